@@ -25,7 +25,8 @@ _HOME = {
     "load_cell": "model.cell",
     "validate": "calibration.validate",
 }
-"""Where each is: imported when it is asked for, for numba alone takes longer than ``bms-estimator --help`` may."""
+"""Module of each public name. It is imported on first use, because numba alone takes longer than ``bms-estimator
+--help`` may."""
 
 
 def __getattr__(name: str) -> Any:

@@ -32,15 +32,15 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings
 
 LARGEST_STD = 0.1
-"""An anchor whose SOC is less certain is none."""
+"""Maximum std of an anchor's SOC."""
 LEAST_SWING = 0.15
 """SOC between the lowest and the highest anchor that a capacity needs."""
 LARGEST_RELATIVE_STD = 0.2
-"""A capacity less certain than that is none."""
+"""Maximum relative std of a capacity."""
 BEYOND = 3.0
-"""A rest so many standard deviations beyond the curve's ends is none of this cell."""
+"""Distance beyond the curve's ends, in standard deviations, at which a rest does not belong to this cell."""
 DISAGREE = 9.0
-"""Squared: anchors off by more than so many of their standard deviations do not go together."""
+"""Maximum squared distance between two consistent anchors, in units of their variance."""
 HYST_UNSURE = 0.3
 """Std of the hysteresis h where the way is known, and of its size, which errs the other way after a charge."""
 

@@ -21,17 +21,17 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, Parameter
 
 KNOWN = 0.3
-"""A parameter with a larger relative standard deviation is not told by the data."""
+"""Maximum relative std of a parameter that the data determine."""
 WIDEST = math.log(100.0)
 """No parameter is looked for further from the file's value than this factor."""
 ROUNDS = 3
-"""The weights of the sources follow from what the fit before left: so many fits."""
+"""Number of fits: the weights of the sources follow from the residuals of the fit before."""
 LEAST_V = 1e-4
 """No source is better than this [V]: what leaves less has as many points as parameters."""
 BLOCKS = 20
 """Parts of a record whose means tell how long its errors are alike."""
 KEYS: tuple[Parameter, ...] = get_args(Parameter)
-"""Of ``[fuel_cell]``, in the order of ``NAMES``."""
+"""Keys of ``[fuel_cell]``, in the order of ``NAMES``."""
 NEEDS = {
     "r_ohm": "steps of the current, or a curve over more of its range",
     "tafel_slope_v": "currents over a decade, the smallest below a tenth of the largest",
@@ -41,7 +41,7 @@ NEEDS = {
     "limiting_current_a": "currents near the limiting one, where the voltage falls off",
     "internal_current_a": "currents near zero",
 }
-"""What tells of a parameter."""
+"""Data that a parameter needs."""
 
 
 @dataclass(frozen=True)

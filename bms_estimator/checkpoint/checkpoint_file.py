@@ -34,13 +34,13 @@ FORMAT = 7
 """Version of the file's layout. Raise it when a field changes its meaning, and migrate files of the version before."""
 DAY_S = 86400.0
 LONGEST_FILE = 1 << 20
-"""A checkpoint has some kilobytes; a longer file is none [bytes]."""
+"""Maximum size of a checkpoint file [bytes]; usual ones have about 100 kB."""
 KEPT = 8
-"""So many files of one pack are kept, those saved last."""
+"""Number of files of one pack that are kept, those saved last."""
 REFUSED = "refused: "
 """A reason that begins so tells why a file that was found is not taken up."""
 LATER = 4
-"""So many files of a later format are kept for who goes back to the version that wrote them."""
+"""Number of files of later formats that are kept for a return to the version that wrote them."""
 _OF_LEDGER = "restarts", "total", "clean", "alarms"
 """Names in the file of what is in the ledger."""
 MOST = 1e15
@@ -73,7 +73,7 @@ class CheckpointContent:
     state: Mapping[str, NDArray[Any]]
     """Fields of ESTIMATOR_STATE by their names, as ``fields`` gives them; empty when it was refused."""
     unseen_s: float
-    """Since it was saved [s]; infinite when nobody knows."""
+    """Time since it was saved [s]; infinite if unknown."""
     ledger: RunCounters
     """With this start counted; of nothing when it was not of this pack, or could not be read."""
     reason: str
@@ -100,9 +100,9 @@ class CheckpointFile:
         self._later = False  # the file is of a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
         self.disk_free_mib: float | None = None
-        """Where the file is, when it was written last [MiB]."""
+        """Free space of the file's disk at the last write [MiB]."""
         self.thread = DiskThread("checkpoint")
-        """Where to call ``save`` and ``update_counters``: a call that nobody waits for any more still ends before the next one begins."""
+        """Thread for ``save`` and ``update_counters``: an abandoned call still ends before the next one begins."""
         self.saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 

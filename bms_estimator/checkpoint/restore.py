@@ -20,7 +20,7 @@ _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith(
 OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
 EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
-"""Fields whose last axes, so many, are along the states of the filter; states that a version adds come last."""
+"""Number of last axes of a field that run along the filter's states; a version appends new states at the end."""
 SAME_SOC = 0.03
 """Largest difference between the SOC of filter and observer; beyond it the filter was switched off."""
 

@@ -66,7 +66,7 @@ EXTRAS = {
 }
 """Optional package -> the extra that brings it."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""What a disk that is full or broken says. It may have room again: systemd is to start a service anew that ends so."""
+"""Errors of a full or broken disk. Space may come back, so that systemd should restart a service that ends with one."""
 
 
 class _Commands(LazyGroup):

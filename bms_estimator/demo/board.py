@@ -20,7 +20,7 @@ class Board(NamedTuple):
 
     name: str
     path: str
-    """Of its pseudo-terminal."""
+    """Path of its pseudo-terminal."""
 
 
 def find_build(given: Path | None) -> Path | None:

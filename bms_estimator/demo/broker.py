@@ -18,13 +18,13 @@ from amqtt.session import Session
 from bms_estimator.model.errors import UserError
 
 MQTT_PORT = 1883
-"""Where MQTT clients look when nobody tells them."""
+"""Default port of MQTT clients."""
 LOOPBACK = "127.0.0.1"
 DELIVERY_S, LOOK_S = 5.0, 0.02
-"""At its end the broker gives its clients so long for what they have not got yet, and looks so often [s]."""
+"""Time that the broker gives its clients at its end for pending messages, and its poll interval [s]."""
 ANONYMOUS = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
 MQTT_5 = b"MQTT\x05"
-"""How the CONNECT of an MQTT 5 client goes on after its length."""
+"""Bytes of an MQTT 5 client's CONNECT after its length."""
 UNSUPPORTED_VERSION = b"\x20\x02\x00\x01"
 """CONNACK of a broker that does not know the client's version."""
 

@@ -28,12 +28,12 @@ CELL = "chen_mora"
 LOAD_A = 0.5
 """Steps up to twice the capacity per hour: SOC falls by more than a percent in a minute [A]."""
 TRUE_SOC, TOLD_SOC = 0.9, 0.7
-"""At the start. The estimator takes what it is told for right within 0.2, one standard deviation."""
+"""True SOC at the start, and the SOC that the estimator is given. It assumes a std of 0.2."""
 RESOLUTION_V = 5e-3
-"""Of a mean of many noisy conversions, a fifth of the converter's step [V]."""
+"""Resolution of a mean of many noisy conversions [V]: a fifth of the converter's step."""
 PUBLISH_RATE_HZ = 4.0
 LAMBDA = 1e4
-"""Of the gain (3.10): what takes k hours with the usual 1 is to be seen within minutes."""
+"""Lambda of the gain (3.10): makes visible within minutes what takes k hours with the usual 1."""
 
 
 async def run_demo(

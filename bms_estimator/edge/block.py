@@ -28,12 +28,12 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 _HEADER = struct.Struct("<4sBxHQQQd")
 _OLDEST = 24
-"""Where it stands in the header."""
+"""Offset of the field in the header."""
 _MAGIC, _VERSION = b"BMSB", 1
 MOST_SAMPLES = 65_535
-"""Of a block."""
+"""Maximum number of samples of a block."""
 MOST_NUMBER = 2**63
-"""Of stores and blocks."""
+"""Maximum number of a store or block."""
 _COLUMNS = tuple((name, np.dtype(SAMPLE[name]).newbyteorder("<")) for name in SAMPLE.names or ())
 _SAMPLE_BYTES = sum(dtype.itemsize for _, dtype in _COLUMNS)
 

@@ -37,11 +37,11 @@ from bms_estimator.store.database import RETRY_S, Database
 
 MIB = 1 << 20
 OVERDUE = 1.5
-"""After so many of its lengths a block is sent though no sample has ended it."""
+"""Age at which a block is sent though no sample has completed it, in block lengths."""
 HANDOVER_S = 2.0
 """At the end: how long what is not sent may still take [s]."""
 PARTING_S = 1.0
-"""How long parting from the server may take [s]."""
+"""Timeout of a disconnect from the server [s]."""
 
 log = structlog.get_logger(__name__)
 

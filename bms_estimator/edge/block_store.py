@@ -25,9 +25,9 @@ from bms_estimator.store.database import Database, StoreError
 MOST_WAITING = 500_000
 """Samples that wait in memory for a disk that takes none: 20 MB, five days at a sample a second."""
 RETRY_S = 1.0
-"""What the disk did not take or give is tried again so often [s]; ``Database`` spares one that has failed."""
+"""Retry interval of a disk operation that failed [s]; ``Database`` avoids a disk that has failed."""
 RESEND_S = 30.0
-"""A worker that is behind asks for the same block again before it can have it: it is sent once in so long [s]."""
+"""Minimum interval between two resends of a block [s]: a worker that lags asks for it again before it can have it."""
 
 log = structlog.get_logger(__name__)
 

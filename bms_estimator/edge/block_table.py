@@ -41,11 +41,11 @@ class StoreState(NamedTuple):
     last_s: float
     """Time of its last sample, since it was made [s]; 0 without any."""
     bytes: int
-    """Of its blocks."""
+    """Size of the blocks [bytes]."""
     run: str
     """Who put the last block ..."""
     taken: int
-    """... and how many it had put."""
+    """Number of blocks that it had put."""
 
 
 class StoreResult(NamedTuple):
@@ -53,7 +53,7 @@ class StoreResult(NamedTuple):
 
     kept: StoreState
     oldest: int
-    """Number of the oldest block; ``kept.next`` where there is none."""
+    """Number of the oldest block; ``kept.next`` without one."""
     dropped: int
     """Blocks that had to make room."""
 
@@ -67,20 +67,20 @@ class StoreTransaction:
     """
 
     run: str
-    """Of this process: what it has put before is not put again."""
+    """Identifier of this process: blocks that it has put are not put again."""
     put: Sequence[tuple[int, ReadyBlock]]
     """Blocks and their running numbers in this process, from 1; their times are seconds since 1970."""
     safe: int
     """Blocks below this number are forgotten."""
     known_s: int
-    """When the store was made that this process knows; 0: none yet. An earlier one is none [s since 1970]."""
+    """Creation time of the store that this process knows [s since 1970]; 0: none yet. An earlier store is not valid."""
     after_s: int
-    """A store that was not made later than this is none, either: a new one is begun [s since 1970]."""
+    """A store that was not created after this time is not valid, and a new one is begun [s since 1970]."""
     most_bytes: int
     now_s: float
     """Wall clock [s since 1970]."""
     count: bool
-    """Whether to count the bytes anew."""
+    """True to count the bytes again."""
 
     def __call__(self, connection: sqlite3.Connection) -> StoreResult:
         """Do it."""
@@ -125,7 +125,7 @@ class Read:
     """
 
     made_s: int
-    """Of the store [s since 1970]."""
+    """Creation time of the store [s since 1970]."""
     first: int
     end: int
     """After the last one."""

@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 Times = NDArray[np.float64]
 
 BAND_S = 1.0
-"""So far a source's clock may be from the host's: how long samples are on their way differs, too [s]."""
+"""Maximum difference between a source's clock and the host's that is not corrected [s]: transport delays vary, too."""
 STEP_S = 10.0
 """Beyond it a clock was set: what it skipped is a gap [s]."""
 SLEW = 0.01
 """Between the two a source's clock is followed faster or slower by this, relative: no resonator is as wrong."""
 WINDOW_S = 600.0
-"""A sample comes late and never early: how far a clock has fallen behind, the least late one of so long tells [s]."""
+"""Window of the smallest delay [s]: a sample comes late and never early, so that the smallest delay shows a clock's
+lag."""
 GRID = 2.0**20
 """Offsets are whole parts of a second, 1/GRID: what is added so leaves an even pace even, which packs best."""
 

@@ -19,7 +19,7 @@ RAW_STREAM, HOURS_STREAM = "RAW", "HOURS"
 PACKS_BUCKET, CELLS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "cells", "checkpoints", "states"
 """Key-value: settings by pack; cell files by name; the last checkpoint by partition. Objects: what checkpoints hold."""
 PARTITIONS = 64
-"""Unless told otherwise when the streams are made; never changed afterwards."""
+"""Default number of partitions; it is set when the streams are made and never changes."""
 
 
 def raw(pack: str) -> str:

@@ -26,7 +26,7 @@ TraceBlock = NDArray[np.void]
 SAMPLE_OUTCOMES = tuple(SampleOutcome)
 """By value: ``SampleOutcome(value)`` takes nearly as long as the kernel."""
 IDENTIFIER = IdentifierSettings()
-"""How an estimator identifies unless told otherwise."""
+"""Default settings of the identifier."""
 
 
 class Estimator:

@@ -14,15 +14,16 @@ from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.sampling import BOARD, Sampling
 
 CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
-"""Where the cell file does not say how wrong its OCV is: std of one cell [V], and std along SOC."""
+"""Std of one cell's OCV [V] and std along SOC, for a cell file that does not declare its error."""
 STEEPEST_V = 5.0
-"""Where the OCV of a cell is steeper, near full and empty, its end is better known than its SOC elsewhere [V]."""
+"""Slope near full and empty above which the end of a cell's OCV is known better than its SOC elsewhere [V]."""
 LEARNED, LEARNED_SLOPE_V = 0.97, 0.15
-"""Part of the variance of the OCV that is learned for good, where its slope is at least so much everywhere [V]: on a
-plateau a voltage does not tell the error of the curve from the SOC, nor do the knees stay where they are."""
+"""Fraction of the OCV's error variance that is learned permanently, where its slope is at least this everywhere [V].
+On a plateau a voltage does not distinguish the error of the curve from the SOC, and the knees move."""
 CURVE_SOC, KNEE_V, TURN = 0.3, 1.0, 4.0
-"""The error of the OCV changes over so much charge [SOC], and where a curve goes from flat to steep: on a plateau it is wrong
-in volts, at a knee in SOC, of slopes above ``KNEE_V`` a cell [V]. Both are as one error, e^-(TURN radians of that angle) alike."""
+"""Correlation length of the OCV's error [SOC], also over a change between flat and steep: on a plateau the error is
+in volts, at a knee, of slopes above ``KNEE_V`` per cell [V], in SOC. The correlation of both is e^-(TURN x angle
+in radians)."""
 COUNT_ERROR_SOC = 0.004
 """However well the curve is known: how full the cell was that it was measured on, std."""
 BEYOND_BRANCHES = 0.2
@@ -30,7 +31,8 @@ BEYOND_BRANCHES = 0.2
 BRANCHES_STD = 0.35
 """Relative std of resistances that come from two branches."""
 BIAS_OF_STD = 0.15
-"""Resistances that are hardly known are wrong in their ratios, too: so much of their relative std is ``bias_relative``."""
+"""Fraction of the resistances' relative std that becomes ``bias_relative``, because uncertain resistances are wrong
+in their ratios, too."""
 ROOM_C = 15.0, 35.0
 """Resistances of unknown temperature are those of a room [C]."""
 LEAST_SHARE = 1e-4
@@ -39,7 +41,7 @@ LEAST_CAPACITANCE = 0.05
 """C_ts, C_tl, negative below delta1, delta2, are at least this part of a9, a12."""
 
 SOC_GRID = np.linspace(0.0, 1.0, GRID)
-"""Of resistances, and of what is known of the OCV. Shape (GRID,)."""
+"""SOC grid of the resistances and of the OCV's error. Shape (GRID,)."""
 
 
 def filter_settings(

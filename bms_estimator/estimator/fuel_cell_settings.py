@@ -14,7 +14,7 @@ from bms_estimator.model.fuel_cell import FuelCellModel
 MEMORY_S = 60.0
 """Water and gas of a stack change within a minute: what was before is of another one [s]."""
 SETTLE_S = 5.0
-"""Double layer and oxygen have forgotten by then what nobody measured [s]."""
+"""Time in which double layer and oxygen forget an unmeasured load [s]."""
 FACTORS = {
     "r_ohm": 4.0,
     "tafel_slope_v": 1.5,
@@ -24,7 +24,7 @@ FACTORS = {
     "limiting_current_a": 2.0,
     "internal_current_a": 4.0,
 }
-"""How many times larger or smaller than in the file a parameter may be; 1.3 of the activation loss at 1 A is about 8 of the
+"""Maximum factor between a parameter and its value in the file; 1.3 of the activation loss at 1 A is about 8 of the
 exchange current."""
 
 

@@ -18,11 +18,11 @@ from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, LN_Q, LN_R
 from bms_estimator.model.cell import CellModel, TableOcv
 
 WIDEST_CAPACITY_STD = 0.3
-"""What a cell file may say."""
+"""Maximum std that a cell file may hold."""
 EVEN = tuple(np.round(np.linspace(0.0, 1.0, 101), 2).tolist())
 """SOCs of a table that comes from (2.10)."""
 LEAST_RISE_V = 1e-6
-"""An OCV increases, from one SOC of its table to the next by so much at least [V]."""
+"""Minimum rise of the OCV between two SOCs of its table [V]."""
 
 
 class IdentifiedValue(NamedTuple):

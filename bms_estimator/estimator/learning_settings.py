@@ -15,13 +15,14 @@ MEMORY_S = 3600.0
 OFFSET_S = 600.0
 """The injection takes up an error of the open-circuit voltage with this time constant [s]."""
 SETTLE_S = 1200.0
-"""After a time that nobody measured: three time constants of the slow branch and more [s]."""
+"""Settling time after an unmeasured gap [s]: at least three time constants of the slow branch."""
 RATE_HZ = 1.0 / 60.0
 """gamma: the parameters go where the data lead with its inverse as time constant, at k = 1 [1/s]."""
 LEAK_S = 10.0
-"""The middle of the bounds counts as much as data of so long whose errors are ``epsilon_v`` [s]."""
+"""Weight of the nominal parameters: as much as data of this duration with errors of ``epsilon_v`` [s]."""
 REACH = 0.5
-"""Of theta: what sensitivities do not tell of a way grows with its square, and is no longer small after this one."""
+"""Trust region for theta. The sensitivities are a linearization; beyond this step the second-order error is no longer
+small."""
 TAU_TS, TAU_TL = NAMES.index("tau_ts"), NAMES.index("tau_tl")
 SCALED = {"r_s": (13, 15), "r_ts": (1, 3), "tau_ts": (7, 9), "r_tl": (4, 6), "tau_tl": (10, 12)}
 """Parameters that scale with each that is learned: a time constant is bounded as its capacitance is, at the file's R."""

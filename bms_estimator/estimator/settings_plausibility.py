@@ -16,9 +16,10 @@ LARGEST_AH = 2000.0
 CELL_V = 1.5, 4.5
 """Between these lies the nominal voltage of any Li-ion cell: titanate 2.3 V, NMC 3.7 V [V]."""
 SMALL_AH, MANY = 5.5, 8
-"""A 18650 or 21700 cell holds no more [Ah]; more than so many of them in one row, and nothing beside it, is rare."""
+"""Maximum capacity of a 18650 or 21700 cell [Ah], and number in series beyond which a single row of such cells is
+rare."""
 CONVERTER_STEPS = 1024
-"""Of the firmware's voltage converter: its range in steps."""
+"""Number of steps of the firmware's voltage converter."""
 
 
 def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:

@@ -5,7 +5,7 @@ from pydantic import BaseModel, ConfigDict, Field
 HEARTBEAT_S = 1.0
 """Between two [s]."""
 DEAD_S = 3.0
-"""A worker that has said nothing for so long is taken for dead [s]."""
+"""Time without a heartbeat after which a worker counts as dead [s]."""
 
 
 class Heartbeat(BaseModel):
@@ -30,7 +30,7 @@ class Heartbeat(BaseModel):
     """From the arrival of a block's last sample at the edge to when the block was taken: the worst since the heartbeat before;
     None: no block was taken [s]."""
     counters: dict[str, int] = Field(default_factory=dict)
-    """Of the partitions, by name: resends, gaps, lost blocks, damaged ..."""
+    """Counters of the partitions by name: resends, gaps, lost blocks, damaged blocks and others."""
     unknown_count: int = 0
     """Packs that the table does not know."""
     unknown: tuple[str, ...] = ()
@@ -40,10 +40,10 @@ class Heartbeat(BaseModel):
     hours_waiting: int = 0
     """Summaries that the server has not acknowledged yet."""
     checkpoint_age_s: float | None = None
-    """Of the oldest of its partitions' last checkpoints; None: there is none [s]."""
+    """Age of the oldest of the partitions' last checkpoints [s]; None without one."""
     cpu_s: float = 0.0
-    """Of the process since it was started [s]."""
+    """CPU time of the process since its start [s]."""
     rss_mib: float = 0.0
     """Memory of the process [MiB]."""
     trouble: str = ""
-    """What does not work now, in words; empty: nothing."""
+    """Present error in words; empty without one."""

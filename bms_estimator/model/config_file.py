@@ -65,7 +65,7 @@ class Strict(BaseModel):
 
 T = TypeVar("T", bound=BaseModel)
 FEW = 12
-"""So many keys of a section are listed when one is unknown."""
+"""Maximum number of keys of a section that are listed for an unknown one."""
 
 
 MESSAGES = {

@@ -4,12 +4,12 @@ import math
 import re
 
 PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
-"""What printed lines are made of."""
+"""Bytes of printed lines."""
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 """A decimal number. Python's ``float`` also takes ``3_9`` for 39, other scripts' digits, ``nan`` and ``inf``."""
 NOT_MEASURED = frozenset({"nan", "inf", "infinity", "ovf"})
-"""What programs print, perhaps with a sign, where there is no number."""
+"""Words that programs print in place of a number, perhaps with a sign."""
 
 _WHOLE = re.compile(NUMBER)
 

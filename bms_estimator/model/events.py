@@ -11,7 +11,7 @@ from bms_estimator.model.payloads import Health, Payload, Snapshot
 LEAST_UNSEEN_S = 1.0
 """Shorter gaps are counted in ``health`` alone [s]."""
 NOT_SAVED = ("cannot be saved", "not saved")
-"""What ``health.checkpoint`` begins with when the disk does not take it."""
+"""Beginnings of ``health.checkpoint`` when the disk does not accept it."""
 
 Name = Literal[
     "start",

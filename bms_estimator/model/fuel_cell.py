@@ -33,7 +33,7 @@ Parameter = Literal[
     "limiting_current_a",
     "internal_current_a",
 ]
-"""What is identified of a stack, in the order of ``kernels.cell_model.fuel_cell.NAMES``."""
+"""Identified parameters of a stack, in the order of ``kernels.cell_model.fuel_cell.NAMES``."""
 
 
 class FuelCell(Strict):

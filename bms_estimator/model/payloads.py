@@ -9,10 +9,11 @@ from typing import Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field
 
 FRESH_PERIODS = 3
-"""Values are stale when no sample was accepted for so many periods of publishing or of sampling, whichever are longer."""
+"""Number of periods without an accepted sample after which values are stale; the longer one of publish and sample
+period."""
 
 PAYLOAD_VERSION = 1
-"""Of all that is published; ``sinks/mqtt/topics.py`` says when it goes up."""
+"""Version of all payloads; ``sinks/mqtt/topics.py`` says when it is raised."""
 
 
 class Payload(BaseModel):
@@ -269,4 +270,4 @@ class Snapshot(NamedTuple):
     health: Health
     info: Info
     alarms: tuple[Alarm, ...] = ()
-    """Of all limits that are watched, raised or not."""
+    """All monitored limits, raised or not."""

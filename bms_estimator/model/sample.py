@@ -22,16 +22,16 @@ SAMPLE = np.dtype(
 )
 
 CurrentSign = Literal["discharge_positive", "charge_positive"]
-"""What a device calls positive."""
+"""Direction of the current that a device reports as positive."""
 
 SampleBlock = NDArray[np.void]
 """Shape (n,), dtype ``SAMPLE``."""
 
 CellBlock = NDArray[np.float64]
-"""Shape (n, m): beside each of a block's n samples the voltages of m cells [V], NaN where one was not told."""
+"""Shape (n, m): voltages of m cells for each of a block's n samples [V], NaN if not reported."""
 
 NO_CELLS: CellBlock = np.empty((0, 0))
-"""Of a block without any, however long it is."""
+"""Cell voltages of a block without any, of any length."""
 
 LEAST_C, MOST_C = -60.0, 200.0
 """No sensor on a pack or a stack says anything beyond [degC]."""

@@ -25,7 +25,7 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
 }
-"""Of every answer: nothing from elsewhere is loaded, nobody frames it, and no address with a token in it leaks."""
+"""Headers of every response: load nothing from elsewhere, forbid framing, and send no referrer that may hold a token."""
 
 
 class AccessControl:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 MESSAGE_BYTES = 256 * 1024
 """Size of a message to a reader. A reader that never reads keeps one message in memory."""
 LINK = "link"
-"""Whether what fills it is connected."""
+"""Key of the connection state."""
 
 
 class LatestValues:

@@ -18,9 +18,9 @@ from bms_estimator.process.listener import CONNECTIONS, Listener
 from bms_estimator.settings.page import Listen, PageSettings
 
 PING_S = 5.0
-"""A reader who hears nothing for so long hears that all is well: the page takes three times that for a lost line [s]."""
+"""Interval of keep-alive events to a silent reader [s]; the page counts the connection as lost after three of them."""
 WRITE_S = 30.0
-"""One who takes nothing for so long is gone [s]."""
+"""Time without progress after which a reader is disconnected [s]."""
 MAX_STREAMS = 32
 """Streams at a time, of all packs together."""
 AGAIN_S = 10.0

@@ -15,7 +15,7 @@ from bms_estimator.reports.theorem_4_1_2 import C_RATES, PRODUCTS, measure
 SMALLEST_CURRENT_A = 1e-4
 """Near enough to the theorem's infinitesimal current."""
 OCV_ERROR_V = 0.010
-"""What E19 lets E_o be wrong by."""
+"""Error of E_o assumed by erratum 19 [V]."""
 SLOW_C = 1.0 / 20.0
 BY_OHM = ("50 ohm", "25 ohm", "12.5 ohm")
 """Resistors, by falling resistance."""

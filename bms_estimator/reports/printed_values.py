@@ -81,7 +81,7 @@ BOUNDS = {
 }
 """Tables 5 and 10, index: upper bound, lower bound, lambda_x, lambda_y, as printed (a8: E4)."""
 A8_WEIGHTS = (10.0, 20.0)
-"""What the printed estimates of a8 belong to (E4)."""
+"""Weights that belong to the printed estimates of a8 (erratum 4)."""
 A5 = 150.0
 """a5 of Table 10, printed as 30 (E5)."""
 
@@ -145,9 +145,9 @@ TABLE_13 = {"dynamic": 0.003, "static": 0.358}
 CURRENTS_A = {"25 ohm": 0.860, "50 ohm": 0.416, "12.5 ohm": 1.741, "50 W bulb": 3.652}
 """Average current of each load (5.2.1)."""
 RESISTORS_OHM = {"25 ohm": 25.0, "50 ohm": 50.0, "12.5 ohm": 12.5}
-"""Of the loads that are resistors (5.1)."""
+"""Resistances of the loads (5.1)."""
 SENSOR_RANGE_V = 25.0
-"""Of the voltage sensor (5.1)."""
+"""Range of the voltage sensor (5.1) [V]."""
 BULB_W = 50.0
 """Rating of one bulb (5.1)."""
 RUN_HOURS = (4.0, 16.0)

@@ -15,7 +15,7 @@ from bms_estimator.reports.simulation import block, observer_settings, with_boun
 
 STEP_S = 0.1
 HELD_S = 1800.0
-"""The current is held so long: eight times tau_tl."""
+"""Time for which the current is held [s]: eight times tau_tl."""
 
 
 @dataclass(frozen=True)

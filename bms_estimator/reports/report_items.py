@@ -16,7 +16,7 @@ class Reproduction(Enum):
     CONTRADICTED = "contradicted by the thesis's own numbers"
     """Other printed numbers of the thesis give another result."""
     CLAIM_HOLDS = "claim tested on other data: holds"
-    """What the thesis claims of its recordings, tested on others."""
+    """Verdict on a claim of the thesis about its recordings, tested on others."""
     CLAIM_FAILS = "claim tested on other data: fails"
     GIVEN = "given"
     """Input data, a diagram or a photograph: there is nothing to compute."""

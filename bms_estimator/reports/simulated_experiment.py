@@ -17,11 +17,11 @@ from bms_estimator.reports import printed_values
 from bms_estimator.reports.procedure import Capture, Kind
 
 VOLTAGE_RANGE_V = 30.0
-"""Of the divider. The thesis's 0-25 V sensor would saturate: the curve of Table 8 begins at 25.40 V."""
+"""Range of the divider [V]. The thesis's 0-25 V sensor would saturate: the curve of Table 8 begins at 25.40 V."""
 CURRENT_RANGE_A = 20.0
 """From -10 to +10 A."""
 MEAN_VOLTAGE_V = 23.0
-"""Of the pack over a discharge: turns the bulb's mean current into a resistance."""
+"""Mean voltage of the pack over a discharge [V], which converts the bulb's mean current to a resistance."""
 QUARTER_HOUR_S = 900.0
 LOWEST_SOC = 0.012
 """Discharges end here, just above delta2 of the true pack."""

@@ -54,7 +54,7 @@ that of the differential equations to four digits, at 10 ms the fitted lambda is
 AFTER_START_S = 1.0
 """Sample interval after it [s]."""
 ALPHA, OTHER_ALPHA = 2.5, 2.9
-"""Of (3.10): the default, and another one that Tables 2 and 3 can be fitted with."""
+"""Alpha of (3.10): the default, and another one that fits Tables 2 and 3."""
 HIGH_CURRENT_A = 4.0 * CURRENT_A
 """4C: more than the thesis's simulations draw by far."""
 

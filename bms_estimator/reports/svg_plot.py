@@ -12,7 +12,7 @@ from bms_estimator.model.arrays import Floats
 INK = "#1d2733"
 FAINT = "#8a97a6"
 COLOURS = ("#1f5fa8", "#d1602b", "#2f8f5b", "#8a4fa3", "#b08a1e", "#4aa3b5")
-"""Told apart in print and by colour-blind eyes: blue, orange, green, violet, ochre, teal."""
+"""Colors that differ in print and for color-blind readers: blue, orange, green, violet, ochre, teal."""
 POINTS = 1200
 """More points than this on a line are not seen in a plot of this width."""
 WIDTH_IN, ROW_IN = 8.0, 3.0

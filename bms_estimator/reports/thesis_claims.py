@@ -21,7 +21,7 @@ PRODUCTS_PERCENT = 20.0
 SOC_PERCENT = 5.0
 """A count that starts with an SOC wrong by this stays as wrong; what 7.1 calls more accurate must be better."""
 MIDDLE_SOC = 0.5
-"""Where the RC products are looked at."""
+"""SOC at which the RC products are compared."""
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,12 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms import Change
 
 WAITING = 100
-"""So many alarms wait for a program that takes its time; then the oldest goes."""
+"""Maximum number of alarms waiting for a slow program; then the oldest is dropped."""
 RELAY_S, RETRY_S = 2.0, 0.5
-"""So often the board is told its relay's level, at least [s]: it may have been reset, or replaced; and once it did not take it."""
+"""Maximum interval between two relay commands, because the board may have been reset or replaced, and retry interval
+of a refused one [s]."""
 CLOSE_S = 2.0
-"""At the end what is under way may take so long [s]."""
+"""Timeout of running hooks at shutdown [s]."""
 FIRST_RETRY_S = 0.5
 """First pause before a program that could not be started is tried again [s]; doubles each time, up to half a minute."""
 

@@ -23,7 +23,8 @@ from bms_estimator.telemetry.health import sample_counters, suspicions
 UNUSABLE = "not_finite", "range", "saturated"
 """Kinds of dropped samples that tell of a fault of the sensor."""
 JUDGE_S, JUDGE_ROWS = 0.1, 1024
-"""Samples are looked at so often [s], or once there are so many: at each block it would take as long as the estimate."""
+"""Interval [s] and number of samples after which samples are checked; a check of each block would take as long as the
+estimate."""
 
 log = structlog.get_logger(__name__)
 

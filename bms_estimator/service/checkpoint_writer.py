@@ -14,13 +14,13 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 
 SAVED_SOC = 0.002
-"""How far the SOC may go from that of the checkpoint: a kill costs no more, beside what moves until the next start."""
+"""Change of the SOC since the checkpoint that triggers a save, so that a kill loses no more."""
 LOOK_S = 1.0
-"""How often it is seen how far it has gone [s]."""
+"""Interval at which that change is checked [s]."""
 HUNG_S = 10.0
-"""A disk that has not taken the state for so long is said to hang [s]."""
+"""Time after which a disk that has not accepted the state counts as hung [s]."""
 LAST_S = 5.0
-"""So long the end waits for the disk: who stops us waits for no more than a minute or so [s]."""
+"""Timeout of the last save at shutdown [s]; service managers wait for about a minute."""
 
 log = structlog.get_logger(__name__)
 

@@ -20,11 +20,11 @@ from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import Source
 
 UNTENDED_S = 30.0
-"""A source whose task has not turned for so long hangs [s]."""
+"""Time without a run of a source's task after which it counts as hung [s]."""
 PAT_S = 5.0
-"""How often systemd hears how it is, unless its watchdog wants it sooner [s]."""
+"""Maximum interval between two watchdog notifications [s]."""
 REPORT_S = 3600.0
-"""How often the log says what has become of the blocks [s]."""
+"""Interval between two log lines about the blocks [s]."""
 
 log = structlog.get_logger(__name__)
 

@@ -35,9 +35,9 @@ from bms_estimator.sources.source import Source, SourceHealth
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
 
 LAG_STEP_S = 0.1
-"""How often the loop's lag is measured [s]: what blocks it for longer is always seen."""
+"""Interval at which the loop's lag is measured [s]: any longer blocking is seen."""
 STATUS_S = 60.0
-"""How often systemd hears of a new SOC; that samples come or cease it hears at once [s]."""
+"""Interval between two SOC texts for systemd [s]; the start and end of samples are reported at once."""
 
 log = structlog.get_logger(__name__)
 

@@ -43,7 +43,8 @@ log = structlog.get_logger(__name__)
 SLOW_S = 1.0
 """Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
 UNTENDED_S = 20.0
-"""A source that has not looked after its line for so long hangs: it tries a port that is missing each 10 s at least [s]."""
+"""Time without a run of a source's task after which it counts as hung [s]: a missing port is tried at least each 10
+s."""
 
 
 class Publisher:

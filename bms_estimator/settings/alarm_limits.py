@@ -13,7 +13,7 @@ from bms_estimator.settings.pack import Settings
 LEAST_SILENT_S = 10.0
 """A link that is silent for less is not lost yet [s]."""
 SILENT_PERIODS = 3
-"""Nor before so many samples or publications are missing."""
+"""Minimum number of missing samples or publications before an alarm on silence."""
 
 
 Quantity = Literal["voltage", "current", "temperature", "cells"]
@@ -69,13 +69,14 @@ _BY_NOMINAL_V = (
 """Up to which nominal voltage of a cell [V] it is taken to be of which chemistry."""
 
 LEAST_CHARGE = 0.02
-"""Of the capacity, per hour: a smaller current into the cell is the sensor's offset and no charging."""
+"""Minimum charge current as a fraction of the capacity per hour; a smaller one is the sensor's offset."""
 
 
 DIGITS = 9
 """0.1 - 0.08 is to be 0.02."""
 MOST_DISCHARGE = 5.0
-"""Of the capacity, per hour: a generic cell's file takes far more for a reading than most cells of its kind stand for long."""
+"""Default maximum discharge current as a multiple of the capacity per hour; a generic cell's file accepts readings
+far above what most such cells stand for long."""
 
 
 class _Default(NamedTuple):

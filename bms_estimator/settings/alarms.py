@@ -126,7 +126,7 @@ class AlarmHook(Strict):
 
 
 PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value", "limit", "unit", "text")
-"""What a message's payload may name. ``state`` is ``raised`` or ``cleared``."""
+"""Fields that a message's payload may name. ``state`` is ``raised`` or ``cleared``."""
 
 
 class AlarmSettings(Strict):

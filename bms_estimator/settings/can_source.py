@@ -12,7 +12,7 @@ from bms_estimator.settings.polled_source import PolledSource, with_profile
 LONGEST_ID, LONGEST_EXTENDED_ID = 0x7FF, 0x1FFF_FFFF
 """Largest identifiers of eleven and of 29 bits."""
 FRAME_BITS = 512
-"""Of the longest frame of CAN FD."""
+"""Bits of the longest CAN FD frame."""
 PROFILES: dict[str, dict[str, object]] = {
     # Frame 0x356 of the battery-to-inverter protocol of Pylontech's low voltage packs, as BMS, inverters and diyBMS
     # (pylon_canbus.cpp) speak it: three int16, little endian, in 10 mV, 0.1 A and 0.1 degC; 500 kbit/s.

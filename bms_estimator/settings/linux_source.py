@@ -11,7 +11,7 @@ from bms_estimator.settings.polled_source import Name, PolledSource
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
 """One step of the voltage by chip, at its own pins: INA219 data sheet, ADS1015 at 4.096 V full scale [V]."""
 FINE_V = 1.25e-3
-"""Of the INA226; what is finer shows through hwmon in millivolts only [V]."""
+"""Voltage resolution of the INA226 [V]; hwmon shows finer ones in millivolts only."""
 
 
 class LinuxSource(PolledSource):

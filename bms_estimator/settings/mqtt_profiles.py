@@ -25,9 +25,9 @@ class Profile(NamedTuple):
     """One project."""
 
     table: Mapping[str, Any]
-    """Of ``[source]``."""
+    """Values of ``[source]``."""
     current_sign: str
-    """What it calls positive; the steps of what it shows follow."""
+    """Direction that the device calls positive; the steps of its values follow."""
     voltage_resolution_v: float
     current_resolution_a: float
     needs: Mapping[str, str] = {}

@@ -26,7 +26,7 @@ SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource |
 SOURCE: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)
 
 LEAST_RATE_HZ, MOST_RATE_HZ = 0.1, 10.0
-"""Of publications."""
+"""Limits of the publish rate [Hz]."""
 LogLevel = Literal["info", "warning", "error"]
 DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
 DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]

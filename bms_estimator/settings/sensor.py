@@ -9,7 +9,7 @@ from bms_estimator.model.one_of import OneOf
 from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
 
 NO_DEVICE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
-"""What ``[sensor]`` may say of a device on a serial line beside ``[source]``: no more than a file with all defaults does."""
+"""Values of ``[sensor]`` that are allowed beside ``[source]``: those of a file with all defaults."""
 
 
 def _filled(sensor: dict[str, object]) -> dict[str, object]:

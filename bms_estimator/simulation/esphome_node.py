@@ -16,7 +16,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.simulation.virtual_adc import Reading
 
 INTERVAL_S = 2.0
-"""So often the node asks the BMS [s]."""
+"""Poll interval of the node [s]."""
 SPREAD_V = 0.004
 """Standard deviation of the cells among each other [V]."""
 
@@ -50,7 +50,7 @@ class SimulatedNode:
         self._apart_v = _apart(cells, random.Random(seed))
         self.path = f"{prefix}/sensor/+/state on {', '.join(mqtt.urls)}"
         self.time_s = 0.0
-        """Of the last reading."""
+        """Time of the last reading [s]."""
         self.samples = 0
         self._end_s = 0.0
         will = Message(f"{prefix}/status", b"offline", 1, retain=True)

@@ -11,7 +11,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.simulation.virtual_adc import Reading
 
 READINGS_HZ = 50
-"""Of a signal; each reading is held until the next."""
+"""Rate of readings of the pack model [Hz]; each is held until the next."""
 LINES_AT_ONCE = 50
 STOP_S = 5.0
 

@@ -13,7 +13,7 @@ from bms_estimator.simulation.virtual_adc import Reading
 HEARD_BYTES = 64
 """No question is longer."""
 MISSING_BYTES = 5
-"""Of an answer that broke off."""
+"""Length of a truncated response [bytes]."""
 SPREAD_V = 0.004
 """Its cells differ by up to this from their mean [V]."""
 

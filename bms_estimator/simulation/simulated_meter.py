@@ -26,19 +26,19 @@ class SimulatedMeter(ABC):
     """
 
     period_s = math.inf
-    """It speaks by itself so often [s]."""
+    """Interval of unsolicited messages [s]."""
 
     def __init__(self, signal: Signal, *, speed: float = 1.0) -> None:
         self._signal, self._speed = signal, speed
         self._master = self._slave = -1
         self.path = ""
-        """Of the pseudo-terminal."""
+        """Path of the pseudo-terminal."""
         self.time_s = 0.0
-        """Of the last reading."""
+        """Time of the last reading [s]."""
         self.samples = 0
-        """Readings told."""
+        """Number of readings sent."""
         self.last = Reading(math.nan, math.nan)
-        """The reading told last."""
+        """Last reading sent."""
 
     def __enter__(self) -> Self:
         """Open the pseudo-terminal."""

@@ -80,7 +80,7 @@ class SimulatedPack:
         self._state = (soc, 0.0, 0.0)
         self._current_a = self._load_a
         self.time_s = 0.0
-        """Of the last reading."""
+        """Time of the last reading [s]."""
 
     @property
     def soc(self) -> float:

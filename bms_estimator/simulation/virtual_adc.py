@@ -45,7 +45,7 @@ class BoardParts:
     bandgap_v: float = 1.1
     divider: float = 6.1
     volts_per_ampere: float = 0.1
-    """Of a ratiometric sensor at 5 V of supply."""
+    """Slope of a ratiometric sensor at 5 V of supply [V/A]."""
     ratiometric: bool = True
     """The current sensor is supplied with AVcc, and its slope is proportional to that."""
     current_zero: float = 0.5

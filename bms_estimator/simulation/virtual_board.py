@@ -57,13 +57,13 @@ Signal = Callable[[float], Reading] | Iterable[Reading]
 FIRMWARE = (0, 2, 0)
 RATE_HZ_AT_RESET = 100
 _LINE_BYTES = 2048
-"""So much waits for a host that does not read; then samples are dropped, as a board drops them."""
+"""Maximum number of bytes waiting for a host that does not read; then samples are dropped, as a board does."""
 _WAKE_S = 0.002
 """Samples that fall due within so short a time leave together, as on USB [s]."""
 _PATIENCE_S = 1.0
-"""For so long the last bytes wait for a host that may not read [s]."""
+"""Time that the last bytes wait for a host that may not read [s]."""
 _LOOK_S = 0.01
-"""How often it looks whether a host has come [s]."""
+"""Interval at which a new host is looked for [s]."""
 _BOOT_S = 0.2
 """Opening the port resets a board; it starts when the host has long thrown away what it found on the line [s]."""
 _BURST = 256
@@ -82,7 +82,7 @@ _RANGES = {
     MessageType.COMMAND_SET_CURRENT_SLOPE: _millionths(LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE),
     MessageType.COMMAND_SET_RATIOMETRIC: range(2),
 }
-"""Of the number that a command sets."""
+"""Range of the number that a command sets."""
 
 
 class BoardFault(Enum):
@@ -150,9 +150,9 @@ class VirtualBoard:
         self._master = self._slave = -1
         self._loop: asyncio.AbstractEventLoop | None = None
         self.path = ""
-        """Of the pseudo-terminal."""
+        """Path of the pseudo-terminal."""
         self.time_s = 0.0
-        """Of the signal, at the end of the last sample; goes on across resets."""
+        """Time of the pack model at the end of the last sample [s]; it continues across resets."""
         self.samples = 0
         """Samples taken since the board was made."""
         self.relay_high = False

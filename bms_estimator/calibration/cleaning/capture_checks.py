@@ -21,12 +21,12 @@ LONG_REST_S = 300.0
 SOC_OFF, VOLTAGE_OFF_V = 0.1, 0.1
 """A rested voltage this far off the OCV at the counted SOC, in SOC and per cell in volts, cannot be the model's error."""
 GAP_STEPS, GAP_CHARGE = 10.0, 0.01
-"""A step this many times the median one, over which the current of its start would draw this part of the capacity, is
-a gap in which nobody knows the charge."""
+"""A step is a gap with unknown charge if it is this many times the median one and the current at its start would draw
+this fraction of the capacity."""
 SHORTEST_S = 30.0
-"""A capture lasts at least so long [s]."""
+"""Minimum duration of a capture [s]."""
 LEAST_ANSWER_V = 1e-3
-"""A cell whose voltage moves less at steps of 1 C, per cell, is none: most have 20 to 100 mV [V]."""
+"""Minimum change of a real cell's voltage at current steps of 1 C, per cell [V]: most have 20 to 100 mV."""
 LEAST_SWEEP = 0.05
 """SOC that must have moved for the sign to show in the voltage's trend."""
 

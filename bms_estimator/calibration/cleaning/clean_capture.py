@@ -11,7 +11,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 NEIGHBOURS = 2
-"""Samples on either side that a glitch is told by."""
+"""Number of neighbors on each side by which a glitch is recognized."""
 LEAST_SAMPLES = 2 * NEIGHBOURS + 1
 """A capture with fewer good samples says nothing."""
 SPIKE_V = 0.03

@@ -12,16 +12,16 @@ GLITCH_FRACTION = 0.5
 MOST_BACK = 0.1
 """Part of the samples that may lie before others in time: a clock that is set back by a little."""
 LEAST_GOOD = 0.5
-"""With a smaller share of good voltages nobody knows which ones are the faults."""
+"""Minimum fraction of good voltages; below it the faulty ones cannot be recognized."""
 REST_CURRENT_C = 0.01
 """Below this C-rate a cell rests [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
 NOISE_STDS, NOISE_STEP_C = 6.0, 0.1
-"""A current within so many standard deviations of its noise is none; noise is what changes by less than this C-rate from
-sample to sample [1/h]."""
+"""A current within this many standard deviations of its noise is zero. Changes from sample to sample below this
+C-rate are noise [1/h]."""
 BLIP_CHARGE = 2e-5
 """Charge, in capacities, below which a current within a rest is a glitch of the sensor, not a load."""
 SOC_SLACK = 0.03
-"""How far SOC may leave 0..1 before the capacity is called wrong: cells of one type differ by as much."""
+"""Distance that SOC may leave 0..1 before the capacity is called wrong: cells of one type differ by as much."""
 
 
 def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:

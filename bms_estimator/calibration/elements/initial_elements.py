@@ -23,7 +23,7 @@ NEGLIGIBLE = 1e-6
 LOWEST_SOC = 0.1
 """Rests below are left out: the elements rise there."""
 MOST_SAMPLES = 1000
-"""Of a rest; a longer one is thinned."""
+"""Maximum number of samples of a rest; longer ones are thinned."""
 LEAST_OHM = 1e-5
 
 

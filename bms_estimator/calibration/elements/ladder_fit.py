@@ -29,11 +29,11 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 
 SOC_NODES = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.65, 0.85, 1.0])
-"""Of the resistances."""
+"""SOC nodes of the resistances."""
 KELVIN_NODES = np.array([0.0, 0.15, 0.3, 0.5, 0.75, 1.0])
-"""Of dE/dT."""
+"""SOC nodes of dE/dT."""
 KNOTS = np.unique(np.round(np.r_[np.arange(0.0, 0.25, 0.025), np.arange(0.25, 1.0, 0.045), 1.0], 4))
-"""Of the correction of the OCV."""
+"""SOC nodes of the correction of the OCV."""
 
 TYPICAL_V = 0.09
 """The scale of all resistances: what R_0 and the fast branches take at 1 C, per cell [V]."""
@@ -43,40 +43,40 @@ ROUGH = 0.1
 """Std of the difference of one resistance between two nodes of SOC, and of two branches next to each other, in that scale:
 the resistance of a decade of time is about the same from a second to an hour."""
 LOW_SOC, LOW_ROUGH = 0.15, 4.0
-"""Towards empty both may be so many times as large."""
+"""SOC below which both may be larger, and the factor."""
 BEND_V, EASY_BEND_SOC, EASY_BEND = 10.0, 0.12, 20.0
-"""Std of d2d/dSOC2 per cell [V]; below that SOC so many times as large."""
+"""Std of d2d/dSOC2 per cell [V]; below this SOC it is larger by the last factor."""
 STRETCHES = 20
-"""The error of the OCV is another in each of so many stretches of SOC."""
+"""Number of SOC intervals in each of which the OCV has an error of its own."""
 PER_KELVIN_V = 1e-3
 """Std of u, per cell [V/K]."""
 KNOWN_PER_KELVIN_V = 5e-5
-"""The same where dE/dT was measured [V/K]."""
+"""Std of dE/dT where it was measured [V/K]."""
 HELD_V, HELD_PER_KELVIN_V = 1e-6, 1e-9
-"""The same where it is not to be fitted."""
+"""Std of OCV [V] and dE/dT [V/K] that are not to be fitted."""
 
 WORTH = 30.0
 """Independent rows that a capture counts as."""
 ERROR_V, ERROR_J = 4e-3, 22e3
 """Std of a row at 25 C, per cell [V], and how it grows in the cold [J/mol]."""
 SOC_STD = 0.01
-"""The same of the SOC gained over the whole range, by the root of the charge: at a knee far from the start a cell is not
-where its curve is, and what the voltage is off there is no resistance."""
+"""Std of the SOC gained over the whole range, growing with the root of the charge. At a knee far from the start a
+cell deviates from its curve, and that voltage error is not a resistance."""
 RELATIVE = 0.1
 """Std relative to the drop that ``TYPICAL_V`` makes of the largest current of the last half minute."""
 STEPS_WORTH, STEP_V = 30.0, 1e-3
-"""The jumps of a capture's voltage at clean steps of its current count as so many rows, of this std per cell [V]: they tell
-R_0, and do not wander."""
+"""Weight in rows, and std per cell [V], of a capture's voltage jumps at clean current steps. They determine R_0 and
+do not drift."""
 STEADY, STEADY_S, STEP_S = 0.01, 5.0, 1.5
-"""A step is clean when before it and behind it the current moves by no more than this part of the largest for so long [s],
-and when it is sampled so closely [s]: of a current that goes on changing, samples that are taken a little before those of
-the voltage would tell another R_0."""
+"""A step is clean if the current before and after it moves by at most this fraction of the largest current for this
+long [s], and if it is sampled this closely [s]. With a changing current a delay between voltage and current
+samples would give another R_0."""
 COUNT_STD = 0.004
 """Relative std of the charge counted in a capture, and of the capacity at its temperature."""
 STEP_SHARE = 0.1
 """A change of current by this part of the capture's largest begins a new stretch."""
 SHORTEST_S, LONGEST_S = 10.0, 30.0
-"""The time since then counts as at least so long; the time since the row before as at most so long [s]."""
+"""Minimum of the time since that step, and maximum of the time since the row before [s]."""
 LONG_REST_S, REST_SHARE = 500.0, 0.01
 """Rest of this length, below this part of the largest current."""
 ROW_S = 0.5

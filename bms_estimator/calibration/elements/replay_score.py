@@ -17,9 +17,9 @@ CUTS = (0.2, 0.5)
 WRONG_SOC = (-0.2, 0.2)
 """By how much its first SOC is wrong."""
 SETTLED_S = 900.0
-"""It is judged from so long after its start [s]."""
+"""Time after the start from which on a replay is scored [s]."""
 LEAST_S = 900.0
-"""For so long at least [s]."""
+"""Minimum scored time [s]."""
 LOWEST_SOC = 0.05
 """Below it nothing is judged."""
 OUTSIDE = 40.0

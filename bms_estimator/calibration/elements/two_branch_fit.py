@@ -10,10 +10,10 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Capacitance, Ladder, Resistance
 
 SOC = np.linspace(0.02, 1.0, 50)
-"""Where the curves are to be near the ladder's."""
+"""SOC at which the curves should match those of the RC network."""
 EXPONENTS = np.geomspace(1.0, 60.0, 60)
 NEGLIGIBLE = 1e-4
-"""A form needs an amplitude: where there is none, this part of the offset."""
+"""Fraction of the offset that replaces a zero amplitude, which the function needs."""
 FARTHEST_DELTA = 0.01
 """Capacitances are positive down to this SOC, (2.11), (2.12)."""
 SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT), "r_tl": (1 + SHORT, RESISTANCES)}

@@ -12,10 +12,11 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 
 RELAXED_V = 0.002
-"""What rests of a warm cell are off as a whole [V]: hours follow after the quarter of an hour that is extrapolated."""
+"""Systematic error of rests of a warm cell [V]: relaxation goes on for hours after the quarter of an hour that is
+extrapolated."""
 COLD_V, DOUBLING_K = 0.012, 25.0
-"""What is more of it in the cold [V]: 12 mV at 0 C, 20 mV at -10 C, of rests up to an hour; relaxation slows down by half
-in ``DOUBLING_K``."""
+"""Additional error in the cold [V]: 12 mV at 0 C, 20 mV at -10 C, of rests up to an hour; relaxation takes twice as
+long for each ``DOUBLING_K``."""
 COLD_OWN = 0.3
 """Part of it that is not alike in all sources."""
 LONG_REST_S = 3600.0

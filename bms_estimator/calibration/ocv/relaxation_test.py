@@ -28,7 +28,8 @@ LARGEST_STD_V = 0.02
 LATE_FROM = 0.5
 """The extrapolation fits this latter part of a rest: the fast branch is over there."""
 SHORTEST_TAU, LONGEST_TAU, TAU_GRID = 0.05, 0.7, 40
-"""Time constants tried, in rests. A slower one cannot be told from a drift and extrapolates wildly."""
+"""Time constants tried, in multiples of the rest. A slower one cannot be distinguished from a drift and extrapolates
+wildly."""
 FORM_ERROR = 0.6
 """Part of the extrapolated voltage that is its standard deviation: relaxation is no pure exponential. Half-hour rests of
 a NCR18650 cut to a quarter of an hour miss their end by 2.4 mV RMS so extrapolated, and by 4.7 mV when not."""

@@ -18,11 +18,12 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 LEAST_S = 7.0 * 3600.0
-"""A slow curve takes at least so long [s]: a whole one at C/7. At C/10 half of the difference is some 20 mV."""
+"""Minimum duration of a low-rate curve [s]: a full one at C/7. At C/10 half of the difference between discharge and
+charge is some 20 mV."""
 SAME_CURRENT = 0.05
 """A current is constant within this part of it, and a standard deviation of its noise."""
 SMOOTH_SAMPLES = 31
-"""Its median over so many samples counts: faults are not seen, noise is a fifth."""
+"""Length of the median filter [samples]: it removes faults and divides noise by five."""
 NOISE_OF_STEP = 1.05
 """Standard deviation of white noise over the median step between its samples."""
 WHOLE_FALL = 0.01
@@ -36,19 +37,20 @@ GRID = np.unique(
 )
 """SOCs at which a slow curve is taken."""
 EVEN, HYSTERESIS_WIDTH = np.linspace(0.0, 1.0, 201), 0.01
-"""Hysteresis is smoothed over this SOC: a knee that lies at another SOC in charge is none."""
+"""Grid of SOC, and width of the smoothing of the hysteresis: a knee that is at another SOC in charge is not
+hysteresis."""
 ENDS = (0.03, 0.98)
 """Outside hysteresis is taken to be as it is there: the branches turn around."""
 POINT_V, POINT_SOC = 1e-3, 0.002
 """Standard deviations of one point of a slow curve: of its voltage, per cell in series [V], and of its SOC."""
 PAIR_V, PAIR_PART = 1.5e-3, 0.1
-"""What the mean of a pair is off as a whole: so much per cell in series [V], and this part of the half difference."""
+"""Systematic error of the mean of a paired curve per cell in series [V], and as a fraction of the half difference."""
 ALONE_PART = 0.5
-"""The same where one of the two is missing: the difference is then that of the middle."""
+"""That fraction for an unpaired curve, whose difference is known in the middle only."""
 TURN = 0.03
 """SOC within which a charge that ends early, at its highest voltage, is not the mean's other half."""
 LONE_V = 0.01
-"""What a lone branch is off, with the ohmic part taken out, per cell in series [V]."""
+"""Systematic error of an unpaired curve without its ohmic part, per cell in series [V]."""
 COLD_PART = 0.25
 """Part of what cold leaves unrelaxed in a rest that is left in the mean of a pair; a lone branch has all of it."""
 

@@ -32,12 +32,14 @@ REST_SHARE, REST_SHARE_STD = 0.7, 0.3
 """Part of the half difference of slow curves that a rest after a discharge keeps, the other is polarisation; and its
 standard deviation: 0.4 and 0.5 seen of an NCA cell, 1.0 of an LFP cell."""
 PLATEAU_SHARE, PLATEAU_V, PLATEAU_SOC = 0.9, 0.15, 0.05
-"""The same of a curve that rises by less, per cell and 1 of SOC, over so much SOC: two phases side by side keep it (Dreyer et al., Nature
-Materials 9, 2010, 448). 0.9 to 1.0 seen in drives of an LFP cell at 25, 5 and -15 C [V]."""
+"""Hysteresis as a fraction of the half difference for a curve with a plateau: a slope below this per cell and unit of
+SOC [V], over this range of SOC. Two coexisting phases keep it (Dreyer et al., Nature Materials 9, 2010, 448).
+Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
 USUAL_STD = 0.6
 """Relative standard deviation of a hysteresis that is no more than usual."""
 LEAST_SHARE, SHARE_POINTS, SHARE_K, SHARE_SOC = 0.1, 6, 10.0, (0.1, 0.95)
-"""Rests at SOC between these tell it themselves, if there are so many within this of the slow curves' temperature [K]."""
+"""Minimum fraction, number of rests, distance from the curves' temperature [K] and range of SOC with which rests
+determine it themselves."""
 OTHER_CAPACITY = 0.05
 """A capacity that differs by more from what a slow discharge measured is remarked on, relative."""
 

@@ -27,7 +27,7 @@ from bms_estimator.model.cell import TableOcv
 KNOTS: Floats = np.unique(
     np.r_[np.arange(0.0, 0.06, 0.015), np.arange(0.06, 0.25, 0.03), np.arange(0.25, 0.96, 0.045), 0.97, 0.985, 0.993, 1]
 )
-"""Of the spline: finer than this a curve of a layered oxide has no shape at rest, only the points' errors."""
+"""Knots of the spline: a finer curve of a layered oxide shows only the errors of its points."""
 NODES: Floats = np.unique(
     np.round(np.r_[np.arange(0.0, 0.1, 0.01), np.arange(0.1, 0.96, 0.02), np.arange(0.96, 1.001, 0.01)], 4)
 )
@@ -44,19 +44,19 @@ BEND_LENGTH = 0.05
 LEAST_SLOPE_V = 1e-3
 """Least slope of the curve, per cell of 4 V and 1 of SOC: monotone means invertible [V]."""
 CELL_V = 4.0
-"""Of the cell that the voltages above are for [V]."""
+"""Voltage of the cell that the voltages above refer to [V]."""
 TEMPERATURE_SPAN_C = 10.0
 """Sources that differ by less say nothing of dE/dT [K]."""
 ENTROPY_V_PER_K, ENTROPY_NODES = 3.5e-4, np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
 """Size of dE/dT before anything is measured [V/K]: 0.1 to 0.5 mV/K in published entropy profiles; where it may bend."""
 DEVIATION_NODES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
-"""Where what a source is off as a whole may change."""
+"""SOC nodes at which the systematic error of a source may change."""
 ROUGH = 0.7
 """Part of it that changes faster: of each point on its own."""
 SOC_STD, CAPACITY_STD = 0.004, 0.01
 """Standard deviations of a source's first SOC and of its capacity, relative: charging ends differ, cells age."""
 EMPTY_STD_V, FULL_STD_V = 0.05, 0.005
-"""What is known of the voltages at SOC 0 and 1 when no rest tells them, per cell [V]."""
+"""Std of the voltages at SOC 0 and 1 without a rest there, per cell [V]."""
 STEEPEST_V = 2.0
 """The slope that turns an error of SOC into one of voltage is no larger: at the ends it is not known well enough [V]."""
 STD_OF_MEDIAN = 1.48

@@ -31,7 +31,7 @@ from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.telemetry.alarms import Change
 
 STEP_S = 1.0
-"""What the identifier suspects is looked at so often, on the capture's clock [s]."""
+"""Interval at which the identifier's suspicions are read, on the capture's clock [s]."""
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Raised:
     ended_s: float | None
     """None: it is active at the end."""
     latched: bool
-    """Its cause is gone, but somebody would have to acknowledge it."""
+    """True if its cause has ended but it waits for acknowledgment."""
     value: float | None
     limit: float | None
     unit: str | None

@@ -39,7 +39,7 @@ class Result:
     k_final: float | None
     temperature_sensor: bool  # the capture has told the cell's temperature
     suspects: list[str]
-    """What the identifier suspects of its input at the end."""
+    """Suspicions of the identifier at the end."""
     gain_rearms: int
     dropped: dict[str, int]
     """Kind of fault -> samples that were not used."""
@@ -49,7 +49,7 @@ class Result:
     gaps: int
     time_steps_back: int
     parameters: dict[str, LearnedParameter]
-    """Of a fuel cell, by the keys of its file; of a battery none: they are over SOC."""
+    """Parameters of a fuel cell by the keys of its file; empty for a battery, whose parameters depend on SOC."""
     samples_per_s: float | None  # read, whether used or not
     wall_s: float
 

@@ -20,8 +20,8 @@ from bms_estimator.sources.captures.replay import load_capture
 
 SHOWN_ANCHORS = 30
 UNITS = 30.0
-"""No capacity is declared so many times too large or too small."""
-"""So many are listed for people; all with ``--json``."""
+"""Maximum ratio of declared and measured capacity."""
+"""Maximum number of rows printed as a table; ``--json`` has all."""
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,9 @@ class Value:
 
     value: float
     std: float | None
-    """Of the value, in its unit; None where the data did not tell of it."""
+    """Std of the value in its unit; None if the data did not determine it."""
     of_start: float
-    """What the file of --cell has."""
+    """Value in the file of --cell."""
     reason: str | None
     """Why the data did not tell of it."""
 

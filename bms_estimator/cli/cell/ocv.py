@@ -50,15 +50,16 @@ from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.replay import load_capture
 
 CELL_VOLTAGE_V = 3.7
-"""Of one Li-ion cell in the middle of its discharge: tells how many are in series [V]."""
+"""Voltage of one Li-ion cell in the middle of its discharge [V], which gives the number of cells in series."""
 LOWEST_CELL_V, HIGHEST_CELL_V, MOST_CELLS = 1.5, 4.5, 300
-"""Where that is of any of them [V], and how many are in series at most."""
+"""Range of that voltage for any cell [V], and maximum number of cells in series."""
 LOWEST, HIGHEST = 0.55, 1.06
 """Limits of a good sample: of the median voltage, of the full one."""
 LEAST_EMPTY = 0.25
 """An empty cell has at least this part of the voltage of a half full one."""
 MEASURED_CAPACITY_STD = 0.03
-"""Of a capacity measured by a slow discharge, relative: gain of the current sensor, other cells of the kind, some years."""
+"""Relative std of a capacity measured by a slow discharge: gain of the current sensor, other cells of the kind, some
+years."""
 CURRENT_MAX_C = 5.0
 """Limit of a good sample when the capture itself has no larger current [1/h]."""
 

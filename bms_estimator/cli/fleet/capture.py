@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 
 FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
 FEW = 5
-"""So many holes are shown."""
+"""Maximum number of gaps shown."""
 BLOCK_S = 120.0
-"""What begins no later than this after what was asked for is not said to be missing [s]: a block is of about a minute."""
+"""Maximum delay of the first block after the requested start that is not reported as missing [s]: a block has about a
+minute."""
 
 Since = Annotated[
     datetime | None, typer.Option("--from", formats=FORMATS, help="UTC; else from the oldest that is kept")

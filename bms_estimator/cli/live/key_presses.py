@@ -21,7 +21,7 @@ KEYS = {
     b"\x1bOD": "previous",
     b"q": "quit",
 }
-"""What a terminal sends -> what is meant: Tab and the arrows, in both modes that they have."""
+"""Actions by the bytes that a terminal sends: Tab and the arrows, in both of their modes."""
 LONGEST = 3
 READ_BYTES = 1024
 

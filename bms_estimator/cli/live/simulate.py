@@ -25,7 +25,7 @@ from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoar
 
 DEVICES = (*METERS, *BMS_ANSWERS)
 DEFAULT_LOAD_C = 3.0
-"""A load of so many times the capacity per hour moves SOC while one looks."""
+"""Default load as a multiple of the capacity per hour: SOC moves visibly."""
 
 
 def simulate(

@@ -22,7 +22,7 @@ from bms_estimator.sinks.terminal.panels import LOG_LINES
 from bms_estimator.sinks.terminal.scene import BrokerOutage
 
 TICK_S = 1.0
-"""Also when nothing is heard the view is made anew: it says since when that is [s]."""
+"""Redraw interval without messages [s]: the view shows the time since the last one."""
 STEPS = {"next": 1, "previous": -1}
 
 

@@ -15,7 +15,7 @@ from bms_estimator.kernels.compile_events import report_compilation
 Show = Callable[[str], None]
 """Takes a line."""
 LINE_S = 5.0
-"""Where lines stay there is one no more often than this [s]."""
+"""Minimum interval between two lines where lines stay visible [s]."""
 
 
 @contextmanager

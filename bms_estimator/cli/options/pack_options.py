@@ -13,7 +13,7 @@ from bms_estimator.settings.pack import PackSettings, Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings
 
 TABLE_RESOLUTION_V = 1e-3
-"""What a capture resolves when no pack file says otherwise: laboratory equipment's millivolt [V]."""
+"""Resolution of a capture without a pack file [V]: a millivolt, as of laboratory equipment."""
 
 
 def load_pack(path: Path) -> tuple[Settings, PackModel]:

@@ -13,10 +13,10 @@ from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.model.sample import SampleBlock
 
 AHEAD_S = 3600.0
-"""The edges' clocks are ahead of the server's by no more: a block is kept at most so long before its samples' time [s]."""
+"""Maximum lead of an edge's clock over the server's [s]: a block may be stored this long before its samples' time."""
 
 ROWS = 65_536
-"""Samples of blocks are handed over at least so many at a time, but the last."""
+"""Minimum number of samples handed over at a time, except for the last ones."""
 
 
 @dataclass

@@ -35,21 +35,22 @@ _WORDS = {
     "permissions violation": "these credentials may not do that: look at --creds",
     "certificate_verify_failed": "its certificate is of nobody whom we trust, or names another server: look at --ca",
 }
-"""What the library says in words alone."""
+"""Errors that the library reports as text only."""
 
 LET_IN_S = 10
-"""So long each step of letting somebody in may take, on a far line or while many come back at once. The server's own is 2 [s]."""
+"""Timeout of each step of an authentication [s], on a slow line or while many reconnect at once. The server's default
+is 2."""
 
 RETRY_S = 1
 """Between two attempts to connect [s]."""
 PING_S = 10
-"""After two pings without an answer a connection that broke in silence is made anew [s]."""
+"""Ping interval [s]; a connection without two responses is reconnected."""
 FLUSH_S = 5.0
-"""So long who has much to say waits for a server that reads nothing [s]."""
+"""Timeout of a flush to a server that reads nothing [s]."""
 CLOSING_S = 3.0
-"""So long a connection may take to end [s]."""
+"""Timeout of closing a connection [s]."""
 SAID_S = 30.0
-"""The same trouble is logged no more often [s]."""
+"""Minimum interval between two log lines about an equal error [s]."""
 
 log = structlog.get_logger(__name__)
 # The library's end of a TLS connection, of no use to anybody.

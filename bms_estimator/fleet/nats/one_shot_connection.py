@@ -13,7 +13,7 @@ from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
 
 CONNECT_S, RETRY_S = 5, 0.1
-"""So long an answer of the server is waited for; between two attempts [s]."""
+"""Timeout of a connection attempt, and delay between two attempts [s]."""
 
 
 @asynccontextmanager

@@ -14,9 +14,9 @@ from nats.aio.subscription import Subscription
 from nats.errors import TimeoutError as NatsTimeoutError
 
 BATCH, BATCH_BYTES = 1000, 8 << 20
-"""Messages, and bytes of them, of one answer at most: nobody else waits long for the connection."""
+"""Maximum number and size of messages in one response, so that other users of the connection do not wait long."""
 ANSWER_S = 10.0
-"""So long a message of an answer is waited for."""
+"""Timeout of one message of a response [s]."""
 _END, _NONE = "204", "404"
 
 

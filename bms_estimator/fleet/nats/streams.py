@@ -22,9 +22,9 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 RAW_BYTES, RAW_AGE_S = 8 << 30, 7 * 86_400.0
-"""What ``RAW`` keeps at most."""
+"""Maximum size and age of the stream ``RAW``."""
 HOURS_PART, HOURS_AGE_S = 1 / 16, 30 * 86_400.0
-"""What ``HOURS`` may take, of what ``RAW`` may; and so long summaries wait for who collects them."""
+"""Maximum size of ``HOURS`` as a fraction of that of ``RAW``, and time that summaries wait for their collector [s]."""
 MAX_BLOCK_BYTES = 256 << 10
 """Maximum size of a block in ``RAW`` [bytes]: 7,000 samples that do not compress fit."""
 PACK_FRACTION = 1 / 3
@@ -35,17 +35,17 @@ MIN_PACK_BLOCKS = 60
 DUPLICATES_S = 3600.0
 """A summary that comes again within it, under its number, is dropped."""
 GROUP = "w"
-"""Of a consumer's priority groups: workers."""
+"""Priority group of a consumer for workers."""
 PIN_S = 2.0
-"""A worker that has asked for nothing for so long has lost a partition."""
+"""Time without a request after which a worker loses a partition [s]."""
 PARTITIONS_KEY = "bms.partitions"
 """In the metadata of ``RAW``."""
 ANSWER_S, ATTEMPTS = 5.0, 12
-"""A cluster drops what is asked while it chooses a leader: so long an answer is waited for, and so often it is asked."""
+"""Timeout of a request [s] and number of attempts: a cluster drops requests while it elects a leader."""
 NO_SUCH_STREAM = 10059
 """The server's number for it."""
 AT_ONCE = 16
-"""So many consumers are made at a time."""
+"""Number of consumers created at a time."""
 
 
 class NoAnswerError(UserError):

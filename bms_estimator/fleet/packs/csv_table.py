@@ -16,7 +16,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import DEVICE_NAME
 
 MOST_SAID = 20
-"""Of the errors of a table so many are shown."""
+"""Maximum number of a table's errors that are shown."""
 CELL_FILE = ".toml"
 """The end of a cell that is a file beside the table."""
 _WHOLE = ("series", "parallel")

@@ -17,7 +17,7 @@ from bms_estimator.fleet.packs.pack_registry import PackRegistry
 POLL_S = 1.0
 """Between two looks for what has changed."""
 AT_ONCE = 2000
-"""Of rows that are written, so many wait for the server's answer."""
+"""Maximum number of written rows waiting for the server's acknowledgment."""
 _GONE = frozenset({"DEL", "PURGE"})
 
 

@@ -14,7 +14,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
 MOST_KINDS = 1024
-"""So many kinds of packs are kept ready."""
+"""Maximum number of kinds of packs that are cached."""
 UNKNOWN_PACK = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
 
 

@@ -24,7 +24,7 @@ from bms_estimator.settings.pack import DeviceName, PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
-"""Of a cell; one of a pack has more in it than the pack's."""
+"""Pattern of a cell's name; a cell file of one pack has a longer name than the pack."""
 _COUNT = Field(ge=1, le=10_000)
 
 
@@ -65,7 +65,7 @@ class PackRow(PackSpec):
 
 
 COLUMNS = ("pack", *PackSpec.model_fields)
-"""Of a table, in the order in which it is written."""
+"""Columns of a table, in the order in which they are written."""
 
 
 def stored(kind: PackSpec) -> bytes:

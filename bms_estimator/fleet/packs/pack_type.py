@@ -16,7 +16,7 @@ from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
 MOST_TYPES = 256
-"""Of so many the settings are kept, 40 kB each; those of more are made again and again, 50 ms each."""
+"""Maximum number of cached types, 40 kB each; others are made again each time, in 50 ms."""
 Digest = tuple[int, int]
 """The first 128 bits, as two words."""
 

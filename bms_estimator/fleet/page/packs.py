@@ -15,15 +15,15 @@ from pydantic_core import from_json
 from bms_estimator.model.input_faults import InputFault
 
 ALIVE_S = 180.0
-"""A pack that sends a block a minute is silent when it has not been heard for so long [s]."""
+"""Time without a block after which a pack counts as silent [s]; a pack sends a block a minute."""
 LISTED = 20
 """Packs of a list, at most."""
 MOST_TYPES = 8
-"""That are told apart; the rarer ones are taken together."""
+"""Maximum number of types shown; the rarer ones are combined."""
 OTHER, UNLISTED = "other types", "not in the table"
 SOC_EDGES = np.linspace(0.0, 1.0, 21)
 STD_EDGES = np.array([0.0, 0.01, 0.02, 0.04, 0.06, 0.08, 0.12, 0.16, 0.20, 0.30, 0.40, 0.60, math.inf]) / 2.0
-"""Of bins. The page shows two standard deviations."""
+"""Edges of the bins. The page shows two standard deviations."""
 
 ROW = np.dtype(
     [
@@ -38,7 +38,7 @@ ROW = np.dtype(
 )
 _NEW = np.array([(-math.inf, math.nan, math.nan, math.nan, 0, 0, False)], dtype=ROW)
 FIELDS = {"soc": "soc", "soc_std": "soc_std", "margin": "stability_margin"}
-"""Of a row: of a state."""
+"""Fields of a state by the columns of a row."""
 
 Rows = NDArray[np.void]
 Mask = NDArray[np.bool_]
@@ -48,7 +48,7 @@ class Concern(NamedTuple):
     """Why a pack needs attention."""
 
     column: str
-    """What is ranked by."""
+    """Column of the ranking."""
     falls: bool
     """The smallest first."""
     limit: float
@@ -60,7 +60,7 @@ CONCERNS = {
     "soc": Concern("soc", falls=True, limit=0.1),
     "uncertain": Concern("soc_std", falls=False, limit=0.05),
 }
-"""Of packs that are alive."""
+"""Concerns about live packs."""
 
 
 class FleetPacks:

@@ -9,7 +9,7 @@ from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.model.errors import UserError
 
 ASKED = ("soh", "failing", "outliers", "honest")
-"""Of the questions."""
+"""Queries of the page."""
 LISTED = 20
 """Rows of an answer, at most."""
 

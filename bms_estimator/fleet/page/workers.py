@@ -8,9 +8,9 @@ from bms_estimator.fleet.heartbeat import Heartbeat
 ALIVE_S = 5.0
 """A worker says each second that it lives; the page is given more time than other workers, which take over after 3 s [s]."""
 REMEMBERED_S = 300.0
-"""One that is gone is named for so long [s]."""
+"""Time for which a lost worker is listed [s]."""
 OVER_S = 10.0
-"""Rates are means over so long [s]."""
+"""Averaging time of rates [s]."""
 MOST_WORKERS = 256
 UNHELD = -1
 

@@ -27,13 +27,13 @@ from bms_estimator.model.errors import UserError
 DURABLE = "collector"
 """The consumer: who collects goes on where the one before was."""
 PERIOD_S = 300.0
-"""A row waits at most so long for its file: more files of a day are slower to ask [s]."""
+"""Maximum time that a row waits for its file [s]; more files of a day slow down queries."""
 MOST_ROWS = 10_000
-"""Of a file: they wait in memory, 5 kB each."""
+"""Maximum number of rows of a file; they wait in memory, 5 kB each."""
 AT_ONCE = 1000
 """Rows that are fetched at a time."""
 FETCH_S = 0.5
-"""Without any row the loop comes round so often [s]."""
+"""Poll interval without rows [s]."""
 COMPACT_S = 600.0
 """Between two looks for days whose files should be one [s]."""
 RETRY_S = 10.0

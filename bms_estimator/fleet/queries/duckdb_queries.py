@@ -26,9 +26,9 @@ AGED_SOC, CHARGE_ERROR = 1000.0, 0.002
 """As in ``kernels.kalman_filter.records.Noise``: what the filter takes for granted between two estimates."""
 READING = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 BY_CHANCE = 0.1
-"""So many packs of a whole fleet may be accused by chance, of each quantity."""
+"""Expected number of packs of a whole fleet that are reported by chance, for each quantity."""
 LEAST_STDS = 3.0
-"""Nobody is accused for less, however small the fleet."""
+"""Minimum deviation of a reported pack in std, for any size of fleet."""
 
 
 class Query(NamedTuple):
@@ -59,21 +59,21 @@ class Limits:
     r_s_limit: float = 2.0
     """failing: times that of the cell file."""
     r_s_fresh_s: float = 86_400.0
-    """Of R_s counts what data have told of within so long [s]."""
+    """Maximum age of the data behind a used R_s [s]."""
     least_days: int = 7
-    """soh, failing: a trend has points of so many days at least."""
+    """Queries soh, failing: minimum number of days in a trend."""
     least_packs: int = 5
-    """outliers: so many packs that know enough say what is usual of their type."""
+    """Query outliers: minimum number of certain packs that define what is usual of their type."""
     least_spread: float = 0.01
-    """outliers: packs of a type differ by so much at least, relative std."""
+    """Query outliers: minimum relative std between packs of a type."""
     recent_days: int = 3
-    """failing: what is suspected on most of so many last days, and was not before."""
+    """Query failing: number of last days on most of which a new suspicion stands."""
     silent_hours: int = 2
     """silent: no summary for longer; a living pack's newest is of the hour before."""
     most_packs: int = 10_000
-    """honest: asks so many packs, chosen by a hash of their name."""
+    """Query honest: maximum number of packs, chosen by a hash of their name."""
     least_seen_s: float = 3590.0
-    """honest: so much of each hour between was measured [s]."""
+    """Query honest: minimum measured part of each hour in between [s]."""
     surer: float = 0.5
     """honest: a later estimate judges where its variance is below this part."""
 

@@ -19,13 +19,13 @@ from bms_estimator.fleet.hour_row import HOUR_S, Hour
 
 FOLDER = "date="
 BATCH, DAY, UNFINISHED = "batch-", "day-", ".part"
-"""What the names of files begin with that came as they are, and of those made of many; how one ends that is not whole."""
+"""Prefixes of single files and of merged ones, and the suffix of an unfinished file."""
 MANY = 48
-"""A day of so many files becomes one though it is not over, or was one already."""
+"""Number of files at which a day is merged before its end, or again."""
 ROW_GROUP = 100_000
 """Rows that a question reads at least [rows]."""
 CLOSED_S = 2 * HOUR_S
-"""A day is closed so long after its end: most of what comes late has come [s]."""
+"""Time after its end at which a day is closed [s]: most late blocks have arrived by then."""
 MEMORY = "500MB"
 """A day of 100,000 packs has more bytes; DuckDB sorts it in parts."""
 _MAGIC = b"PAR1"

@@ -42,7 +42,7 @@ class Role(Enum):
 
 
 BEARERS = (Role.EDGE, Role.DASHBOARD)
-"""They connect by MQTT, which asks nobody to sign: whoever has the token is the user."""
+"""Roles that connect by MQTT, which has no signatures: the holder of the token is the user."""
 
 _READS = (
     "$JS.API.INFO",

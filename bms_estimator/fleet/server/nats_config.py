@@ -11,11 +11,13 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.connection import LET_IN_S
 
 NATS_PORT, MQTT_PORT, MONITOR_PORT, CLUSTER_PORT = 4222, 1883, 8222, 6222
-"""As NATS has them; the monitor, which asks nobody for a name, stays on the loopback."""
+"""Default ports of NATS; the monitor has no authentication and stays on the loopback."""
 LONGEST_BLOCK_BYTES = 1 << 20
-"""Of a message: a block of 60 samples takes 700 bytes, one of a whole day at 1 Hz less than this."""
+"""Maximum size of a message [bytes]: a block of 60 samples takes 700 bytes, one of a whole day at 1 Hz less than
+this."""
 MOST_CONNECTIONS = 200_000
-"""Of a node: where two of three are away, one has all edges. The server's own limit is 65,536."""
+"""Maximum number of connections of a node: if two of three are down, one has all edges. The server's default is
+65,536."""
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,12 @@ ROUND_S = 0.1
 MOST_IN_FLIGHT = 2000
 """Blocks that a connection may have sent without an acknowledgement."""
 QUIET_S = 3.0
-"""After the last block: a worker that misses one has so long to say so [s]."""
+"""Time after the last block in which a worker may request a missing one [s]."""
 SAID_S = 5.0
 """From one line about it to the next [s]."""
 KEEPALIVE_S = 20
 LEAST_WAIT_S, MOST_WAIT_S = 1, 4
-"""Before a connection that broke is made anew [s]."""
+"""Minimum and maximum delay before a reconnect [s]."""
 _HEARD = awaits("+").replace(".", "/")
 
 
@@ -43,12 +43,12 @@ class Report(NamedTuple):
     """Sent, those sent again among them."""
     again: int
     bytes: int
-    """Of the blocks."""
+    """Size of the blocks [bytes]."""
     resends: int
     """Asked for by workers."""
     unacknowledged: int
     lag_s: float
-    """How long the oldest complete block has not been sent [s]."""
+    """Age of the oldest complete block that was not sent [s]."""
 
     def __str__(self) -> str:
         return (

@@ -9,7 +9,7 @@ from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFle
 from bms_estimator.model.arrays import Floats
 
 RESEND_S = 5.0
-"""A worker that is behind asks for the same block again before it can have it: it is sent once in so long [s]."""
+"""Minimum interval between two resends of a block [s]: a worker that lags asks for it again before it can have it."""
 
 
 class Due(NamedTuple):

@@ -27,7 +27,7 @@ Whole = NDArray[np.int64]
 Bits = NDArray[np.uint64]
 
 BLOCK_S = 60
-"""Of a block, one sample a second [s]."""
+"""Length of a block at one sample a second [s]."""
 MIDDLE_SOC, SWING_SOC = 0.52, 0.36
 """SOC goes from 0.16 to 0.88."""
 SLOW, QUICK, QUICKNESS = 0.75, 0.25, 3.3
@@ -35,13 +35,13 @@ SLOW, QUICK, QUICKNESS = 0.75, 0.25, 3.3
 SHORTEST_S, LONGEST_S = 8 * 3600.0, 24 * 3600.0
 """Period of the slow one [s]: up to 0.43 C."""
 PULSE_S, PULSE_C = 15, 0.6
-"""Of each minute: a pulse of up to so much, then a third of it the other way."""
+"""Length [s] and maximum size [C] of a pulse in each minute; a third of it in the other direction follows."""
 PAST_MINUTES = 5
 """Whose pulses are still felt: e^(-300/20) of them is left after that."""
 TAU_TS_S, TAU_TL_S = 20.0, 800.0
-"""Of the branches [s]."""
+"""Time constants of the branches [s]."""
 JITTER_S = 0.02
-"""Time stamps of a real device are off by up to so much [s]."""
+"""Maximum error of a real device's timestamps [s]."""
 WORN, NEW, TIRED = 0.75, 1.02, 0.6
 """True capacity to the declared one: the range, and that of a pack whose capacity leaves it."""
 MOST_RESISTANCE, FAILING = 1.6, 3.0
@@ -80,7 +80,7 @@ COLUMNS = (
     "current_resolution_a",
     "period_s",
 )
-"""Of the table of packs."""
+"""Columns of the table of packs."""
 
 
 class _Curves:

@@ -13,9 +13,9 @@ from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.worker.pack_state import MOST_LOST
 
 TOLD_EACH = 10
-"""Blocks: so often an edge hears that those before are safe."""
+"""Number of blocks between two confirmations to an edge that earlier blocks are safe."""
 ASKED_EACH = 5
-"""Blocks that came too early: so often it hears again from where to send."""
+"""Number of early blocks after which an edge is told again where to resume."""
 
 MAX_PASSED = 20
 """Missing blocks count as lost after the first one behind them has come this many times. The edge resends them all, at least 30 s

@@ -29,9 +29,9 @@ from bms_estimator.fleet.nats.stored_messages import stored
 from bms_estimator.model.clock import iso_utc
 
 KEPT = 2
-"""So many checkpoints of a partition: the last, and one before, should the last be damaged."""
+"""Number of checkpoints of a partition that are kept: the last, and one before in case the last is damaged."""
 PIECE_BYTES = 128 << 10
-"""Of an object, in one message."""
+"""Size of an object's chunk, one message [bytes]."""
 _STREAM = f"OBJ_{subjects.STATES_BUCKET}"
 
 log = structlog.get_logger(__name__)
@@ -47,7 +47,7 @@ class CheckpointInfo(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     sequence: int
-    """Of the stream: the last message that is in it."""
+    """Sequence number of the last message of the stream in it."""
     object: str
     """Its name in the bucket of states."""
     bytes: int

@@ -18,7 +18,7 @@ from bms_estimator.kernels.packed_record import WORD_BYTES, pack, room, symmetry
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 
 Fields = Mapping[str, NDArray[Any]]
-"""Of a record, by their names, those of parts as ``part.field``."""
+"""Fields of a record by name, those of parts as ``part.field``."""
 MOST_LOST = 2**62
 """No more lost blocks are counted."""
 

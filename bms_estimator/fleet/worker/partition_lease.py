@@ -34,13 +34,14 @@ from bms_estimator.process.tasks import until_first_ends
 RETRY_S = 0.5
 """Between two attempts at what the server does not do now [s]."""
 SILENCE_S = 3.0
-"""So long after the last message the stream is asked whether there was another: those who give back have had their time [s]."""
+"""Time without a message after which the stream is checked for another one [s]: a worker that releases a partition
+has finished by then."""
 LATER_S = 5.0 * SILENCE_S
 """After it had no other [s]."""
 HOURS_AT_ONCE = 128
 """Summaries that wait for the server's answer at a time."""
 TROUBLES = (NatsError, TimeoutError, StreamError)
-"""What may go wrong between us and the server: tried again."""
+"""Errors between worker and server that are retried."""
 
 log = structlog.get_logger(__name__)
 

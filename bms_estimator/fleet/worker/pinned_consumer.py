@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.streams import ANSWER_S, GROUP, PIN_S, consumer
 RENEW_S = PIN_S / 4.0
 """Between two requests [s]: the loop may be three times as late without losing a pin."""
 EXPIRES_S = 2.5 * RENEW_S
-"""Of a request [s]."""
+"""Expiry of a request [s]."""
 BATCH = 32
 """Messages that a request asks for, unless as many wait here already."""
 PIN_HEADER, STATUS_HEADER = "Nats-Pin-Id", "Status"
@@ -36,7 +36,7 @@ class DeliveredMessage(NamedTuple):
     sequence: int
     """In the stream."""
     pin: int
-    """How often this consumer has been pinned to us until then."""
+    """Number of times that this consumer has been pinned to this worker."""
     follows: bool
     """It comes right after the one given before: no other message of the partition is between."""
 

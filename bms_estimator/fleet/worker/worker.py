@@ -27,9 +27,9 @@ from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import end, until_first_ends
 
 CHECKPOINT_S = 300.0
-"""Between two checkpoints of a partition, unless told otherwise [s]."""
+"""Default interval between two checkpoints of a partition [s]."""
 LISTEN_S = 0.5
-"""So long others are listened to before partitions are tried for: who hears of a new worker answers at once [s]."""
+"""Time of listening to other workers before partitions are claimed [s]: they answer a new worker at once."""
 LOOK_S = 0.5
 """Between two looks for a checkpoint that is due, or summaries that wait [s]."""
 MOST_UNKNOWN = 20

@@ -31,13 +31,13 @@ MOST_WAITING = 10_000
 BATCH = 1000
 """Lines in one request, a megabyte at most."""
 ANSWER_S = 10.0
-"""For so long the server may be silent [s]."""
+"""Timeout of a server response [s]."""
 CLOSING_S = 3.0
-"""How long the last request may take [s]."""
+"""Timeout of the last request [s]."""
 NEVER = (400, 413, 422)
 """Answers to what will never be taken: the lines are given up. All others may pass."""
 MOST_SHOWN = 200
-"""Of an answer goes to the log [characters]."""
+"""Maximum length of a response in the log [characters]."""
 
 log = structlog.get_logger(__name__)
 

@@ -52,9 +52,9 @@ COUNTERS = (
     "broker_losses",
     "availability_corrections",
 )
-"""What only grows."""
+"""Fields that only grow."""
 LEFT_OUT = ("soc_percent", "board_time_s")
-"""The same as another, or a clock that begins anywhere."""
+"""Fields that repeat another one, or a clock with an arbitrary origin."""
 KINDS = {"line": "what the line counted", "samples": "samples by what became of them", "requests": "requests by kind"}
 """Fields of the health that count by kind -> what they are."""
 OWN_NAMES = {"cells_v": "cell"}

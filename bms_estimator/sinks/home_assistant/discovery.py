@@ -22,7 +22,7 @@ ALARM_CLASSES = {
     "under_temperature": "cold",
     "charging_below_freezing": "cold",
 }
-"""Where it is not "problem"."""
+"""Device classes of alarms other than "problem"."""
 _SEES = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
 """An alarm that is raised stays on: what it needs may be lost after it was raised."""
 NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
@@ -34,7 +34,7 @@ class DiscoveryInputs(NamedTuple):
 
     info: Info
     cells: int = 0
-    """So many are measured."""
+    """Number of measured cells."""
     alarms: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
     """That are allowed."""

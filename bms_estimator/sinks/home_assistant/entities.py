@@ -10,7 +10,7 @@ from typing import NamedTuple
 from bms_estimator.model.payloads import Info
 
 QUICK_S = 15.0
-"""What a load moves all the time is shown anew no more often than this: four rows a minute [s]."""
+"""Minimum interval of a value that the load moves all the time [s]: four rows a minute."""
 SLOW_S = 60.0
 """All other values [s]."""
 
@@ -24,7 +24,7 @@ class Entity(NamedTuple):
     decimals: int
     """To which it is rounded."""
     step: float
-    """It is shown anew when it has changed by so much, in its unit: what noise moves is less."""
+    """Minimum change of a published value, in its unit, above its noise."""
     device_class: str | None = None
     min_interval_s: float = SLOW_S
     """Nor more often than this [s]."""
@@ -36,7 +36,7 @@ class Entity(NamedTuple):
     signed: bool = False
     """Its sign is that of the current."""
     immediate_step: float = math.inf
-    """A change by so much is shown at once: somebody has set it."""
+    """Change that is published at once, because a user has set the value."""
 
 
 def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:

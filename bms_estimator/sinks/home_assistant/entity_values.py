@@ -12,7 +12,7 @@ from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs
 from bms_estimator.sinks.home_assistant.entities import Entity, cell_key, entities
 
 MOST_ROWS = 18
-"""Values that are shown anew in a minute, of those that are enabled by default; two are left for alarms."""
+"""Maximum number of default-enabled values published in a minute; two more are reserved for alarms."""
 MINUTE_S = 60.0
 PAUSE_S = 5.0
 """Between two messages with values [s]."""
@@ -27,7 +27,7 @@ class EntityStates(NamedTuple):
     changed_s: Mapping[str, float] = {}
     told_s: float = -math.inf
     rows_s: tuple[float, ...] = ()
-    """When a value was shown anew, in the last minute."""
+    """Times at which values were published in the last minute."""
 
 
 def values_to_publish(

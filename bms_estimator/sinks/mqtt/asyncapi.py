@@ -30,7 +30,7 @@ ARGUMENTS: dict[str, Document] = {
     "acknowledge_alarm": {"name": {"type": ["string", "null"], "description": "of an alarm; all when left out"}},
     "publish_rate": {"rate_hz": {"type": "number", "minimum": LEAST_RATE_HZ, "maximum": MOST_RATE_HZ}},
 }
-"""Of a command -> its fields."""
+"""Fields of each command."""
 OPTIONAL = ("name",)
 """Fields that may be left out."""
 RESPONSE = {

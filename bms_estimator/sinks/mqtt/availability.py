@@ -11,7 +11,7 @@ from bms_estimator.mqtt.denied_topics import DeniedTopics
 from bms_estimator.mqtt.message import Message
 
 CORRECTION_S = 5.0
-"""An availability that somebody else wrote is put right no more often than this [s]."""
+"""Minimum interval between two corrections of an availability that another client wrote [s]."""
 BURST_S = 60.0
 """Corrections closer than this are one burst, of which one line is logged [s]."""
 ECHO_S = 10.0

@@ -26,9 +26,9 @@ READS_PER_MIN = 120.0
 COMMANDS_PER_MIN = 6.0
 """Requests that change something, granted or not [1/min]."""
 LOG_S = 60.0
-"""Of each kind of refusal no more than one line in this time; all are counted [s]."""
+"""Minimum interval between two log lines for each kind of refusal [s]; all are counted."""
 MOST_SHOWN = 40
-"""So much of a foreign name goes to the log [characters]."""
+"""Maximum length of a foreign name in the log [characters]."""
 
 Handler = Callable[[Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
 """Takes the request's arguments, returns the response's data. Raises UserError when it cannot be granted."""

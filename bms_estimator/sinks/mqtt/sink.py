@@ -36,7 +36,7 @@ BIRTH_DELAY_S = 2.0
 HANDOVER_S = 2.0
 """At the end: how long what still waits in the outbox may take [s]."""
 CLOSING_S = 3.0
-"""How long the last messages may take in all [s]."""
+"""Timeout of the last messages together [s]."""
 
 log = structlog.get_logger(__name__)
 

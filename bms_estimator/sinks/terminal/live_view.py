@@ -25,11 +25,11 @@ REDRAW_S = 0.25
 HISTORY = 256
 """Publications that the curves of voltage and current remember: the width of a very wide screen."""
 WAITING_LINES = 1000
-"""So many lines wait for a pipe that nobody reads; then the oldest goes."""
+"""Maximum number of lines waiting for a pipe that is not read; then the oldest is dropped."""
 END_LINES = 4
 """Below the view that stays there is room for what is said in the end, and for the prompt."""
 CLOSE_S = 2.0
-"""For so long the last view waits for a terminal that takes none [s]."""
+"""Time that the last view waits for a terminal that does not read [s]."""
 
 
 T = TypeVar("T")

@@ -19,23 +19,23 @@ from bms_estimator.sinks.terminal.layout import FlowLayout, LayoutBlock, fitted
 from bms_estimator.sinks.terminal.scene import ScreenState
 
 WIDE_CELLS, WIDE_LINES = 76, 18
-"""Two columns of panels need so much room."""
+"""Minimum size for two columns of panels."""
 PANEL_CELLS = 4
-"""Of its border and padding."""
+"""Width of a panel's border and padding."""
 VALUE_CELLS = 8
 """Numbers change their length; columns must not dance."""
 SPARKS = "▁▂▃▄▅▆▇█"
 LOG_LINES = 2
 """The last of the log, which the screen hides."""
 MOST_ALARMS = 4
-"""So many are shown in full."""
+"""Maximum number of alarms shown in full."""
 MOST_PACKS = 8
-"""So many packs are listed, around the one that is shown."""
+"""Maximum number of packs listed, around the shown one."""
 NARROW_MARGIN = 0.05
 """A stability margin below is shown as a warning."""
 LOW_SOC = 0.2
 BAND_STDS = 2.0
-"""Of the band around the SOC: it holds the truth 19 times out of 20."""
+"""Half width of the band around the SOC in std: it holds the ground truth 19 times out of 20."""
 
 ELEMENT_UNITS = {
     "r_s_ohm": ("R_s", 1e3, "mΩ"),
@@ -54,7 +54,7 @@ ELEMENT_UNITS = {
 }
 """Element -> name, factor and unit on the screen."""
 WORN = {"capacity": "capacity", "r_s": "R_s"}
-"""What tells of wear -> name on the screen."""
+"""Names on the screen of quantities that show wear."""
 COUNTED = {"lock_losses": "lock losses", "reconnects": "reconnects"}
 """Fault counter of the health -> name on the screen."""
 

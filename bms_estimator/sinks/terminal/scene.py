@@ -28,7 +28,7 @@ class PackView:
     """What one pack published last."""
 
     device: str = ""
-    """Its name; empty where there is none."""
+    """Name of the device; empty without one."""
     topics: Mapping[str, object] = field(default_factory=dict)
     """Payloads by topic below the device's."""
     heard_s: float = 0.0

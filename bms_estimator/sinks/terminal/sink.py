@@ -11,7 +11,7 @@ from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.terminal.live_view import LiveView
 
 BASE_TOPIC = "bms"
-"""Nobody sees these topics."""
+"""Base topic of the messages, which are not sent."""
 
 
 class TerminalSink:
