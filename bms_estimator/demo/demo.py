@@ -76,7 +76,7 @@ async def run_demo(
         settings = _settings(board.path, broker.url, page, rate_hz)
         view = TerminalSink(log=log, hint=hint, true_soc=truth.soc)
         pages = Pages(opened)
-        # no folder of state: it begins anew each time
+        # no state folder: start from the beginning each time
         await run_pack_service(settings, cell, sinks=[view, totals], tap=truth, stop=stop, pages=pages)
     return totals.summary()
 

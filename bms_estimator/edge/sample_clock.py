@@ -40,7 +40,7 @@ class SampleClock:
         self._lead_s = math.nan  # our clock less the host's steady one
         self._told_s = math.nan  # the source's clock at the last sample
         self._offset_s = 0.0  # our clock less the source's
-        self._slew_s = 0.0  # by so much the offset is to grow, slowly
+        self._slew_s = 0.0  # slow increase of the offset
         self._least_late_s, self._window_s = math.inf, 0.0  # of the present window, and when it began
 
     def go_on_from(self, time_s: float) -> None:

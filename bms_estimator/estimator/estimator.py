@@ -149,7 +149,7 @@ class Estimator:
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
         if self.identifying:
             self.record["filter"]["soc"] = self.state["soc"]
-            self.record["filter"]["smallest_a"] = 0.0  # a sensor shows anew what it can
+            self.record["filter"]["smallest_a"] = 0.0  # a sensor repeats what it can measure
 
 
 def estimator_of(settings: Settings, cell: PackModel) -> Estimator:

@@ -40,7 +40,7 @@ class _Listener(event.Listener):
     def on_start(self, event: event.Event) -> None:
         """Count a kernel of this package; inner functions come after their callers."""
         kernel = event.data["dispatcher"].py_func
-        if kernel in self._waiting:  # a kernel is compiled anew for each kind of argument
+        if kernel in self._waiting:  # a kernel is compiled for each type of argument
             self._waiting.remove(kernel)
             self._tell(_name(kernel), self._all - len(self._waiting), self._all)
 

@@ -40,7 +40,7 @@ ESTIMATOR_STATE = np.dtype(
         ("fit", ELEMENT_FIT),
         ("fit_age_s", "f8"),  # since an element was fitted
         ("next_element", "i8"),  # to be fitted
-        ("unseen_s", "f8"),  # before the first sample of a new clock; infinite when nobody knows
+        ("unseen_s", "f8"),  # gap before the first sample of a new clock [s]; infinite if unknown
         ("unlearned_s", "f8", ELEMENTS),  # since the map learned of each element; infinite: never did
     ],
     align=True,

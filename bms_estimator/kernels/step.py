@@ -100,7 +100,7 @@ def step(
         dt_s = state[0].unseen_s
         settle_s = settings[0].learning.settle_s  # the load meanwhile is not known
         state[0].learning.settle_s = state[0].series_resistance.settle_s = settle_s
-    if not 0.0 <= dt_s < math.inf:  # the clock was set back, or nobody knows how long nobody measured: go on from here
+    if not 0.0 <= dt_s < math.inf:  # the clock was set back, or the gap is unknown: continue from here
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
         if new_clock:

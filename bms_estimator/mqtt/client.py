@@ -174,7 +174,7 @@ class Client(aiomqtt.Client):
             async with asyncio.timeout(PARTING_S):
                 await self.__aexit__(None, None, None)
         if self._disconnected.done() and not self._disconnected.cancelled():
-            self._disconnected.exception()  # else asyncio prints that nobody has looked at it
+            self._disconnected.exception()  # otherwise asyncio logs that the exception was never retrieved
 
     def _on_connect(
         self, client: Any, userdata: Any, flags: Any, reason_code: ReasonCode, properties: Properties | None = None
@@ -204,7 +204,7 @@ class Client(aiomqtt.Client):
             return
         if not self._connected.done():
             self._connected.set_exception(ClosedError(self._why))
-        if self._connected.cancelled():  # nobody waits any more; the base would ask it for its exception
+        if self._connected.cancelled():  # no caller waits any more; the base class would read its exception
             return
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
 

@@ -63,7 +63,7 @@ class PackTopics(LatestValues):
             return
         try:
             text = _json(value)
-        except RecursionError:  # somebody else's: deeper than it could be written
+        except RecursionError:  # another publisher's: deeper than it could be written
             return
         if value is None:
             self._forget(pack, topic)
@@ -130,7 +130,7 @@ class PackTopics(LatestValues):
         """Keep what the curves show, once a second; a state that comes late or is dated far in the future is left out."""
         try:
             row = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
-        except (TypeError, ValueError, KeyError):  # somebody else's
+        except (TypeError, ValueError, KeyError):  # another publisher's
             return
         if row[0] > self._wall() + MAX_AHEAD_S:  # all later states would be ignored
             return

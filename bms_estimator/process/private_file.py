@@ -39,7 +39,7 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
         OSError: The disk does not take it. The old file is as it was.
     """
     new = path.with_suffix(".new")
-    new.unlink(missing_ok=True)  # what a power cut has left, or somebody has planted
+    new.unlink(missing_ok=True)  # left by a power cut, or an unexpected symlink
     with open(new, "xb", opener=_private) as file:
         if os.geteuid() == 0:
             folder_is = path.parent.stat()

@@ -107,7 +107,7 @@ class Publisher:
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
         self.kept: ChargeEnergy | None = None
-        self._flow = ChargeEnergy()  # as it was told last
+        self._flow = ChargeEnergy()  # as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
         self.watch = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks)
@@ -116,7 +116,7 @@ class Publisher:
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._sample_s = -math.inf  # monotonic, of the last accepted sample
-        self._impossible: str | None = None  # why the last sample that was dropped is none; None: all are good
+        self._impossible: str | None = None  # reason why the last dropped sample was dropped; None: all are good
         self._dropped_before = self._dropped()  # by kind, when that began
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()

@@ -196,7 +196,7 @@ class VirtualBoard:
 
     async def run_for_host(self) -> None:
         """``run`` from when a host opens the line: samples before would be lost."""
-        os.close(self._slave)  # the line hangs up while nobody has it open
+        os.close(self._slave)  # the line hangs up while no process has it open
         self._slave, line = -1, select.poll()
         line.register(self._master, 0)
         while line.poll(0):  # noqa: ASYNC110 - the system tells nobody when a line is opened

@@ -325,7 +325,7 @@ class AlarmEvaluator:
         soc, std = trace["soc"], trace["soc_std"]
         lost = (trace["lock"] == 0) | self._mismatch_suspected
         self._mismatch_suspected = bool(suspects & MODEL_SUSPECTS)
-        lost[-1] |= self._mismatch_suspected  # since when, nobody knows: not before
+        lost[-1] |= self._mismatch_suspected  # start unknown: not before this
         values: dict[AlarmName, Floats] = {
             "soc_low": soc - np.where(np.isnan(std), 0.0, std),
             "stability_margin_low": trace["stability_margin"],

@@ -32,7 +32,9 @@ def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
         amplitude, exponent, offset = _exponential(ohm, 1.0)
         made[name] = Resistance(amplitude_ohm=amplitude, exponent=exponent, offset_ohm=offset)
         if name != "r_s":
-            share = np.maximum(total[:, first:end], 1e-6 * total.sum(axis=1, keepdims=True))  # none told: all alike
+            share = np.maximum(
+                total[:, first:end], 1e-6 * total.sum(axis=1, keepdims=True)
+            )  # none reported: assume equal ones
             share /= share.sum(axis=1, keepdims=True)
             farad = np.exp(share @ LN_TAUS[first - 1 : end - 1]) / ohm
             amplitude, exponent, offset = _exponential(farad, -1.0)

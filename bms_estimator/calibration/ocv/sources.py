@@ -295,7 +295,7 @@ def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
 def _without_branches(source: Source, ladder: Ladder) -> Source:
     if source.lone is None:
         return source
-    points, first = source.points, 1 if np.isfinite(source.lone.step_v) else 0  # a jump has told the ohmic part
+    points, first = source.points, 1 if np.isfinite(source.lone.step_v) else 0  # a jump has shown the ohmic part
     temperature_c = np.nan_to_num(points.temperature_c, nan=REFERENCE_C)
     drop_v = steady_drop(ladder, source.lone.current_a, points.soc, temperature_c, first)
     points = replace(

@@ -37,7 +37,7 @@ class Result:
     lock_lost: bool
     lock_losses: int
     k_final: float | None
-    temperature_sensor: bool  # the capture has told the cell's temperature
+    temperature_sensor: bool  # the capture has the cell's temperature
     suspects: list[str]
     """Suspicions of the identifier at the end."""
     gain_rearms: int

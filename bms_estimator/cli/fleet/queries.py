@@ -50,7 +50,7 @@ async def _collect(where: ServerAddress, folder: Path, period_s: float) -> None:
         asyncio.ensure_future(stop.wait()),
     )
     await asyncio.wait((connecting, stopping), return_when=asyncio.FIRST_COMPLETED)
-    if not connecting.done():  # told to stop before a server was there
+    if not connecting.done():  # stopped before a server was found
         await end(connecting)
         return
     nc = connecting.result()

@@ -54,7 +54,7 @@ def keys(press: Callable[[str], None]) -> Iterator[None]:
     finally:
         loop.remove_reader(terminal)
         with contextlib.suppress(termios.error):  # the terminal is gone
-            termios.tcsetattr(terminal, termios.TCSANOW, before)  # not once all is written: nobody may read it
+            termios.tcsetattr(terminal, termios.TCSANOW, before)  # stop before all is written: there may be no reader
 
 
 def meanings(pressed: bytes) -> Iterator[str]:

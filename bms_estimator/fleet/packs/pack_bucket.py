@@ -71,7 +71,7 @@ class PackBucket:
         except nats.errors.Error as error:
             raise StreamError(f"the server refuses to read {_stream(bucket)}: {error_text(error)}") from None
         if state.last_seq + 1 < self._next[bucket]:
-            self._next[bucket] = 1  # made anew, or its end is lost: numbers come again for other values
+            self._next[bucket] = 1  # re-created, or its end is lost: sequence numbers restart with other values
         async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next[bucket]):
             for message in batch:
                 key, data = _entry(bucket, message)

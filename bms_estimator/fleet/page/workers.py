@@ -37,7 +37,7 @@ class FleetWorkers:
             return
         heard = self._heard.setdefault(heartbeat.id, deque())
         if heard and heartbeat.blocks < heard[-1].heartbeat.blocks:
-            heard.clear()  # started anew
+            heard.clear()  # restarted
         heard.append(_Heard(now_s, heartbeat))
         while heard[0].at_s < now_s - OVER_S:
             heard.popleft()

@@ -15,7 +15,7 @@ from bms_estimator.fleet.worker.pack_state import MOST_LOST
 TOLD_EACH = 10
 """Number of blocks between two confirmations to an edge that earlier blocks are safe."""
 ASKED_EACH = 5
-"""Number of early blocks after which an edge is told again where to resume."""
+"""Number of early blocks between two replies to an edge that say where to resume."""
 
 MAX_PASSED = 20
 """Missing blocks count as lost after the first one behind them has come this many times. The edge resends them all, at least 30 s

@@ -109,7 +109,7 @@ class PinnedConsumer:
         lost = self.pinned and message.subject.rpartition(".")[2] == str(self._pins)
         if lost:
             self._pin = ""
-            self.waiting.clear()  # they come once more, to us or to somebody else
+            self.waiting.clear()  # they are delivered again, here or elsewhere
         return lost
 
     async def unpin(self) -> None:

@@ -233,7 +233,7 @@ class Worker:
         _check(self._nc, self._options)
         now_s = time.monotonic()
         if not self._nc.is_connected or now_s > self._renewed_s + DEAD_S / 2.0:
-            self._members.extend_all(now_s)  # nobody could be heard
+            self._members.extend_all(now_s)  # no other worker could be received
         self._renewed_s = now_s
         share = self._members.share(self._partitions, now_s)
         for number in self._held.keys() - share:
@@ -242,7 +242,7 @@ class Worker:
             self._try_for(number, now_s)
         for task in [*self._returning.values(), *(task for _, task in self._held.values())]:
             if task.done() and not task.cancelled():
-                task.result()  # a fault of ours: were it not seen, the partition would be nobody's
+                task.result()  # our own fault; unnoticed it would leave the partition without an owner
         await self._ask_all()
         if self._nc.is_connected:
             for holding in self._holdings:

@@ -8,7 +8,7 @@ from bms_estimator.numba_cache import njit
 
 FLOW_SUMS = np.dtype(
     [
-        ("charge_as", "f8"),  # since somebody looked, positive on discharge [A s]
+        ("charge_as", "f8"),  # since the last reading, positive on discharge [A s]
         ("energy_ws", "f8"),  # the same [W s]
         ("last_s", "f8"),  # the last sample: its time stamp [s], ...
         ("last_a", "f8"),  # ... current [A] ...

@@ -15,14 +15,14 @@ HOUR_SUMS = np.dtype(
         ("last_a", "f8"),  # current [A]
         ("last_w", "f8"),  # and power [W]; these and what follows go on from hour to hour
         ("step_s", "f8"),  # to it from the one before [s]
-        ("rest_s", "f8"),  # for so long next to no current has flowed [s]
+        ("rest_s", "f8"),  # time with almost no current [s]
         ("outliers_before", "i8"),  # counters of the estimator at the hour's begin
         ("searches_before", "i8"),
         ("samples", "i8"),  # accepted; from here on of this hour alone
         ("dropped", "i8"),  # samples that were not
         ("gaps", "i8"),  # steps over which nothing is counted
         ("lost_blocks", "i8"),  # that never came
-        ("seen_s", "f8"),  # so much of it was measured [s]
+        ("seen_s", "f8"),  # measured time [s]
         ("out_as", "f8"),  # charge [A s] and energy [W s], each step in its direction
         ("in_as", "f8"),
         ("out_ws", "f8"),
@@ -33,7 +33,7 @@ HOUR_SUMS = np.dtype(
         ("sum_a", "f8"),
         ("min_a", "f8"),
         ("max_a", "f8"),
-        ("temperatures", "i8"),  # samples that told one
+        ("temperatures", "i8"),  # samples with a value
         ("sum_c", "f8"),
         ("min_c", "f8"),
         ("max_c", "f8"),

@@ -14,7 +14,7 @@ WINDOW_SUMS = np.dtype(
         ("voltage_v", "f8"),
         ("current_a", "f8"),
         ("power_w", "f8"),
-        ("temperatures", "i8"),  # samples that told one
+        ("temperatures", "i8"),  # samples with a value
         ("temperature_c", "f8"),
     ],
     align=True,

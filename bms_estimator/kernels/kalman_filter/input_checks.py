@@ -80,13 +80,13 @@ CHECKS = np.dtype(
         ("last_v", "f8"),  # of the sample before; 0: none
         ("last_a", "f8"),
         ("step_v", "f8"),  # the smallest change of voltage seen [V]; 0: none yet
-        ("frozen_v_s", "f8"),  # for so long the voltage has stayed the same though it cannot [s]
-        ("frozen_a_s", "f8"),  # for so long the current has
+        ("frozen_v_s", "f8"),  # time for which the voltage has been impossibly constant [s]
+        ("frozen_a_s", "f8"),  # time for which the current has been impossibly constant
         ("held_as", "f8"),  # charge since the voltage last changed [A s]; what was there then:
         ("held_a", "f8"),  # current [A],
         ("held_soc", "f8"),
         ("held_soc_std", "f8"),
-        ("same_s", "f8"),  # for so long the current has stayed the same [s]; SOC and its std then
+        ("same_s", "f8"),  # time for which the current has been constant [s]; SOC and its std at its beginning
         ("same_soc", "f8"),
         ("same_soc_std", "f8"),
         ("wrong_v", "f8"),  # running mean of the error that stays [V]
@@ -105,7 +105,7 @@ CHECKS = np.dtype(
 COUNTERS = np.dtype(
     [
         ("gated", "i8"),  # samples not believed
-        ("reopened", "i8"),  # so many in a row that they were
+        ("reopened", "i8"),  # number of successive ones
         ("reset", "i8"),  # not finite: back to the last good state
     ],
     align=True,
@@ -198,7 +198,7 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
     f.mean[0, :] = c.good_mean
     f.covariance[0, :, :] = c.good_covariance
     if not math.isfinite(f.temperature_c):
-        f.temperature_c, f.sensed = REFERENCE_C, 0  # what is told next is taken at once
+        f.temperature_c, f.sensed = REFERENCE_C, 0  # the next input is accepted at once
         f.weak = f.strong = f.hysteresis = 1.0
     initialize_load_statistics(f, p, f.current_a)
     spawn_hypotheses(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + LOST_STD**2))

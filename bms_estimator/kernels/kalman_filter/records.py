@@ -109,7 +109,7 @@ EKF_SETTINGS = np.dtype(
         ("low_c", "f8"),  # temperatures that the resistances are known for [C]
         ("high_c", "f8"),
         ("sensor_v2", "f8"),  # variance of one voltage sample: noise and rounding [V^2]
-        ("unmeasured_s", "f8"),  # over a longer step nobody measured the current [s]
+        ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
         ("current_step_a", "f8"),  # of the current that is shown [A]; 0: none
         ("dead_band_a", "f8"),  # a smaller one is shown as 0 [A]
         *[(field.name, "f8") for field in fields(Noise)],  # volts as of the pack
@@ -123,7 +123,7 @@ WINDOW = np.dtype(
         ("time_s", "f8"),  # since the update before [s]
         ("charge_as", "f8"),  # moved since then [A s]
         ("throughput_as", "f8"),  # its magnitude
-        ("unknown_as", "f8"),  # std of the charge where nobody measured [A s]
+        ("unknown_as", "f8"),  # std of the charge in unmeasured gaps [A s]
         ("between_as2", "f8"),  # variance of the charge that samples far apart do not show [A^2 s^2]
         ("rounded_as2", "f8"),  # the same of what the steps of the current leave out [A^2 s^2]
         ("gap", "i8"),  # 1: samples are missing
@@ -161,12 +161,12 @@ EKF_STATE = np.dtype(
         ("count", "i8"),  # hypotheses in use
         ("best", "i8"),  # the likeliest
         ("started", "i8"),
-        ("seeded_s", "f8"),  # for so long the hypotheses have been there [s]
+        ("seeded_s", "f8"),  # age of the hypotheses [s]
         ("reopened", "i8"),  # times the SOC became unknown: the model would have to be wrong by too much
         ("window", WINDOW),
         ("current_a", "f8"),  # of the last sample
-        ("same_s", "f8"),  # for so long the shown current has been the same, to a step [s]
-        ("rest_s", "f8"),  # for so long no load has been shown [s] ...
+        ("same_s", "f8"),  # time for which the reported current has been constant to a step [s]
+        ("rest_s", "f8"),  # time for which no load has been reported [s]
         ("rest_as", "f8"),  # ... and the charge that was shown all the same [A s]
         ("smallest_a", "f8"),  # the smallest that was shown and is not 0 [A]; 0: none yet
         ("step", STEP),
@@ -181,7 +181,7 @@ EKF_STATE = np.dtype(
         ("weak", "f8"),  # Arrhenius factors at it
         ("strong", "f8"),
         ("hysteresis", "f8"),  # the same of the hysteresis
-        ("sensed", "i8"),  # 1: a temperature was told
+        ("sensed", "i8"),  # 1: a temperature was reported
         ("soc", "f8"),  # mean of the hypotheses
         ("soc_std", "f8"),
         ("voltage_v", "f8"),  # predicted by the likeliest [V]

@@ -37,11 +37,11 @@ LEARNING_STATE = np.dtype(
         ("offset_v", "f8"),  # what the injection has added to the output [V]
         ("d_offset", "f8", LEARNABLE),  # its derivative by theta [V]
         ("psi", "f8", LEARNABLE),  # dy^/dtheta [V]
-        ("temperature_c", "f8"),  # the last that was told; NaN: none was [C]
+        ("temperature_c", "f8"),  # last reported value; NaN without one [C]
         ("given", "f8", LEARNABLE),  # what is not learned, at the last sample
         ("information", "f8", (LEARNABLE, LEARNABLE)),  # of psi psi', remembered [V^2 s]
         ("pull", "f8", LEARNABLE),  # of psi (e + psi' theta), remembered [V^2 s]
-        ("settle_s", "f8"),  # nothing is learned for so long: the states hold what nobody measured [s]
+        ("settle_s", "f8"),  # time without learning: the states hold unmeasured history [s]
         ("waited_s", "f8"),  # since theta moved [s]
         ("step", "f8", LEARNABLE),  # the last change of theta
         ("factor", "f8", (LEARNABLE, LEARNABLE)),  # Cholesky's, of information and leakage

@@ -37,7 +37,7 @@ OBSERVER_SETTINGS = np.dtype(
         ("voltage_max_v", "f8"),
         ("current_max_a", "f8"),  # magnitude
         ("gap_s", "f8"),  # a longer step counts as a gap, unless the one before was about as long [s]
-        ("unmeasured_s", "f8"),  # over a longer step nobody measured the current [s]
+        ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
     ],
     align=True,
 )

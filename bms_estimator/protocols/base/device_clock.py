@@ -28,7 +28,7 @@ class DeviceClock:
     def __init__(self) -> None:
         self.jumps = 0
         self._last_s = 0.0
-        self._told_s = self._arrival_s = math.nan  # the latter when the told time was another last
+        self._told_s = self._arrival_s = math.nan  # the latter when the device's time last changed
         self._least_late_s = math.inf
         self._lag_s, self._lags, self._slow = 0.0, 0, False
 

@@ -53,7 +53,7 @@ _PAIR = re.compile(
     r"(?<![A-Za-z0-9_])([A-Za-z_][A-Za-z0-9_]*)\s*[=:]\s*"
     rf"({NUMBER}(?:,{NUMBER})*)"
     r"(?:\s*([A-Za-z]{1,8})\b(?!\s*[=:]))?"  # a unit, unless it is the next name
-    r"(?!\w|\.\d|,[-+.\d])"  # half a number is none
+    r"(?!\w|\.\d|,[-+.\d])"  # a partial number is not valid
 )
 
 

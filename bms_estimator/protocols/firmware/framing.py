@@ -50,7 +50,7 @@ DECODER = np.dtype(
         ("period_us", "f8"),  # of the last hello: from sample to sample
         ("doubted_s", "f8"),  # arrival at which boot_id became -1
         ("withheld", "i8"),  # status bits of samples that were dropped since then
-        ("reset_pending", "i8"),  # a hello told of a reset
+        ("reset_pending", "i8"),  # a hello reported a reset
         ("board_us", "i8"),  # of the last sample, 32 bit
         ("elapsed_us", "i8"),  # board clock since the first sample or the reset
         ("origin_s", "f8"),  # time at which elapsed_us was 0
@@ -91,7 +91,7 @@ HASTE_S = 0.3
 """Time by which the board's clock may advance beyond arrival and sequence numbers from one sample to the next [s]."""
 SLOWEST = 0.01
 """No board's clock is slower than the host's by more than this, relative."""
-_REORDER_WINDOW = 64  # a sample further behind comes from a board that counts anew
+_REORDER_WINDOW = 64  # a sample further behind comes from a board whose clock restarted
 _MOST_APART = 0.1  # sequence and clock of one board, relative; beyond this it is another, or has another rate
 LONGEST_DOUBT_S = 5.0
 """Maximum time for which samples wait for the hello that identifies their board [s]; then they are accepted as

@@ -42,7 +42,7 @@ class AvailabilityMonitor:
         self._own, self._delivery, self._refusals = own, delivery, refusals
         self._wake, self._echo_s = wake, echo_s
         self._echoed = asyncio.Event()
-        self._forged = False  # somebody else wrote there
+        self._forged = False  # another client wrote there
         self._corrected_s = -math.inf
 
     def begin(self) -> None:

@@ -84,7 +84,7 @@ class BleBringer(LineProducer):
             ValueError,
             LookupError,
             AssertionError,
-        ) as error:  # bytes that nobody foresaw
+        ) as error:  # unexpected bytes
             raise SourceUnavailableError(str(error) or type(error).__name__) from None
 
     def _line(self, sample: Mapping[str, object]) -> bytes | None:

@@ -46,7 +46,7 @@ class LinuxSensor(LineProducer):
     def __init__(self, settings: LinuxSource, root: Path = SYS, hung_s: float = HUNG_S) -> None:
         self._settings, self._root, self._hung_s = settings, root, hung_s
         self._thread = DiskThread("sysfs")
-        self._left: asyncio.Future[Any] | None = None  # a call that hung: there is none beside it
+        self._left: asyncio.Future[Any] | None = None  # a call that hung: only one runs at a time
         self._counters = {"read_errors": 0, "value_errors": 0}
         self._fault: str | None = None
 
@@ -91,7 +91,7 @@ class LinuxSensor(LineProducer):
         try:
             await self._wait(future)
         except SourceUnavailableError:
-            future.add_done_callback(lambda late: late.exception())  # nobody asks for it any more
+            future.add_done_callback(lambda late: late.exception())  # no caller waits for it any more
             self._left = future
             raise
         return future.result()

@@ -75,7 +75,7 @@ class SerialSource:
         self._monotonic = monotonic
         make_protocol(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
         self._decoder = make_protocol(settings)
-        tells_serial = settings.protocol == "binary"  # what prints text could never be told from another
+        tells_serial = settings.protocol == "binary"  # boards that print text cannot be distinguished
         self._door = BoardCheck(
             lambda: make_protocol(settings), settings.serial or "", memory if tells_serial else None
         )
