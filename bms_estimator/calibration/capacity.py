@@ -293,7 +293,7 @@ def _solved(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> C
 
 
 def _covariance(anchors: Sequence[Anchor], p: np.void) -> Floats:
-    """Of the anchors' SOCs: what each voltage errs by itself, what the curve errs, what counting between them does."""
+    """Return the covariance of the anchors' SOCs: errors of each voltage, of the curve, and of the charge between them."""
     z, slope_v, own_v, curve_v, moved, part = (
         np.array([getattr(a, name) for a in anchors])
         for name in ("soc", "slope_v", "own_v", "curve_v", "moved_ah", "part")

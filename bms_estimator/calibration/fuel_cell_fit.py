@@ -114,7 +114,7 @@ def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFi
 
 
 def _fit(sources: Sequence[Source], file: Floats, told: list[int]) -> tuple[Floats, Floats]:
-    """theta, shape (8,), and the covariance of those ``told``."""
+    """Fit theta, shape (8,); return it with the covariance of the parameters ``told``."""
     theta, weights = np.zeros(LEARNABLE), np.ones(len(sources))
 
     def all_of(values: Floats) -> Floats:
@@ -159,7 +159,7 @@ def _weight(source: Source, file: Floats, theta: Floats, parameters: int) -> flo
 
 
 def _alike(error_v: Floats) -> float:
-    """How many samples in a row count as one: the variance of means of blocks, over that of independent samples'."""
+    """Return the number of successive samples that count as one: variance of block means over that of independent samples."""
     size = error_v.size // BLOCKS
     if size < 2:
         return 1.0

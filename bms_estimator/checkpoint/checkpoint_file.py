@@ -68,7 +68,7 @@ class RunCounters:
 
 @dataclass(frozen=True)
 class CheckpointContent:
-    """What a checkpoint file held."""
+    """Content of a checkpoint file."""
 
     state: Mapping[str, NDArray[Any]]
     """Fields of ESTIMATOR_STATE by their names, as ``fields`` gives them; empty when it was refused."""
@@ -206,7 +206,7 @@ class CheckpointFile:
         return CheckpointContent(state, unseen_s, ledger, "")
 
     def _remove_oldest(self) -> None:
-        """Of the pack's files leave those saved last: whoever tries settings leaves one for each."""
+        """Remove the oldest files of the pack: trying settings leaves one file for each."""
         ours = re.compile(rf"{re.escape(self._name)}-[0-9a-f]{{8}}\.npz")
         others = [path for path in self.path.parent.iterdir() if ours.fullmatch(path.name) and path != self.path]
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)

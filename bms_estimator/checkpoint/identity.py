@@ -29,7 +29,7 @@ def pack_identity(settings: Settings, cell: PackModel) -> str:
 
 
 def observer_identity(settings: Settings, cell: PackModel) -> str:
-    """Hash of what the observer's parameters and gain rest on; under other settings it begins anew, within seconds."""
+    """Return the hash of all that the observer's parameters and gain depend on; under other settings they restart within seconds."""
     parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
@@ -44,7 +44,7 @@ def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDAr
 
 
 def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Of a state's fields by their names those that hold under other settings of the observer: all but its own."""
+    """Return the fields of a state that stay valid under other observer settings: all but the observer's own."""
     kept = "observer.soc", "observer.soc_coulomb", "observer.started"
     dropped = "observer.", "learning.", "series_resistance."
     return {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}

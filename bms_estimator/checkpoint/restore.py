@@ -89,7 +89,7 @@ def _is_shorter(known: tuple[int, ...], field: tuple[int, ...], axes: int) -> bo
 
 
 def _open_curve(estimator: Estimator) -> None:
-    """Of the error of the OCV nothing is known where it was no state of the filter before."""
+    """Reset the error of the OCV if an earlier version did not have it as a state."""
     f, c = estimator.record[0]["filter"], estimator.record[0]["checks"]
     count = int(f["count"])
     for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):

@@ -132,7 +132,7 @@ def _run(arguments: Sequence[str] | None) -> None:
 
 
 def _is_of_a_disk(error: BaseException | None) -> bool:
-    """Whether an error, or what it came from, is that a disk is full or broken."""
+    """Return True if an error, or its cause, is a full or broken disk."""
     if error is None or isinstance(error, OSError):
         return error is not None and error.errno in DISK_FAULTS
     return _is_of_a_disk(error.__cause__ or error.__context__)

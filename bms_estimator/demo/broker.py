@@ -54,7 +54,7 @@ class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
 
     @property
     def idle(self) -> bool:
-        """Whether all that came has gone out, or into nothing."""
+        """True if all received messages were delivered or dropped."""
         handed_on = all(
             session is None or session.delivered_message_queue.empty() for session, _ in self._sessions.values()
         )
@@ -104,7 +104,7 @@ class DemoBroker:
 
     @property
     def look_command(self) -> str:
-        """What shows all topics in a second terminal."""
+        """Command that shows all topics in a second terminal."""
         port = "" if self.port == MQTT_PORT else f" -p {self.port}"
         return f"mosquitto_sub{port} -t 'bms/#' -v"
 
@@ -142,7 +142,7 @@ def choose_port(port: int | None, usual: int) -> int:
 
 
 def _free(port: int) -> bool:
-    """Whether nobody listens on the port."""
+    """Return True if the port is free."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -1,4 +1,4 @@
-"""The demo: broker, board and the real service in one process. The estimator is told a wrong SOC and finds the true one."""
+"""Demo: broker, board and the real service in one process. The estimator starts with a wrong SOC and finds the true one."""
 
 import asyncio
 import sys

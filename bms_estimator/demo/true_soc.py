@@ -1,4 +1,4 @@
-"""What a simulated pack's SOC was when the board took the sample that the host has just decoded."""
+"""True SOC of a simulated pack at the sample that was decoded last."""
 
 from collections import deque
 

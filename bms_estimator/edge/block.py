@@ -39,7 +39,7 @@ _SAMPLE_BYTES = sum(dtype.itemsize for _, dtype in _COLUMNS)
 
 
 class BlockError(ValueError):
-    """What is wrong with the bytes of a block."""
+    """Error in the bytes of a block."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def decode(data: bytes) -> Block:
 
 
 def peek_header(data: bytes) -> tuple[int, float]:
-    """How many samples a block says it holds, and when it arrived [s since 1970]; none, and for ever, of what is no block."""
+    """Return number of samples and arrival time [s since 1970] from a block's header; 0 and infinity if it is not a block."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         return 0, math.inf
     _, _, count, *_, arrival_s = _HEADER.unpack_from(data)

@@ -1,4 +1,4 @@
-"""What an edge keeps on its disk, and what is done with it, each in one transaction."""
+"""Block table of an edge, with each operation in one transaction."""
 
 import sqlite3
 from collections.abc import Sequence
@@ -186,7 +186,7 @@ def _bytes(connection: sqlite3.Connection, where: str = "") -> int:
 
 
 def _sound(made_s: int, number: int, data: Any) -> bool:
-    """Whether a row is a block as it was put."""
+    """Return True if a row is a block as it was put."""
     if not isinstance(data, bytes):
         return False
     try:

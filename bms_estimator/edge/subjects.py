@@ -23,12 +23,12 @@ PARTITIONS = 64
 
 
 def raw(pack: str) -> str:
-    """Where an edge publishes."""
+    """Return the subject on which an edge publishes."""
     return f"raw.{pack}"
 
 
 def kept(partition: int, pack: str = "*") -> str:
-    """Where the stream ``RAW`` has what came of a pack."""
+    """Return the subject in the stream ``RAW`` of a pack's blocks."""
     return f"p.{partition}.raw.{pack}"
 
 
@@ -38,32 +38,32 @@ def mapping(partitions: int) -> tuple[str, str]:
 
 
 def awaits(pack: str) -> str:
-    """Where a worker answers an edge."""
+    """Return the subject of a worker's requests to an edge."""
     return f"edge.{pack}.awaits"
 
 
 def published(pack: str, topic: str) -> str:
-    """Where estimates go."""
+    """Return the subject of estimates."""
     return f"bms.{pack}.{topic}"
 
 
 def hours(pack: str = "*") -> str:
-    """Where the summaries of a pack's hours go."""
+    """Return the subject of a pack's one-hour summaries."""
     return f"hours.{pack}"
 
 
 def worker(name: str = "*") -> str:
-    """Where a worker says how it is."""
+    """Return the subject of a worker's heartbeats."""
     return f"fleet.worker.{name}"
 
 
 def unknown(pack: str = "*") -> str:
-    """Where a worker says that a pack is unknown."""
+    """Return the subject on which a worker reports an unknown pack."""
     return f"fleet.unknown.{pack}"
 
 
 def partition_of(pack: str, partitions: int) -> int:
-    """Where ``mapping`` puts a pack: FNV-1a of its name, as the server's ``partition`` has it."""
+    """Return the partition of a pack: FNV-1a of its name, as in the server's ``partition`` mapping."""
     digest = 0x811C9DC5
     for byte in pack.encode():
         digest = (digest ^ byte) * 0x01000193 & 0xFFFFFFFF

@@ -116,7 +116,7 @@ class Estimator:
 
     @property
     def identifying(self) -> bool:
-        """Whether the identifier is at work."""
+        """True if the identifier is enabled."""
         return bool(self.settings_record["identify"][0])
 
     def set_soc(self, soc: float) -> None:

@@ -93,7 +93,7 @@ def filter_settings(
 
 
 def unmeasured_s(sampling: Sampling) -> float:
-    """Over a longer step nobody measured the current [s]."""
+    """Return the longest step over which the current counts as measured [s]."""
     return max(UNMEASURED_S, PERIODS * sampling.period_s)
 
 

@@ -1,4 +1,4 @@
-"""What the filter has learned, read from the estimator's records."""
+"""Identified parameters, read from the estimator's records."""
 
 import math
 from functools import lru_cache
@@ -26,7 +26,7 @@ LEAST_RISE_V = 1e-6
 
 
 class IdentifiedValue(NamedTuple):
-    """A value with its standard deviation, both in the unit of its name, and for how long no data told of it."""
+    """Value with its standard deviation, both in the unit of its name, and the age of the last data that determined it."""
 
     value: float
     std: float

@@ -60,7 +60,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
 
 
 def _bounds(cell: CellModel, scaled: tuple[int, ...]) -> tuple[float, float]:
-    """Of theta: what the bounds of all ``scaled`` parameters allow, and the file's own values."""
+    """Return the bounds of theta: the limits of all ``scaled`` parameters, and the file's own values."""
     bounds = [(cell.bounds(i), cell.a[i]) for i in scaled]
     lower = max(np.log(b.lower / value) for b, value in bounds)
     upper = min(np.log(b.upper / value) for b, value in bounds)

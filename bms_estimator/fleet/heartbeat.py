@@ -1,4 +1,4 @@
-"""What a worker says of itself each second on ``subjects.worker``."""
+"""Heartbeat of a worker, each second on ``subjects.worker``."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -9,7 +9,7 @@ DEAD_S = 3.0
 
 
 class Heartbeat(BaseModel):
-    """A worker lives, holds these partitions and has done so much since it was started."""
+    """State of a live worker: its partitions, and counters since its start."""
 
     model_config = ConfigDict(frozen=True)
 

@@ -32,7 +32,7 @@ def _name(kernel: FunctionType) -> str:
 
 
 class _Listener(event.Listener):
-    """numba tells which function it begins to compile; one that comes from the cache is not told."""
+    """Listener for functions that numba begins to compile; cached ones are not reported."""
 
     def __init__(self, kernels: set[FunctionType], tell: CompileCallback) -> None:
         self._waiting, self._all, self._tell = kernels, len(kernels), tell
@@ -45,4 +45,4 @@ class _Listener(event.Listener):
             self._tell(_name(kernel), self._all - len(self._waiting), self._all)
 
     def on_end(self, event: event.Event) -> None:
-        """Nobody asks."""
+        """Do nothing: the end of a compilation is not needed."""

@@ -114,7 +114,7 @@ def fit_next_element(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def add_elements_to_map(s: Record, p: Record, dt_s: float) -> None:
-    """Add the present elements to the map, in its order R_ts, R_tl, C_ts, C_tl, R_s, where the load told of them."""
+    """Add the present elements to the map, in its order R_ts, R_tl, C_ts, C_tl, R_s, if the load excites them."""
     f = s.filter
     exciting_a = MIN_EXCITATION_C * p.filter.capacity_as / 3600.0
     loaded = f.rms_a2 > exciting_a * exciting_a

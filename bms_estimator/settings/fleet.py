@@ -113,6 +113,6 @@ class FleetSettings(Strict):
 
 
 def reachable(listen: str) -> Listen:
-    """Where a program on this machine finds what listens there."""
+    """Return the address at which a program on this machine reaches the listener."""
     host, port = parse_listen(listen)
     return Listen({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), port)  # noqa: S104 - what others listen on

@@ -73,7 +73,7 @@ class CellRegisters(Register):
     )
 
     def cell(self, number: int) -> Register:
-        """Of the cell, from 0."""
+        """Index of the cell, from 0."""
         first = Register(**self.model_dump(exclude={"count", "step"}))
         return first.model_copy(update={"address": self.address + number * (self.step or self.words)})
 
@@ -136,7 +136,7 @@ class ModbusSource(PolledSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The sign of a known device, and the steps of what is told in whole numbers."""
+        """Return the sign of a known device, and the steps of its integer values."""
         sign = {"current_sign": "charge_positive"} if self.profile else {}
         volts = {} if self.voltage.type == "float32" else {"voltage_resolution_v": abs(self.voltage.scale)}
         amperes = {} if self.current.type == "float32" else {"current_resolution_a": abs(self.current.scale)}

@@ -52,7 +52,7 @@ class ValueLocation(Strict):
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """As told."""
+        """Topics as configured."""
         return (self.topic,) if isinstance(self.topic, str) else self.topic or ()
 
     def si(self, number: float) -> float:

@@ -147,7 +147,7 @@ class Settings(Strict):
 
     @property
     def sampling(self) -> Sampling:
-        """What the source tells of the current, and how often."""
+        """Return period and current resolution of the source."""
         s = self.sensor
         return Sampling(s.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0)
 

@@ -21,7 +21,7 @@ class Listen(NamedTuple):
 
     @property
     def loopback(self) -> bool:
-        """Whether only programs of this machine reach it."""
+        """True if only programs on this machine reach it."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:

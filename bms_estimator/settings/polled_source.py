@@ -25,7 +25,7 @@ class PolledSource(Strict):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """What follows for ``[sensor]``, where that does not say otherwise: what is resolved, the sign of the current."""
+        """Return the ``[sensor]`` defaults of the source: resolution, sign of the current."""
         return {}
 
 

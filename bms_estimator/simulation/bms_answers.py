@@ -1,4 +1,4 @@
-"""What a BMS answers to each question, by protocol: the other side of ``protocols.devices``."""
+"""Responses of a BMS to each query, by protocol: the other side of ``protocols.devices``."""
 
 import math
 import struct
@@ -14,7 +14,7 @@ PACK = 1
 
 @dataclass(frozen=True)
 class Measured:
-    """What a BMS has measured last; current positive on discharge, temperature NaN without a probe."""
+    """Last measured values; current positive on discharge, temperature NaN without a probe."""
 
     voltage_v: float
     current_a: float

@@ -65,7 +65,7 @@ class SimulatedNode:
         """Nothing to close."""
 
     async def run(self, seconds: float) -> None:
-        """Publish for so long of its time."""
+        """Publish for a given simulated time."""
         self._end_s = seconds
         await self._link.run()
 

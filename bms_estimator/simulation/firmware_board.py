@@ -61,7 +61,7 @@ class FirmwareBoard:
 
     @staticmethod
     def is_built(build: Path) -> bool:
-        """Whether ``build`` holds the firmware and its simulator."""
+        """Return True if ``build`` holds the firmware and its simulator."""
         return all((build / name).is_file() for name in ("board_sim", "bms_board.elf"))
 
     def __enter__(self) -> Self:

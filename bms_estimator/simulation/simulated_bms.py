@@ -19,7 +19,7 @@ SPREAD_V = 0.004
 
 
 class BmsFault(Enum):
-    """What can happen to an answer."""
+    """Fault of a response."""
 
     SILENCE = "never sent"
     CORRUPT = "one byte changed"

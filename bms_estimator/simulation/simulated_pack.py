@@ -97,7 +97,7 @@ class SimulatedPack:
         return Reading(self._current_a, float(voltage_v), ROOM_C)
 
     def _next_current(self, dt_s: float) -> float:
-        """Of the load ``dt_s`` later; charging holds its time."""
+        """Return the current of the load ``dt_s`` later; charging stops its time."""
         self._charging = self.soc <= (FULL_SOC if self._charging else EMPTY_SOC)
         if self._charging:
             return self._charge_a

@@ -19,7 +19,7 @@ _NOISE_POINTS = 1 << 16
 
 
 class Reading(NamedTuple):
-    """What is at the sensors; current positive on discharge, temperature NaN without an NTC."""
+    """Values at the sensors; current positive on discharge, temperature NaN without an NTC."""
 
     current_a: float
     voltage_v: float

@@ -86,7 +86,7 @@ _RANGES = {
 
 
 class BoardFault(Enum):
-    """What can happen to a sample's frame."""
+    """Fault of a sample's frame."""
 
     DROP = "never sent"
     CORRUPT = "one byte changed"
@@ -218,7 +218,7 @@ class VirtualBoard:
         self._faults.extend(itertools.repeat(fault, frames))
 
     def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> None:
-        """Restart the board: sequence and clock begin anew, the rate is the first one, a hello is sent."""
+        """Reset the board: sequence number, clock and rate restart, and a hello is sent."""
         self._boot(cause)
 
     def send(self, data: bytes) -> None:

@@ -28,7 +28,7 @@ log = structlog.get_logger(__name__)
 
 
 class SourceUnavailableError(Exception):
-    """What is measured cannot be reached, or was lost; the message says why, for people. It may come yet."""
+    """The source cannot be reached, or was lost; the message says why. It may become available later."""
 
 
 class LineProducer(ABC):
@@ -37,7 +37,7 @@ class LineProducer(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """What is read, for people: begins the messages."""
+        """Name of the source, with which messages begin."""
 
     @abstractmethod
     def iter_lines(self) -> AsyncGenerator[bytes, None]:
@@ -56,12 +56,12 @@ class LineProducer(ABC):
 
     @property
     def fault(self) -> str | None:
-        """Why no line comes though it is connected, for people; None where nobody knows."""
+        """Reason why no line comes though it is connected; None if unknown."""
         return None
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the device said of itself."""
+        """Hello of the device."""
         return {}
 
 
@@ -120,7 +120,7 @@ class LineSource:
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the device said of itself."""
+        """Hello of the device."""
         return self._bringer.board
 
     @property
@@ -130,7 +130,7 @@ class LineSource:
 
     @property
     def clock_ppm(self) -> float | None:
-        """Nobody knows."""
+        """Rate error of the clock, which is unknown."""
         return self._decoder.clock_ppm
 
     current_zero: None = None
@@ -139,7 +139,7 @@ class LineSource:
     """Nor is there a relay."""
 
     def pulse(self) -> SourceHealth:
-        """Whether somebody still looks after what is brought."""
+        """Health of the task that produces lines."""
         now_s = self._monotonic()
         return SourceHealth(now_s - self._tended_s, self._epoch_s + now_s - self._arrived_s, self._lines.qsize())
 
@@ -178,7 +178,7 @@ class LineSource:
         return block
 
     async def _have_brought(self) -> None:
-        """Take what is brought, and begin anew. Only a fault of ours ends it: who iterates is given that."""
+        """Produce lines and restart after an error. Only an internal error ends it and is raised to the reader."""
         while True:
             await self._pause()
             reason = "it ended"

@@ -1,4 +1,4 @@
-"""Where samples come from: serial boards, captures, tables."""
+"""Interface of sources of samples: serial ports, captures, tables."""
 
 from collections.abc import AsyncIterator, Mapping
 from typing import NamedTuple, Protocol, Self
@@ -10,7 +10,7 @@ Chunk = tuple[float, bytes]
 
 
 class SourceHealth(NamedTuple):
-    """Whether what brings samples lives."""
+    """Health of a source."""
 
     task_idle_s: float
     """Since its task last looked after the line, or tried to open it [s]."""
@@ -47,11 +47,11 @@ class Source(Protocol):
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the board said of itself in its hello; empty when there was none."""
+        """Hello of the board; empty without one."""
 
     @property
     def clock_ppm(self) -> float | None:
-        """How much faster the board's clock runs than the host's [1e-6]; None while unknown."""
+        """Rate of the board's clock over the host's [1e-6]; None if unknown."""
 
     @property
     def cells(self) -> CellBlock:

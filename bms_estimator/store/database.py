@@ -96,7 +96,7 @@ class Database:
                 wait.reschedule(min(wait.when() or self._end_s, self._end_s))
 
     async def _wait(self, waiter: asyncio.Future[Any]) -> bool:
-        """Whether the disk answered in time."""
+        """Return True if the disk responded in time."""
         due_s = min(asyncio.get_running_loop().time() + self._hang_s, self._end_s)
         try:
             async with asyncio.timeout_at(due_s) as wait:
@@ -110,7 +110,7 @@ class Database:
 
     @property
     def opened(self) -> int:
-        """How often the file was opened: what was there before may not be there any more."""
+        """Number of times the file was opened: earlier content may be gone."""
         return self._file.opened
 
     async def call(self, work: Callable[[sqlite3.Connection], Result]) -> Result:

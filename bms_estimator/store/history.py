@@ -130,7 +130,7 @@ class History:
         await self._write()
 
     async def _write(self) -> None:
-        """Write what waits. Whether an earlier try was written nobody may know: what is there already is left out."""
+        """Write the waiting rows, skipping existing ones, because an earlier attempt may have been written."""
         minutes, happened, last = list(self._minutes), list(self._events), self._number
         if not minutes and not happened:
             return
@@ -158,7 +158,7 @@ class History:
 
 
 def _second(connection: sqlite3.Connection, row: Minute) -> int:
-    """Where a row stands: with its minute, or by a second later where the clock went through that already."""
+    """Return the timestamp of a row: its minute, or a second later if the clock went through that minute before."""
     for second in range(row.time_s, row.time_s + MINUTE_S):
         there = connection.execute("SELECT seen_s FROM minute WHERE time_s = ?", (second,)).fetchone()
         if there is None or there[0] + row.seen_s <= MINUTE_S:

@@ -15,7 +15,7 @@ GAP_RATIO = 3.0
 
 
 class Minute(NamedTuple):
-    """One row of history; None where nothing was told. Means and extremes are of what was published."""
+    """One row of history; None for missing values. Means and extremes are over published values."""
 
     time_s: int
     """Its begin [s since 1970]."""
@@ -43,7 +43,7 @@ class Minute(NamedTuple):
 
 @dataclass
 class _Mean:
-    """Of one quantity."""
+    """Mean of one quantity."""
 
     count: int = 0
     total: float = 0.0

@@ -116,7 +116,7 @@ class Outbox:
         await self._settle(write=True)
 
     def _behind(self) -> bool:
-        """Whether what waits must be written."""
+        """Return True if waiting messages must be written."""
         self._seen.append(self._queue.next)
         oldest = self._queue.oldest
         return oldest is not None and (not self.connected or (len(self._seen) == BEHIND and oldest < self._seen[0]))

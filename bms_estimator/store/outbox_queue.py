@@ -63,12 +63,12 @@ class Queue:
 
     @property
     def can_hand_out(self) -> bool:
-        """Whether ``take_next`` gives something."""
+        """True if ``take_next`` returns a message."""
         return bool(self._ready or (self._tail and (self.skip_disk or not self.stored)))
 
     @property
     def needs_page(self) -> bool:
-        """Whether it is time to read from disk."""
+        """True if messages should be read from disk."""
         return bool(self.stored) and len(self._ready) < PAGE // 2
 
     def put(self, message: Message) -> None:
@@ -120,7 +120,7 @@ class Queue:
                 self.stored.add(newest.number)
 
     def loaded(self, rows: Iterable[QueuedMessage], end: int) -> None:
-        """Of what is on disk alone these were read; all that is before ``end`` and not among them is lost."""
+        """Take over messages read from disk; those before ``end`` that are missing are lost."""
         wanted = self.stored.take_before(end)
         read = {waiting.number: waiting for waiting in rows if waiting.number in wanted}  # some were dropped meanwhile
         self._ready.extend(read.values())
@@ -148,7 +148,7 @@ class Queue:
         return runs.first - first
 
     def left(self, runs: NumberRanges) -> None:
-        """So much of what was on disk alone is still there."""
+        """Set the number of messages that are still only on disk."""
         before = len(self.stored)
         self.stored = self.stored.both(runs)
         self._lose(before - len(self.stored))

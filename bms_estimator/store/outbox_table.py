@@ -1,4 +1,4 @@
-"""What the outbox asks of the disk, all of it in one transaction."""
+"""Disk operations of the outbox, all in one transaction."""
 
 import re
 import sqlite3
@@ -21,7 +21,7 @@ _NUMBERS = (
 
 
 class StoredBacklog(NamedTuple):
-    """What is on disk at start."""
+    """Messages on disk at the start."""
 
     runs: NumberRanges
     damaged: int
@@ -43,7 +43,7 @@ def _runs(connection: sqlite3.Connection, first: int, end: int) -> NumberRanges:
 
 
 class Outcome(NamedTuple):
-    """Of one transaction."""
+    """Result of one transaction."""
 
     stored: NumberRanges | None
     """Messages on disk alone before it, where it was asked."""
@@ -72,7 +72,7 @@ class OutboxTransaction:
     """True to count the messages that are only on disk, first of all."""
 
     def __bool__(self) -> bool:
-        """Whether there is something to do."""
+        """Return True if there is something to do."""
         return bool(self.gaps or self.rows or self.page or self.recount)
 
     def __call__(self, connection: sqlite3.Connection) -> Outcome:

@@ -84,7 +84,7 @@ class Inputs:
         return {name: [each.measured, each.lost] for name, each in self._inputs.items() if each.measured}
 
     def measured(self, names: Collection[Quantity]) -> bool:
-        """Whether all of these were measured at some time."""
+        """Return True if all of these were measured at some time."""
         return all(self._inputs[name].measured for name in names)
 
     def take(self, times_s: Floats, steps_s: Floats, counts: Mapping[Quantity, Counts]) -> list[float]:

@@ -113,7 +113,7 @@ class _Rows:
 
 
 def _extremes(cells: CellBlock) -> Floats:
-    """Lowest and highest cell voltage of each sample [V], NaN where there is none, and their number. Shape (n, 3)."""
+    """Return lowest and highest cell voltage of each sample [V], NaN without any, and their number. Shape (n, 3)."""
     if not cells.shape[1]:
         return np.tile(_NO_EXTREMES, (len(cells), 1))
     measured = np.count_nonzero(np.isfinite(cells), axis=1)

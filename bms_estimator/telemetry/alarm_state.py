@@ -87,7 +87,7 @@ class AlarmState:
         return [AlarmTransition(at_s, raising)]
 
     def acknowledge(self) -> bool:
-        """Somebody knows. Returns whether it has ended by that."""
+        """Acknowledge the alarm. Return True if that ends it."""
         self.acknowledged = self.raising is not None
         if not self.cause_cleared:
             return False
@@ -100,7 +100,7 @@ class AlarmState:
         self._held_s = None
 
     def _due(self, signed: float, step_s: float, sign: float) -> bool:
-        """Whether what leads to the next state has now held for long enough."""
+        """Return True if the condition of the next state has held long enough."""
         raised = self.raising is not None and not self.cause_cleared
         holds = signed < sign * self.watched.clear if raised else signed >= sign * self.watched.limit
         if not holds:

@@ -1,4 +1,4 @@
-"""What an alarm says to people."""
+"""Texts of alarms."""
 
 from collections.abc import Sequence
 

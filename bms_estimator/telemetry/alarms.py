@@ -57,14 +57,14 @@ class Change(NamedTuple):
 
 
 class Reasons(NamedTuple):
-    """What else is known of an alarm's cause."""
+    """Further facts about an alarm's cause."""
 
     suspects: InputFault
     texts: tuple[str, ...]
 
 
 class AlarmMessage(NamedTuple):
-    """What is told of an alarm."""
+    """Message about an alarm."""
 
     raising: RaisedAlarm | None
     gone: bool
@@ -197,12 +197,12 @@ class AlarmEvaluator:
         return [state.watched.name for state in found]
 
     def names(self) -> tuple[AlarmName, ...]:
-        """Of all that are watched."""
+        """Names of all monitored alarms."""
         return tuple(self._states)
 
     @property
     def active(self) -> tuple[AlarmName, ...]:
-        """Of those that are raised."""
+        """Names of all raised alarms."""
         return tuple(name for name, state in self._states.items() if state.raising is not None)
 
     @property
@@ -297,7 +297,7 @@ class AlarmEvaluator:
         return found
 
     def _is_blinded(self) -> bool:
-        """Whether a quantity is lost that a critical alarm needs."""
+        """Return True if a quantity is lost that a critical alarm needs."""
         lost = set(self._inputs.lost)
         return any(not lost.isdisjoint(NEEDED.get(name, ())) for name in self.unwatched)
 
@@ -308,7 +308,7 @@ class AlarmEvaluator:
             self._note(state, state.raise_at(at_s, RaisedAlarm(at_s + wall_s, None)))
 
     def _judge_share(self, at_s: float, counts: SampleCounts, suspects: InputFault, wall_s: float) -> None:
-        """Of samples that are lost or unusable among all."""
+        """Evaluate the share of samples that are lost or unusable."""
         if 0.0 <= at_s - self._counted_s < SHARE_S:
             return
         before, self._counts, self._counted_s = self._counts, counts, at_s

@@ -11,7 +11,7 @@ from bms_estimator.model.payloads import Totals
 
 
 class ChargeEnergy(NamedTuple):
-    """What has gone through the terminals; none of it ever decreases."""
+    """Charge and energy through the terminals; no field ever decreases."""
 
     charge_out_ah: float = 0.0
     charge_in_ah: float = 0.0

@@ -1,4 +1,4 @@
-"""What was learned of a fuel cell, each parameter with its error."""
+"""Identified parameters of a fuel cell with their errors."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""How the service and the line are: topic ``health``."""
+"""Health of service and line: topic ``health``."""
 
 import math
 import os
@@ -43,7 +43,7 @@ def dropped_text(dropped: Mapping[str, int]) -> str:
 
 
 def identifier_counters(record: np.void) -> dict[str, int]:
-    """How often the filter did not believe its input or itself, of a record of ESTIMATOR_STATE."""
+    """Return counters of the filter's rejected inputs and resets, from a record of ESTIMATOR_STATE."""
     counts = zip(COUNTERS.names or (), record["counters"].item(), strict=True)
     return dict(counts) | {"searched": int(record["filter"]["reopened"])}
 

@@ -1,4 +1,4 @@
-"""What is counted over restarts: samples, crashes, the time in which nobody measured, charge and energy."""
+"""Totals over all restarts: samples, crashes, unmeasured time, charge and energy."""
 
 import math
 from collections import Counter
@@ -41,7 +41,7 @@ class LifetimeTotals:
 
     @property
     def total(self) -> Totals:
-        """Of all runs."""
+        """Totals of all runs."""
         samples = Counter(self._before.samples)
         samples.update(sample_counters(self.estimator.state[0]))
         changed = {"samples": dict(samples), "unseen_s": self._before.unseen_s + self._unseen_s}

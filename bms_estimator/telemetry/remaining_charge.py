@@ -1,4 +1,4 @@
-"""What is left in the pack at the present state and load."""
+"""Remaining charge, energy and time at the present state and load."""
 
 import math
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
 
 
 def _time(charge_ah: float, current_a: float, capacity_ah: float) -> float:
-    """How long ``charge_ah`` takes [s]; NaN where the current, for that of a pack of ``capacity_ah``, is none."""
+    """Return the time for ``charge_ah`` [s]; NaN if the current is negligible for a pack of ``capacity_ah``."""
     return 3600.0 * charge_ah / current_a if current_a * LONGEST_H > capacity_ah else math.nan
 
 

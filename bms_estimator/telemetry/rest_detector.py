@@ -1,4 +1,4 @@
-"""Whether the pack is seen at rest: the only time when a current of zero may be learned."""
+"""Detection of rest: the only time when the zero of the current may be calibrated."""
 
 from collections import deque
 
@@ -31,7 +31,7 @@ class RestDetector:
             self._windows.popleft()
 
     def reset(self) -> None:
-        """Begin anew: nobody has seen what happened meanwhile."""
+        """Restart the detection after an unobserved time."""
         self._windows.clear()
 
     def not_at_rest_reason(self, now_s: float) -> str | None:

@@ -1,4 +1,4 @@
-"""What in a capture contradicts the cell it is said to come from, in words and numbers."""
+"""Contradictions between a capture and the cell that it is said to come from."""
 
 import numpy as np
 
@@ -45,7 +45,7 @@ def capture_contradictions(load: CleanCapture, cell: CellModel, start: float) ->
 
 
 def without_excitation(load: CleanCapture, cell: CellModel) -> bool:
-    """Whether the current is too small to tell anything of the resistances."""
+    """Return True if the current is too small to determine the resistances."""
     return _no_excitation(load, cell) is not None
 
 
@@ -60,7 +60,7 @@ def step_resistance(load: CleanCapture) -> float | None:
 
 
 def soc_outside(load: CleanCapture, capacity_ah: float, start: float) -> str | None:
-    """How far SOC, counted from ``start``, leaves 0..1; None where it does not."""
+    """Return how far SOC, counted from ``start``, leaves 0..1; None if it stays within."""
     soc = start - load.discharged_ah / capacity_ah
     if soc.min() >= -2.0 * SOC_SLACK and soc.max() <= 1.0 + 2.0 * SOC_SLACK:
         return None

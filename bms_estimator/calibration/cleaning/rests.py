@@ -100,6 +100,6 @@ def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def mean_temperature_c(samples: SampleBlock) -> float:
-    """Mean temperature where it is told [C], else NaN."""
+    """Return the mean of the reported temperatures [C], NaN without any."""
     told = samples["temperature_c"][np.isfinite(samples["temperature_c"])]
     return float(told.mean()) if told.size else float("nan")

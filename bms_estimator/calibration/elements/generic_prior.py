@@ -1,4 +1,4 @@
-"""What captures do not tell of a cell: that of the shipped generic cell whose open-circuit voltage is most like it."""
+"""Prior from the shipped generic cell with the most similar open-circuit voltage, for values that captures do not determine."""
 
 import numpy as np
 

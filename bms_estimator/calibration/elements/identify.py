@@ -236,15 +236,15 @@ class _Candidate:
         self.fit, self.cell = self._fitted(range(len(runs)))
 
     def miscounts(self) -> list[float]:
-        """Of each capture, beyond that it was counted with: by what more its voltage lies on the fit's."""
+        """Additional miscount of each capture at which its voltage matches the fit's."""
         return [one.miscount(self.fit) for one in self._moments]
 
     def scores(self) -> Floats:
-        """Of each capture's replays, with a cell that did not see it where there are others like it [%]."""
+        """Scores of each capture's replays [%], with a cell that did not use the capture if there are similar ones."""
         return np.array([interval_score(self._cell_for(j), run.load, run.soc) for j, run in enumerate(self._runs)])
 
     def held_back(self, j: int) -> bool:
-        """Whether another capture at about the temperature of ``j`` was given."""
+        """Return True if another capture at about the temperature of ``j`` was given."""
         mean_c = [run.mean_c for run in self._runs]
         return any(k != j and abs(mean_c[k] - mean_c[j]) < SPAN_K for k in range(len(mean_c)))
 

@@ -299,7 +299,7 @@ def _apart(time_s: Floats) -> NDArray[np.bool_]:
 
 
 def _weights(load: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
-    """Of each row, up to a factor, and which are the last of a long rest."""
+    """Return the weight of each row, up to a factor, and which rows are the last of a long rest."""
     largest_a = float(np.abs(load.current_a).max())
     step_s = np.clip(np.diff(load.time_s, append=load.time_s[-1] + 1.0), 0.0, LONGEST_S)
     changed = np.r_[True, np.abs(np.diff(load.current_a)) > STEP_SHARE * largest_a]

@@ -96,7 +96,7 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
 
 
 def coldness(temperature_c: Floats) -> Floats:
-    """How much slower a cell is than at 25 C: 0 there, 1 at 0 C; 0 where the temperature is not known."""
+    """Return how much slower a cell relaxes than at 25 C: 0 there, 1 at 0 C; 0 for an unknown temperature."""
     colder = np.maximum(REFERENCE_C - np.nan_to_num(temperature_c, nan=REFERENCE_C), 0.0)
     return np.asarray(2.0 ** (colder / DOUBLING_K) - 1.0, dtype=np.float64)
 

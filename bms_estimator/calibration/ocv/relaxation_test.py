@@ -73,7 +73,7 @@ class Rest:
 
     @property
     def remaining_v(self) -> float:
-        """What was left to relax at the end of the rest [V]."""
+        """Voltage left to relax at the end of the rest [V]."""
         return self.ocv_v - self.voltage_v
 
 

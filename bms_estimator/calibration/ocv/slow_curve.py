@@ -162,7 +162,7 @@ def _branch(
 
 
 def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
-    """Charge of the whole slow discharge nearest to 25 C [Ah]; NaN when there is none."""
+    """Return the charge of the full slow discharge nearest to 25 C [Ah]; NaN without one."""
     whole = [branch for branch in branches if branch.whole and branch.before_ah < 0.01 * branch.ah[-1]]
     if not whole:
         return float("nan")

@@ -1,4 +1,4 @@
-"""What each capture or table says of the open-circuit voltage: rests, a slow curve, or a curve that is given."""
+"""Sources of the open-circuit voltage: rests, low-rate curves, and given curves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class ExternalCurve:
-    """A curve that somebody else found: soc 0..1, ocv_v [V], hysteresis_v [V] or None; shape (n,) each."""
+    """Curve from another source: soc 0..1, ocv_v [V], hysteresis_v [V] or None; shape (n,) each."""
 
     name: str
     soc: Floats
@@ -110,7 +110,7 @@ class OcvSources:
 
     @property
     def points(self) -> Points:
-        """Of all sources."""
+        """Points of all sources."""
         return joined([source.points for source in self.sources])
 
 
@@ -234,7 +234,7 @@ def _usual_share(telling: Source, series_count: int) -> float:
 
 
 def has_plateau(soc: Floats, ocv_v: Floats, series_count: int) -> bool:
-    """Whether the curve rises so little somewhere that two phases lie side by side; ``soc`` increasing, voltage in V."""
+    """Return True if the curve is so flat somewhere that two phases coexist; ``soc`` increasing, voltage in V."""
     edges = np.linspace(*SHARE_SOC, 1 + round(np.ptp(SHARE_SOC) / PLATEAU_SOC))
     slope_v = np.diff(np.interp(edges, soc, ocv_v)) / np.diff(edges)
     return float(slope_v.min()) < PLATEAU_V * series_count
@@ -272,7 +272,7 @@ def _soc_at(curve: TableFit, voltage_v: float) -> float:
 
 
 def _amid_hysteresis(points: Points, kept_v: Floats, relative_std: float) -> Points:
-    """Points moved to halfway between discharge and charge, ``kept_v`` above those after discharge, which may be wrong by so much."""
+    """Move points halfway between discharge and charge: ``kept_v`` above those after discharge, with that as their error."""
     size_v = np.interp(points.soc, GRID, kept_v)
     return replace(
         points,

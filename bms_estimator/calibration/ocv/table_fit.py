@@ -210,7 +210,7 @@ def _solved(model: _Model, points: Points, std_v: Floats, cells: float) -> Float
 
 
 def _sizes(points: Points, model: _Model, x: Floats, common: float) -> tuple[Floats, float]:
-    """How much larger than said each source's scatter is, and the sources' common deviations all are; at least 1."""
+    """Return how much larger than declared each source's scatter and the systematic errors of all are; at least 1."""
     left = (points.ocv_v - model.points @ x) / np.hypot(points.std_v, ROUGH * points.common_v)
     sources = int(points.source.max()) + 1
     noise = [max(1.0, STD_OF_MEDIAN * float(np.median(np.abs(left[points.source == k])))) for k in range(sources)]
@@ -230,7 +230,7 @@ def _knots() -> Floats:
 
 
 def _centres() -> Floats:
-    """Where each coefficient of the spline acts (Greville abscissae)."""
+    """Return the SOC at which each coefficient of the spline acts (Greville abscissae)."""
     knots = _knots()
     return np.asarray((knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3.0)
 

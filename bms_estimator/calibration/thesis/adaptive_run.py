@@ -148,7 +148,7 @@ def adaptive_run(
 
 
 def _crossing(parameter: str, a: Floats, soc: Floats, time_s: Floats) -> Crossing:
-    """Where ``parameter`` meets its condition."""
+    """Return the SOC at which ``parameter`` meets its condition."""
     i = int(parameter[1:])
     at = float(delta(a[i], a[i + 1], a[i - 1]))
     below = np.flatnonzero(soc <= at)

@@ -113,7 +113,7 @@ def _unstable_from(time_s: Floats, voltage_v: Floats, margin: Floats) -> tuple[f
 
 
 def _knee(time_s: Floats, voltage_v: Floats) -> float | None:
-    """Where the voltage begins its last fall [s]; None when it does not."""
+    """Return the time at which the last fall of the voltage begins [s]; None without one."""
     edges = np.linspace(0, time_s.size - 1, WINDOWS + 1).astype(int)
     if np.unique(edges).size < edges.size:
         return None

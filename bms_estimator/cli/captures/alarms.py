@@ -53,7 +53,7 @@ class Raised:
 
 @dataclass
 class Found:
-    """What a capture raises, and what it tells nothing of."""
+    """Alarms raised by a capture, and alarms that it has no data for."""
 
     raised: list[Raised]
     quiet: Sequence[str]

@@ -204,7 +204,7 @@ def _temperature(result: Result) -> dict[str, str]:
 
 
 def _set_back(result: Result) -> str:
-    """How often, and what that looks like."""
+    """Describe how often the clock was set back."""
     text = f"{result.time_steps_back:,} times"
     return f"{text}: are the rows in the order of time?" if result.time_steps_back > MANY * result.samples else text
 

@@ -1,4 +1,4 @@
-"""What a replay came to: sums over the trace, then one object for people and programs."""
+"""Summary of a replay: sums over the trace, then one object for tables and JSON."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from bms_estimator.telemetry.state import finite
 
 @dataclass(frozen=True)
 class LearnedParameter:
-    """What was learned, at the end; a number that there is none of is None."""
+    """Parameter as learned at the end; None without a value."""
 
     value: float | None
     std: float | None
@@ -24,7 +24,7 @@ class LearnedParameter:
 
 @dataclass(frozen=True)
 class Result:
-    """The outcome of a replay; a number that there is none of is None."""
+    """Result of a replay; None for missing numbers."""
 
     samples: int  # accepted
     duration_s: float | None  # from the first to the last of them, on the capture's clock

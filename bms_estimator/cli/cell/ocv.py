@@ -70,7 +70,7 @@ TENTHS = np.linspace(0.0, 1.0, 11)
 
 
 class Form(StrEnum):
-    """What the open-circuit voltage is written as."""
+    """Form in which the open-circuit voltage is written."""
 
     CHEN_MORA = "chen-mora"
     TABLE = "table"
@@ -78,7 +78,7 @@ class Form(StrEnum):
 
 @dataclass(frozen=True)
 class SourceResult:
-    """What one source was found to be and how it fits, as ``--json`` prints it."""
+    """Kind of a source and quality of its fit, as printed by ``--json``."""
 
     name: str
     kind: str

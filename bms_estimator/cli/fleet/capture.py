@@ -63,7 +63,7 @@ def capture(
 
 
 def epoch_s(time: datetime | None, otherwise_s: float) -> float:
-    """As seconds since 1970; told in UTC."""
+    """Convert a UTC time to seconds since 1970."""
     return otherwise_s if time is None else time.replace(tzinfo=UTC).timestamp()
 
 

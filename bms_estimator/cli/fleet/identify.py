@@ -1,4 +1,4 @@
-"""``bms-estimator fleet identify``: packs identified anew from what they have sent."""
+"""``bms-estimator fleet identify``: re-identification of packs from their stored samples."""
 
 import asyncio
 import csv
@@ -147,7 +147,7 @@ async def _put(found: Sequence["ReidentificationResult"], known: PackRegistry, w
 
 
 def _row(one: "ReidentificationResult") -> dict[str, object]:
-    """As a program reads it: no number where there is none."""
+    """Return the row for JSON, with None for missing numbers."""
     values = asdict(one) | {"better": bool(one.cell_file)}
     del values["cell_file"]
     return {

@@ -105,7 +105,7 @@ def _print_csv(answer: "Answer") -> None:
 
 
 def _print_table(answer: "Answer") -> None:
-    """As wide as it must be: a name that is cut is none."""
+    """Print a table as wide as necessary, because a truncated name is useless."""
     table = Table(*answer.columns, box=box.SIMPLE)
     for row in answer.rows:
         table.add_row(

@@ -105,7 +105,7 @@ async def _show(console: Console, progress: "Progress", log: deque[str]) -> None
 
 
 class Progress:
-    """What has been recorded so far."""
+    """Progress of a recording."""
 
     def __init__(self, source: Source, recording: CaptureRecorder) -> None:
         self._source, self._recording = source, recording
@@ -114,7 +114,7 @@ class Progress:
         self._rate_hz = 0.0
 
     def line(self) -> Text:
-        """For a screen that is drawn anew."""
+        """Progress as one line that is redrawn."""
         why = f"  {self._source.message}" if self._source.message else ""
         now_s, frames = time.monotonic(), self._source.counters["frames_received"]
         if now_s - self._last[0] >= 1.0:
@@ -123,7 +123,7 @@ class Progress:
         return Text(f"{self.summary()}, {self._rate_hz:.0f} Hz{why}", no_wrap=True, overflow="ellipsis")
 
     def summary(self) -> str:
-        """Of the whole recording."""
+        """Summary of the whole recording."""
         counters = self._source.counters
         faults = sum(
             counters.get(name, 0) for name in ("cobs_errors", "length_errors", "version_errors", "text_errors")

@@ -50,7 +50,7 @@ def top(
 
 
 async def _watch(settings: MqttSettings, log: deque[str], first: str) -> None:
-    """Show until a key, a signal, or until nobody reads any more."""
+    """Show the view until a key, a signal, or the end of the reader."""
     stop = stop_on_signal()
 
     def hear(heard: DeviceMessage) -> None:

@@ -1,4 +1,4 @@
-"""What is being compiled, for people: a first start takes a minute or two."""
+"""Progress of the compilation at a first start, which takes a minute or two."""
 
 import math
 import signal

@@ -58,7 +58,7 @@ class BlockCapture:
 
     @property
     def blocks(self) -> int:
-        """So many were found."""
+        """Number of blocks found."""
         return len(self._blocks)
 
     @property

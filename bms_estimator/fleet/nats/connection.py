@@ -188,7 +188,7 @@ class _Said:
 
 
 def error_text(error: BaseException) -> str:
-    """Of an error of NATS, or of the line to it."""
+    """Return an error of NATS, or of the connection to it, as text."""
     said = str(getattr(error, "description", None) or error).removeprefix("nats: ") or type(error).__name__
     for kind, text in _REASONS.items():
         if isinstance(error, kind):

@@ -1,4 +1,4 @@
-"""What a stream has under a subject, from one sequence to another."""
+"""Messages of a stream on a subject, between two sequence numbers."""
 
 import asyncio
 from collections.abc import AsyncGenerator

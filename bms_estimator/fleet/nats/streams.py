@@ -87,7 +87,7 @@ async def make_streams(
 
 
 async def partitions_of(nc: Client) -> int | None:
-    """How many partitions the stream ``RAW`` has; None: it has not been made."""
+    """Return the number of partitions of the stream ``RAW``; None if it does not exist."""
     answer = await _repeated(_ask, nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
     if "error" in answer:
         if answer["error"].get("err_code") == NO_SUCH_STREAM:

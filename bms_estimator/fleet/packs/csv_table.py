@@ -47,7 +47,7 @@ class PackTable:
 
 
 class _RowError(ValueError):
-    """What is wrong with one value: its column, and what to do."""
+    """Error in one value: its column, and what to do."""
 
 
 def read_table(path: Path) -> PackTable:

@@ -23,7 +23,7 @@ _GONE = frozenset({"DEL", "PURGE"})
 
 @dataclass(frozen=True)
 class Written:
-    """What a change of the table came to: so many rows."""
+    """Result of a table change: numbers of rows."""
 
     new: int
     changed: int

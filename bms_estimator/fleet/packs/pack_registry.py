@@ -48,7 +48,7 @@ class PackRegistry:
         return found if isinstance(found, str) else ""
 
     def kind(self, pack: str) -> PackSpec | str | None:
-        """Its row, or what is wrong with it; None where there is none."""
+        """Return the pack's row, or the error in it; None without a row."""
         data = self._rows.get(pack)
         return None if data is None else self._kind(data)
 

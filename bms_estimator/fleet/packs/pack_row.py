@@ -29,7 +29,7 @@ _COUNT = Field(ge=1, le=10_000)
 
 
 class PackSpec(Strict):
-    """What packs have in common that differ by their names alone; as ``[pack]`` and ``[sensor]`` of a pack's file."""
+    """Values that packs of one kind share; as ``[pack]`` and ``[sensor]`` of a pack's file."""
 
     cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
         description="lfp, nmc, nca, lco, lmo, lto: generic, give capacity_ah; else a shipped cell's name, or a cell "

@@ -1,4 +1,4 @@
-"""What a fleet publishes, heard for its page: states, parameters, hours, workers, unknown packs, and the table of packs."""
+"""Messages of a fleet for its page: states, parameters, hours, workers, unknown packs, and the table of packs."""
 
 import asyncio
 import time
@@ -181,7 +181,7 @@ class FleetFeed:
 
 
 def type_name(kind: PackSpec | str) -> str:
-    """Of a row of the table, such as ``lfp 16s2p 280 Ah``; of one that is wrong, that it is."""
+    """Return the type of a table row, such as ``lfp 16s2p 280 Ah``, or that the row is wrong."""
     if isinstance(kind, str):
         return "wrong rows"
     capacity = "" if kind.capacity_ah is None else f" {kind.capacity_ah:g} Ah"

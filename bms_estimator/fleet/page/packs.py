@@ -64,7 +64,7 @@ CONCERNS = {
 
 
 class FleetPacks:
-    """What is known of all packs; all times are of one clock that never goes back [s]."""
+    """State of all packs; times are on one monotonic clock [s]."""
 
     def __init__(self) -> None:
         self._places: dict[str, int] = {}
@@ -159,7 +159,7 @@ class FleetPacks:
         }
 
     def _row(self, name: str) -> Any:
-        """Of a pack, made where it is heard of first."""
+        """Return the row of a pack, created at its first message."""
         place = self._places.get(name)
         if place is None:
             place = self._places[name] = len(self._names)
@@ -219,7 +219,7 @@ def _extremes(column: NDArray[np.float64], mask: Mask) -> list[tuple[int, float]
 
 
 def _spread(rows: Rows) -> dict[str, Any]:
-    """Of packs that are alive."""
+    """Return the spread over live packs."""
     return {
         "alive": int(rows.size),
         "soc": _histogram(rows["soc"], SOC_EDGES),
@@ -230,7 +230,7 @@ def _spread(rows: Rows) -> dict[str, Any]:
 
 
 def _histogram(values: NDArray[np.float64], edges: NDArray[np.float64]) -> list[int]:
-    """How many are in each bin; what lies beyond the ends is in the first and the last."""
+    """Count the values in each bin; values beyond the ends go to the first and last bin."""
     values = values[np.isfinite(values)]
     bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
     return [int(n) for n in np.bincount(bins, minlength=edges.size - 1)]

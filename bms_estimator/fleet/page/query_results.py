@@ -1,4 +1,4 @@
-"""What the hours of a fleet answer, for its page: each question asked now and then, off the event loop."""
+"""Query results for the page of a fleet: each query runs at intervals, off the event loop."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""What the page of a fleet is sent, from all that was heard. Pure: the clocks are given."""
+"""View that the page of a fleet is sent. Pure: clocks are arguments."""
 
 import json
 from collections import deque

@@ -47,7 +47,7 @@ class FleetWorkers:
         self._heard.clear()
 
     def unknown(self, now_s: float) -> tuple[int, list[str]]:
-        """How many packs no table knows, and some of them."""
+        """Return the number of packs without a table row, and some of their names."""
         alive = self._alive(now_s)
         count = sum(heard[-1].heartbeat.unknown_count for heard in alive.values())
         return count, sorted({name for heard in alive.values() for name in heard[-1].heartbeat.unknown})

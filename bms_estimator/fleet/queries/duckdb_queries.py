@@ -32,7 +32,7 @@ LEAST_STDS = 3.0
 
 
 class Query(NamedTuple):
-    """What can be asked by name."""
+    """Query with a name."""
 
     needs: tuple[str, ...]
     """Tables to be made before, files of SQL."""
@@ -50,7 +50,7 @@ QUESTIONS = {
 
 @dataclass(frozen=True)
 class Limits:
-    """What the questions take as given."""
+    """Parameters of the queries."""
 
     within_days: float = 90.0
     """failing: a limit is reached so soon."""
@@ -83,7 +83,7 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class Answer:
-    """A table; numbers are plain, what is not known is None."""
+    """Result table; numbers are plain, unknown values are None."""
 
     columns: tuple[str, ...]
     rows: list[tuple[Any, ...]]
@@ -215,7 +215,7 @@ def _given(now_hour: int) -> dict[str, Any]:
 
 
 def _stds(base: duckdb.DuckDBPyConnection) -> float:
-    """So far from what is usual that of all packs together hardly one is there by chance."""
+    """Return the deviation in std that hardly one of all packs exceeds by chance."""
     (packs,) = base.execute("SELECT count(*) FROM packs").fetchone() or (0,)
     return max(NormalDist().inv_cdf(1.0 - 0.5 * BY_CHANCE / max(packs, 1)), LEAST_STDS)
 

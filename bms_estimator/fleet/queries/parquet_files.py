@@ -62,7 +62,7 @@ def write_table(folder: Path, table: pa.Table) -> list[Path]:
 
 
 def day_folder(folder: Path, day: date) -> Path:
-    """Where the hours of a day are."""
+    """Return the folder of a day's hours."""
     return folder / f"{FOLDER}{day.isoformat()}"
 
 
@@ -137,7 +137,7 @@ def compact(day: Path) -> Path:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove files that a killed process left unfinished; nobody else may write to ``folder`` now."""
+    """Remove files that a killed process left unfinished; no other process may write to ``folder`` now."""
     for file in folder.glob(f"{FOLDER}*/.*{UNFINISHED}"):
         file.unlink(missing_ok=True)
 
@@ -148,7 +148,7 @@ def sound_files(day: Path) -> list[Path]:
 
 
 def is_whole(file: Path) -> bool:
-    """Whether a file has begin and end of Parquet; one that vanishes has not."""
+    """Return True if a file has beginning and end of Parquet; False if it vanishes."""
     try:
         with file.open("rb") as opened:
             if opened.read(4) != _MAGIC:

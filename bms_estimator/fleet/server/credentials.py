@@ -31,7 +31,7 @@ GB = 1_000_000_000
 
 
 def has_keys(folder: Path) -> bool:
-    """Whether this machine has the private keys."""
+    """Return True if this machine has the private keys."""
     return (folder / "operator.nk").exists()
 
 

@@ -27,7 +27,7 @@ _NONE = -1
 
 
 class Role(Enum):
-    """What a user of a tenant is."""
+    """Role of a tenant's user."""
 
     EDGE = "edge"
     """Beside one pack: sends its blocks, hears what is awaited."""
@@ -184,7 +184,7 @@ def account(operator_key: Key, tenant: Tenant) -> str:
 
 
 def system_account(operator_key: Key, public: str) -> str:
-    """Claims of the account in which servers talk to each other: nobody has a user there."""
+    """Return the claims of the account in which servers communicate; it has no users."""
     limits = _unlimited() | {"conn": _NONE}
     return _signed(operator_key, public, "system", {"limits": limits, "type": "account"})
 

@@ -349,7 +349,7 @@ def _scheme(node: Node) -> str:
 
 
 def _heard(own: str) -> str:
-    """Where a node listens for others that know it by ``own``: a name may be that of any of its addresses."""
+    """Return the address on which a node listens for others that know it by ``own``, which may name any of its addresses."""
     listen = reachable(own)
     return own if listen.loopback else f"0.0.0.0:{listen.port}"
 

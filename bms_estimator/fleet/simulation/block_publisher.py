@@ -37,7 +37,7 @@ _HEARD = awaits("+").replace(".", "/")
 
 
 class Report(NamedTuple):
-    """What came of it."""
+    """Result of publishing."""
 
     blocks: int
     """Sent, those sent again among them."""
@@ -158,7 +158,7 @@ async def run_edges(
 
 
 async def _ended(stop: asyncio.Event) -> bool:
-    """Whether it is to end, after ``ROUND_S`` at the latest."""
+    """Return True if it should end; waits at most ``ROUND_S``."""
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(stop.wait(), ROUND_S)
     return stop.is_set()

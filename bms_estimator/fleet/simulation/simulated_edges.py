@@ -1,4 +1,4 @@
-"""What simulated edges have sent and what they must send again: the protocol of an edge for many at once, without I/O."""
+"""Sent and repeated blocks of simulated edges: the edge protocol for many at once, without I/O."""
 
 from typing import NamedTuple
 
@@ -79,11 +79,11 @@ class SimulatedEdges:
 
     @property
     def done(self) -> bool:
-        """Whether every edge has sent its last block."""
+        """True if every edge has sent its last block."""
         return self._last is not None and bool((self.next > self._last).all())
 
     def lag_s(self, now_s: float) -> float:
-        """How long the oldest complete block has waited to be sent [s]; 0 where all are."""
+        """Age of the oldest complete block that was not sent [s]; 0 without one."""
         ready_s = self._ready_s(self.next)
         return 0.0 if self.done else max(0.0, now_s - float(ready_s.min()))
 

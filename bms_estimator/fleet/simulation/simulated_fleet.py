@@ -51,7 +51,7 @@ OUTLIERS = 0.01
 
 
 class Kind(NamedTuple):
-    """What many packs have in common."""
+    """Values that many packs share."""
 
     cell: str
     capacity_ah: float | None
@@ -96,7 +96,7 @@ class _Curves:
 
 @dataclass(frozen=True)
 class Truth:
-    """What no estimator is told of each pack. Arrays of shape (packs,)."""
+    """Ground truth of each pack, which no estimator gets. Arrays of shape (packs,)."""
 
     capacity_as: Floats
     """[A s]"""

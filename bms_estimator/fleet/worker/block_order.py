@@ -23,7 +23,7 @@ apart, so the server refuses the missing ones, or they are damaged on the edge's
 
 
 class BlockOrder(Enum):
-    """What a block is to the order of its pack."""
+    """Position of a block in the order of its pack."""
 
     NEXT = "next"
     RESENT = "resends"

@@ -142,7 +142,7 @@ class BlockProcessor:
             times[~fit] = math.nan
 
     def _unseen_s(self, block: Block) -> float:
-        """How long nobody measured before a block [s]; infinite when nobody knows."""
+        """Return the length of the gap before a block [s]; infinite if unknown."""
         d, known_s = self._delivery, _known(block.samples)
         if not d["clock"] or not known_s.size:
             return math.inf
@@ -150,7 +150,7 @@ class BlockProcessor:
         return passed_s if passed_s >= 0.0 else math.inf
 
     def _turn_hour(self, pack: str, block: Block, of_type: PackType) -> tuple[tuple[tuple[str, bytes], ...], bool]:
-        """Where a block is of a later hour: the row of the one before, if anything came in it, and begin the new one."""
+        """Finish the hour before if a block is of a later one, and begin the new one; return the row if it has data."""
         present, before = hour_summary.hour_of(block), int(self._delivery["hour"])
         if present <= before:
             return (), False

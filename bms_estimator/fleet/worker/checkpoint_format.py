@@ -36,7 +36,7 @@ _LONGEST_RECORD = 1 << 24
 
 
 class CheckpointError(ValueError):
-    """What is wrong with a checkpoint, and what can be done."""
+    """Error in a checkpoint, and what can be done."""
 
 
 class PreviousLayoutState(NamedTuple):

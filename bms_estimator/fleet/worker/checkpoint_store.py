@@ -56,7 +56,7 @@ class CheckpointInfo(BaseModel):
 
 
 class Pointer(BaseModel):
-    """What the bucket of checkpoints says of a partition."""
+    """Entry of a partition in the checkpoint bucket."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -220,7 +220,7 @@ class CheckpointStore:
         return data if len(data) == info.size and info.digest == _digest(hashlib.sha256(data).digest()) else None
 
     async def _remove(self, name: str) -> None:
-        """Remove an object and what is told of it, as far as they are there: a deleted one would leave its name for ever."""
+        """Remove an object and its metadata, as far as they exist; a deletion marker would keep its name forever."""
         if name:
             for subject in (_described(name), _pieces(name)):
                 await self._js.purge_stream(_STREAM, subject=subject)
@@ -248,12 +248,12 @@ class _Chunks(io.RawIOBase):
 
 
 def _pieces(name: str) -> str:
-    """Where the bytes of an object are."""
+    """Return the subject of an object's chunks."""
     return f"$O.{subjects.STATES_BUCKET}.C.{name}"
 
 
 def _described(name: str) -> str:
-    """Where it stands what an object is."""
+    """Return the subject of an object's metadata."""
     return f"$O.{subjects.STATES_BUCKET}.M.{base64.urlsafe_b64encode(name.encode()).decode()}"
 
 

@@ -188,7 +188,7 @@ _CORRELATIONS = {
 
 
 def _correlation(covariance: NDArray[np.float64], j: int, k: int) -> float:
-    """Of states ``j`` and ``k``; 0 where one of them is taken as known."""
+    """Return the correlation of states ``j`` and ``k``; 0 if one of them is fixed."""
     variances = float(covariance[j, j] * covariance[k, k])
     return float(covariance[j, k]) / math.sqrt(variances) if variances > 0.0 else 0.0
 

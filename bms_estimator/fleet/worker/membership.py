@@ -16,7 +16,7 @@ from bms_estimator.fleet.heartbeat import DEAD_S
 
 
 def assign_partitions(partitions: int, workers: Collection[str]) -> list[str]:
-    """Which of some workers, one at least, is to have each of so many partitions."""
+    """Assign each partition to one of the workers, of which there is at least one."""
     most = math.ceil(partitions / len(workers))
     has = Counter[str]()
     found = []
@@ -63,7 +63,7 @@ class Membership:
         return sorted({self.me, *self._heard})
 
     def share(self, partitions: int, now_s: float) -> set[int]:
-        """Those of so many partitions that are ours to try for."""
+        """Return the partitions that this worker should claim."""
         alive = self.alive(now_s)
         if alive != self._alive:
             self._alive = alive

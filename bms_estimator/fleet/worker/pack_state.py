@@ -119,7 +119,7 @@ class WorkRecord:
         return of_estimator
 
     def count_lost(self, blocks: int) -> None:
-        """So many blocks of this hour never came."""
+        """Count blocks of this hour as lost."""
         lost = self.record[0]["hour"]
         lost["lost_blocks"] = min(int(lost["lost_blocks"]) + blocks, MOST_LOST)
 

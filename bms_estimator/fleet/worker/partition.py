@@ -113,7 +113,7 @@ class Partition:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """What came, and what became of it, since the partition began."""
+        """Counters since the partition began."""
         return {**self._counters, "packs": len(self._packs) + len(self._former), "unknown": len(self.unknown)}
 
     @property

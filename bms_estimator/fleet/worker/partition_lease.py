@@ -109,7 +109,7 @@ class PartitionLease:
 
     @property
     def is_owned(self) -> bool:
-        """Whether we have it, as far as we have heard."""
+        """True if this worker owns the partition, as far as it knows."""
         return self.partition is not None and self.claim is not None
 
     def receive(self, message: Msg) -> None:
@@ -190,7 +190,7 @@ class PartitionLease:
                         self.hours.popleft()
 
     async def release(self) -> None:
-        """Write a checkpoint and let somebody else have the partition; ``run`` has ended."""
+        """Write a checkpoint and release the partition; ``run`` has ended."""
         try:
             await self.save()
         except TROUBLES as error:
@@ -241,7 +241,7 @@ class PartitionLease:
         await self._publish(await self._step(pack, sequence, take))
 
     async def _take(self, given: DeliveredMessage) -> None:
-        """Take a message, after those before it; until that is done, or the partition somebody else's."""
+        """Process a message after those before it; return when it is done or the partition is lost."""
         while not await self._try(lambda: self._go_on_to(given)):
             await asyncio.sleep(RETRY_S)
             if not self.consumer.pinned:
@@ -403,7 +403,7 @@ class PartitionLease:
         self.hours.clear()  # who has the partition makes them from the last checkpoint on
 
     async def _try(self, what: Callable[[], Awaitable[None]]) -> bool:
-        """Whether the server did it; says why not."""
+        """Return True if the server did it; log the reason if not."""
         try:
             await what()
         except FencedError as error:

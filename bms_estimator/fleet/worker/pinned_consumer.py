@@ -68,7 +68,7 @@ class PinnedConsumer:
 
     @property
     def pinned(self) -> bool:
-        """Whether it is ours, as far as we have heard."""
+        """True if this worker is pinned, as far as it knows."""
         return bool(self._pin)
 
     async def is_pinned(self) -> bool:

@@ -1,4 +1,4 @@
-"""What flows through the terminals from sample to sample."""
+"""Charge and energy through the terminals from sample to sample."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What an hour of a pack adds up to, block after block."""
+"""Sums over an hour of a pack, block by block."""
 
 import math
 

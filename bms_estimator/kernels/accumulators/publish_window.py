@@ -1,4 +1,4 @@
-"""What the samples of a publish window add up to."""
+"""Sums over the samples of a publish window."""
 
 import math
 

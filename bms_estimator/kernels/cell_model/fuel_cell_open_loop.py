@@ -1,4 +1,4 @@
-"""What a fuel cell does under a measured current: no voltage is looked at."""
+"""Response of a fuel cell to a measured current; the voltage is not used."""
 
 import numpy as np
 

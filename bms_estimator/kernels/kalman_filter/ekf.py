@@ -179,7 +179,7 @@ def compute_innovation(
 
 @njit(cache=True)
 def secant_reach(variance: float) -> float:
-    """How far to both sides the OCV is taken for straight, by the variance of the SOC."""
+    """Return the distance on both sides over which the OCV is linearized, by the variance of the SOC."""
     return min(max(math.sqrt(variance), NARROWEST), WIDEST)
 
 

@@ -107,13 +107,13 @@ def branch_rise_within_sample(f: Record, e: Record) -> float:
 
 @njit(cache=True)
 def scale_is_identified(f: Record, p: Record, j: int) -> bool:
-    """Whether data have told of the scale LN_R0 or LN_R, ``j``."""
+    """Return True if data have determined the scale LN_R0 or LN_R, ``j``."""
     return f.covariance[f.best, j, j] < KNOWN * resistance_std(f, p) ** 2
 
 
 @njit(cache=True)
 def r_s_identified_by_steps(f: Record, p: Record) -> bool:
-    """Whether steps of the current have told of R_s."""
+    """Return True if steps of the current have determined R_s."""
     return f.step.variance < KNOWN * resistance_std(f, p) ** 2
 
 

@@ -31,7 +31,10 @@ OUTLIERS_S = 3600.0
 
 @njit(cache=True)
 def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> bool:
-    """Whether a voltage may be believed. For how long each of the two has been the same though it cannot; before ``watch_sign``."""
+    """Return True if the voltage may be used.
+
+    Update how long voltage and current have been impossibly constant; call before ``watch_sign``.
+    """
     counted_s = min(dt_s, FAST_S)
     fast = dt_s <= FAST_S and c.slow_v != 0.0
     moved = stuck = False
@@ -72,7 +75,7 @@ def reference_series_resistance(p: Record) -> float:
 
 @njit(cache=True)
 def ocv_has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: float) -> bool:
-    """Whether the charge since the voltage last changed has moved the open-circuit voltage, whatever the current drops."""
+    """Return True if the charge since the last change of the voltage has moved the OCV more than the current's drop explains."""
     if f.count > 1:
         return False
     now_soc = c.held_soc - c.held_as / p.capacity_as

@@ -92,7 +92,7 @@ LN_RIGHT = 3.0
 
 @njit(cache=True)
 def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temperature_c: float) -> None:
-    """First sample: nothing is known but the told ``soc``, to ``p.soc_std``."""
+    """Initialize at the first sample around the given ``soc`` with a std of ``p.soc_std``."""
     s.started, s.best = 1, 0
     s.current_a = current_a
     s.smallest_a = 0.0
@@ -153,7 +153,7 @@ def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
 
 @njit(cache=True)
 def set_soc(s: Record, p: Record, soc: float) -> None:
-    """Begin again at an SOC that somebody told: mostly it is right, and the voltage shows where it is not."""
+    """Initialize again at an SOC set by the user: mostly it is right, and the voltage shows where it is not."""
     spawn_hypotheses(s, p, soc, WRONG_USER_SOC_STD)
     s.covariance[s.best, SOC, SOC] = USER_SOC_STD**2
     s.ln_weight[s.best] += LN_RIGHT
@@ -235,6 +235,6 @@ def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
 
 @njit(cache=True)
 def weakest_cell_soc_std(s: Record, p: Record) -> float:
-    """Std of the SOC as of the emptiest of cells in series: nobody sees how far below their mean it lies."""
+    """Return the std of the SOC of the weakest cell in series; how far it lies below the mean cannot be observed."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
     return math.hypot(max(s.soc_std, LEAST_STD, UNKNOWN_FULL * p.r_std), spread)

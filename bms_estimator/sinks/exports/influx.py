@@ -51,7 +51,7 @@ class RefusedError(Exception):
 
 
 class Target(NamedTuple):
-    """Where lines go, all files read."""
+    """Destination of the lines, with all files read."""
 
     url: str
     headers: dict[str, str]

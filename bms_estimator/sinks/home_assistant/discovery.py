@@ -57,7 +57,7 @@ def device_id(device: str) -> str:
 
 
 def discovery_topic(settings: HomeAssistantSettings, device: str) -> str:
-    """Where the discovery message goes; an empty retained payload there removes the device."""
+    """Return the topic of the discovery message; an empty retained payload there removes the device."""
     return f"{settings.discovery_prefix}/device/{device_id(device)}/config"
 
 

@@ -21,7 +21,7 @@ HEARTBEAT_S = 10.0
 
 
 class EntityStates(NamedTuple):
-    """What Home Assistant was told last. Times are on a monotonic clock [s]."""
+    """Values that Home Assistant has. Times are on a monotonic clock [s]."""
 
     values: Mapping[str, float | None] = {}
     changed_s: Mapping[str, float] = {}
@@ -95,7 +95,7 @@ def _times(factor: float, value: float | None) -> float | None:
 
 
 def _moved(shown: EntityStates, key: str, value: float | None, entity: Entity, now_s: float) -> bool:
-    """Whether a value is to be shown anew."""
+    """Return True if a value should be published again."""
     if key not in shown.values:
         return True
     before, rested = shown.values[key], now_s - shown.changed_s[key] >= entity.min_interval_s

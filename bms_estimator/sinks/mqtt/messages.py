@@ -1,4 +1,4 @@
-"""What goes to a broker: from what it got last and a snapshot to messages. Pure: no connection, no clock."""
+"""Messages from a snapshot and the published state. Pure: no connection, no clock."""
 
 import json
 from collections.abc import Collection, Mapping
@@ -25,7 +25,7 @@ AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
 
 
 class PublishedState(NamedTuple):
-    """What the broker got last; at first nothing."""
+    """State that the broker has; empty at first."""
 
     snapshot: Snapshot | None = None
     shown: EntityStates = EntityStates()

@@ -131,7 +131,7 @@ class RateLimiter:
         self._left, self._at_s = per_minute, monotonic()
 
     def take(self) -> bool:
-        """Whether one more is within the rate; if so it is counted."""
+        """Return True and count one more if it is within the rate."""
         now_s = self._monotonic()
         self._left = min(self._left + (now_s - self._at_s) * self._most / 60.0, self._most)
         self._at_s = now_s

@@ -110,7 +110,7 @@ class MqttSink:
         self._wake.set()
 
     def publish_raw(self, topic: str, payload: bytes) -> None:
-        """Publish a message of somebody else at QoS 1; it waits for a broker that is away, as states do."""
+        """Publish a message of another component at QoS 1; it waits for an absent broker, as states do."""
         self._backlog.put([Message(topic, payload, 1, retain=False)])
 
     async def __aenter__(self) -> Self:

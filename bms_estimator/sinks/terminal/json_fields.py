@@ -34,11 +34,11 @@ class JsonFields:
         return _text(self._of.get(name))
 
     def flag(self, name: str) -> bool:
-        """Whether it is true."""
+        """Return True if the field is true."""
         return self._of.get(name) is True
 
     def is_null(self, name: str) -> bool:
-        """Whether it is there and null."""
+        """Return True if the field exists and is null."""
         return name in self._of and self._of[name] is None
 
     def fields(self, name: str) -> "JsonFields":
@@ -54,7 +54,7 @@ class JsonFields:
         return [_number(item) for item in self._list(name)]
 
     def names(self) -> Iterator[str]:
-        """Of all fields."""
+        """Names of all fields."""
         return (_text(name) for name in self._of)
 
     def _list(self, name: str) -> list[object]:

@@ -21,7 +21,7 @@ class FlowLayout:
         self._texts = texts
 
     def is_empty(self) -> bool:
-        """Whether there is no text at all."""
+        """Return True if there is no text."""
         return not self._texts
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:

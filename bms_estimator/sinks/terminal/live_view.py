@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 @dataclass
 class Curves:
-    """Of one pack."""
+    """Curves of one pack."""
 
     voltage_v: deque[float] = field(default_factory=lambda: deque(maxlen=HISTORY))
     current_a: deque[float] = field(default_factory=lambda: deque(maxlen=HISTORY))

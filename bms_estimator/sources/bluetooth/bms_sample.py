@@ -27,13 +27,13 @@ def _temperature(sample: Mapping[str, Any]) -> float:
 
 
 def _mean(values: Iterable[float]) -> float:
-    """Of those that are numbers; NaN where none is."""
+    """Return the mean of the finite values; NaN without any."""
     numbers = [value for value in values if not math.isnan(value)]
     return fmean(numbers) if numbers else math.nan
 
 
 def _number(value: Any) -> float:
-    """NaN where it is none."""
+    """Return the number, or NaN."""
     try:
         number = float(value)
     except (TypeError, ValueError):

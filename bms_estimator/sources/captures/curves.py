@@ -1,4 +1,4 @@
-"""Curves as CSV files: an open-circuit voltage that somebody else found, a polarisation curve of a fuel cell."""
+"""Curves as CSV files: an open-circuit voltage, or a polarization curve of a fuel cell."""
 
 import csv
 import gzip

@@ -52,14 +52,14 @@ _LONGEST_HEADER_BYTES = 1 << 20
 
 @dataclass(config=ConfigDict(strict=True, extra="ignore", frozen=True))
 class _Versioned:
-    """What a header of any version tells."""
+    """Fields of a header of any version."""
 
     version: int
 
 
 @dataclass(config=ConfigDict(strict=True, extra="ignore", frozen=True))
 class CaptureHeader:
-    """What was recorded."""
+    """Header of a recording."""
 
     mode: str = "binary"
     port: str = ""
@@ -185,7 +185,7 @@ class CaptureWriter:
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a file begins as a raw capture does."""
+    """Return True if a file begins as a raw capture does."""
     try:
         with _open(path) as file:
             return file.read(len(MAGIC)) == MAGIC

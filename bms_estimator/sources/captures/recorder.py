@@ -93,7 +93,7 @@ class CaptureRecorder:
             log.warning("recording not ended", file=str(self._path), reason=self.fault)
 
     def _run(self) -> None:
-        """Write until told to end; the writer's close waits for the disk."""
+        """Write until stopped; the writer's close waits for the disk."""
         try:
             with self._writer:
                 self._write_on()

@@ -29,7 +29,7 @@ class Capture(Protocol):
 
     @property
     def fraction(self) -> float:
-        """How much has been read, 0..1."""
+        """Fraction that has been read, 0..1."""
 
     @property
     def implausible(self) -> int:
@@ -77,7 +77,7 @@ class RawCapture:
 
     @property
     def fraction(self) -> float:
-        """How much has been read, 0..1; too fast where the file is packed."""
+        """Fraction that has been read, 0..1; too large for a compressed file."""
         return min(self._read / self._size, 1.0)
 
     @property
@@ -133,12 +133,12 @@ class Replay:
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the board said of itself when it was recorded."""
+        """Hello of the board when it was recorded."""
         return self._decoder.board if self._decoder else {}
 
     @property
     def clock_ppm(self) -> float | None:
-        """How much faster the board's clock ran when it was recorded; a table does not tell."""
+        """Rate error of the board's clock when it was recorded [1e-6]; None for a table."""
         return self._decoder.clock_ppm if self._decoder else None
 
     async def __aenter__(self) -> Self:
@@ -184,7 +184,7 @@ class Replay:
 
 
 def _parts(time_s: NDArray[np.float64], longest_s: float) -> Iterator[slice]:
-    """Where a block is cut so that no part lasts longer."""
+    """Return the indices that cut a block into parts of limited duration."""
     if math.isinf(longest_s):
         yield slice(None)
         return

@@ -1,4 +1,4 @@
-"""A capture that comes through a pipe, as a file: readers measure a file and begin it anew."""
+"""Capture from a pipe as a file: readers measure a file's size and read it twice."""
 
 import gzip
 import shutil

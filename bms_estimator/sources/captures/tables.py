@@ -25,7 +25,7 @@ SHOWN = 40
 
 
 class ColumnNaming(NamedTuple):
-    """How a table calls the columns of ``SAMPLE``, and which sign its current has."""
+    """Column names of ``SAMPLE`` in a table, and the sign of its current."""
 
     time_s: str
     current_a: str
@@ -43,7 +43,7 @@ SPELLINGS = (
 
 
 class Sign(NamedTuple):
-    """What the current of a table calls positive."""
+    """Direction that a table's current calls positive."""
 
     given: CurrentSign | None = None
     """Said of this very table: holds whatever its columns are called."""
@@ -66,7 +66,7 @@ class ColumnTable(Protocol):
 
 
 class _Columns(NamedTuple):
-    """Where a table keeps what a sample needs."""
+    """Positions of a sample's columns in a table."""
 
     indices: tuple[int, ...]
     """Column indices of time, current, voltage, and temperature if there is one."""
@@ -90,7 +90,7 @@ class CsvTable:
 
     @property
     def fraction(self) -> float:
-        """How much has been read, 0..1."""
+        """Fraction that has been read, 0..1."""
         if self._raw is None:
             return 0.0
         return 1.0 if self._raw.closed else self._raw.tell() / max(self._size, 1)

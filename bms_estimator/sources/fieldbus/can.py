@@ -59,7 +59,7 @@ class CanBringer(LineProducer):
 
     @property
     def fault(self) -> str | None:
-        """What does not come."""
+        """Reason why no reading comes."""
         if self._is_off:
             return "the controller is bus off: are bitrate, wiring and termination right?"
         missing = self._map.missing

@@ -56,7 +56,7 @@ Key = tuple[str, int]
 
 @dataclass
 class _Frame:
-    """What is wanted of one frame."""
+    """Wanted signals of one frame."""
 
     signals: list[tuple[Key, Signal]] = field(default_factory=list)
     message: Message | None = None
@@ -113,7 +113,7 @@ class CanMap:
 
     @property
     def missing(self) -> str | None:
-        """What has to come before there is a reading, for people; None where nothing has."""
+        """Signals that are missing for a first reading, as text; None if none is."""
         waited = {
             quantity: str(place)
             for place, frame in self._frames.items()

@@ -63,7 +63,7 @@ class ModbusBringer(LineProducer):
 
     @property
     def name(self) -> str:
-        """Where the device is."""
+        """Address of the device."""
         return self._settings.described
 
     @property
@@ -77,7 +77,10 @@ class ModbusBringer(LineProducer):
         return self._fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """One line for each poll. After a late or missing answer the line is opened anew: no answer is taken for another's."""
+        """Yield one line for each poll.
+
+        After a late or missing response the connection is reopened, so that responses are not mixed up.
+        """
         self._requests = plan(self._values)
         client = _client(self._settings)
         try:

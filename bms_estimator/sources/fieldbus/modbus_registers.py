@@ -30,7 +30,7 @@ class Value(NamedTuple):
 
     @property
     def needed(self) -> bool:
-        """Whether there is no reading without it."""
+        """True if there is no reading without it."""
         return self.quantity in ("voltage", "current")
 
 

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 class _Chip(NamedTuple):
-    """What is read for each sample."""
+    """Channels that are read for each sample."""
 
     voltage: Channel
     current: Channel
@@ -62,7 +62,7 @@ class LinuxSensor(LineProducer):
 
     @property
     def fault(self) -> str | None:
-        """What was wrong with the last reading."""
+        """Error of the last reading."""
         return self._fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:

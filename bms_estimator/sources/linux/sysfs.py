@@ -18,7 +18,7 @@ LONGEST_BYTES = 4096
 
 
 class JunkError(Exception):
-    """What a file holds is no number; the message names it."""
+    """The content of a file is not a number; the message names it."""
 
 
 class Channel(NamedTuple):
@@ -122,7 +122,7 @@ def _chips(root: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _place(chip: Path) -> str:
-    """Where a chip is on its bus: in sysfs the folder of the device, above that of its driver's class."""
+    """Return a chip's location on its bus: in sysfs the folder of the device, above that of its driver's class."""
     folder = chip.resolve().parent
     return folder.parent.name if folder.name == "hwmon" else folder.name
 

@@ -1,4 +1,4 @@
-"""``kind = "mqtt"``: what somebody else publishes of a battery."""
+"""``kind = "mqtt"``: readings that another program publishes."""
 
 import asyncio
 import itertools
@@ -62,7 +62,7 @@ class MqttReports(LineProducer):
 
     @property
     def name(self) -> str:
-        """What is heard, and where."""
+        """Topics and broker of the source."""
         return f"{self._settings.described}, {self._broker.url}"
 
     @property
@@ -116,7 +116,7 @@ class MqttReports(LineProducer):
                 await asyncio.gather(receiving, return_exceptions=True)
 
     def _wait_s(self, now_s: float, asked_s: float) -> float | None:
-        """How long to wait for a message [s]; None: for ever."""
+        """Return the time to wait for a message [s]; None without limit."""
         ask_s = max(asked_s + self._settings.ask_s - now_s, 0.0) if self._settings.ask else None
         return min((s for s in (ask_s, self._assembly.wait_s(now_s)) if s is not None), default=None)
 

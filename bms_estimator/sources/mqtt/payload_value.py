@@ -1,4 +1,4 @@
-"""A number out of what somebody publishes: a payload that is one, or JSON and a path in it."""
+"""Number from an MQTT payload: a plain number, or JSON and a path in it."""
 
 import json
 import math

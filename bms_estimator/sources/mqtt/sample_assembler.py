@@ -1,4 +1,4 @@
-"""One sample of what comes on several topics, each at its own time. Pure: time is told."""
+"""Assembly of one sample from several topics with their own times. Pure: the time is an argument."""
 
 import math
 import re
@@ -82,7 +82,7 @@ class SampleAssembler:
 
     @property
     def fault(self) -> str | None:
-        """Why no sample comes, for people; None where nobody knows."""
+        """Reason why no sample comes; None if unknown."""
         if self._offline:
             return f"the publisher says {self._offline} on {self._availability}"
         wrong = [fault for name in NEEDED if (fault := self._faults.get(name))]
@@ -95,7 +95,7 @@ class SampleAssembler:
         return f"{absent[0]}: nothing comes on {', '.join(self._topics_of(absent[0]))}" if absent else None
 
     def wait_s(self, now_s: float) -> float | None:
-        """Until there is a sample though nothing more comes [s]; None: there is none without another message."""
+        """Return the time until a sample is complete without another message [s]; None if it needs one."""
         return max(min(self._new.values()) + self._settings.settle_s - now_s, 0.0) if self._new else None
 
     def take(self, topic: str, payload: bytes, now_s: float, *, retained: bool) -> None:
@@ -195,7 +195,7 @@ class SampleAssembler:
         return told.value if told and now_s - told.at_s <= most_s else None
 
     def _cells_v(self, now_s: float) -> list[float]:
-        """From the first to the last that was told of late; NaN between them where one was not."""
+        """Return the cells from the first to the last recent one; NaN for those in between without a recent value."""
         most_s = self._settings.slow_max_age_s
         fresh = {cell: told.value for cell, told in self._cells.items() if now_s - told.at_s <= most_s}
         return [fresh.get(cell, math.nan) for cell in range(1, max(fresh, default=0) + 1)]
@@ -210,6 +210,6 @@ def _filter(topic: str) -> str:
 
 
 def _covers(one: str, other: str) -> bool:
-    """Whether all that comes on the second comes on the first, too."""
+    """Return True if the first topic filter covers the second."""
     levels, others = one.split("/"), other.split("/")
     return len(levels) == len(others) and all(a in ("+", b) for a, b in zip(levels, others, strict=True))

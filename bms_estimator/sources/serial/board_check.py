@@ -52,7 +52,7 @@ class BoardCheck:
 
     @property
     def serial(self) -> str:
-        """Of the pack's board; empty: any may come."""
+        """Serial number of the pack's board; empty if any board is accepted."""
         return self._told or self._known.get("serial", "")
 
     def opened(self) -> None:
@@ -63,7 +63,7 @@ class BoardCheck:
         self._held.clear()
 
     def reload_known_board(self) -> None:
-        """Soon take note when somebody has accepted another board. A file that is gone tells nothing of the kind."""
+        """Check soon whether another board was accepted. A missing file does not mean that."""
         if self._memory and not self._looking:
             self._looking = True
             Thread(target=self._look, args=(self._memory,), daemon=True).start()

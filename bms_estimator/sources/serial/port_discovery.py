@@ -1,4 +1,4 @@
-"""Where a board may be: on the port that is named or, known by its serial number, on any that may be a board's."""
+"""Candidate ports of a board: the configured one or, with a known serial number, any with a board's chip."""
 
 import math
 import os
@@ -61,6 +61,6 @@ class PortDiscovery:
         return chosen
 
     def skip_port(self, path: str, seconds: float) -> None:
-        """Try the other ports first for so long."""
+        """Try the other ports first for some time."""
         now_s = self._monotonic()
         self._left[path] = now_s, now_s + seconds

@@ -35,7 +35,7 @@ NO_BOARD = re.compile(
 
 
 class NoPortError(Exception):
-    """The board's port cannot be told or opened; the message is the port and why. It may come yet."""
+    """The board's port cannot be found or opened; the message is the port and the reason. It may become available later."""
 
 
 class PortBusyError(NoPortError):
@@ -89,7 +89,7 @@ def board_ports() -> list[str]:
 
 
 def may_be_board(port: ListPortInfo) -> bool:
-    """Whether the chip of a port is one that boards have, and nothing it says of itself speaks against it."""
+    """Return True if a port's chip is common on boards and its description does not contradict."""
     named = " ".join(word for word in (port.manufacturer, port.product, port.description) if word)
     return port.pid in BRIDGE_CHIPS.get(port.vid or 0, ()) and not NO_BOARD.search(named)
 
@@ -115,7 +115,7 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
 
 
 def holder(port: str) -> str | None:
-    """Who has ``port`` open, as ``name (pid n)``; None when nobody else, or when it cannot be seen."""
+    """Return the process that has ``port`` open, as ``name (pid n)``; None if there is none or it is not visible."""
     device = os.path.realpath(port)
     for process in Path("/proc").glob("[0-9]*"):
         if process.name != str(os.getpid()) and _has_open(process, device):

@@ -66,12 +66,12 @@ class SerialPort:
 
     @property
     def is_open(self) -> bool:
-        """Whether bytes can be sent."""
+        """True if bytes can be sent."""
         return self._port is not None
 
     @property
     def waiting(self) -> int:
-        """Reads that nobody has taken yet."""
+        """Number of chunks waiting to be decoded."""
         return self._reads.qsize()
 
     async def open(self) -> str:

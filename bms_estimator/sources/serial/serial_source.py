@@ -100,7 +100,7 @@ class SerialSource:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The decoder's, ``unadmitted_bytes`` of the doorkeeper, ``reconnects``, and of a tap ``missed_reads``."""
+        """Counters of the decoder, ``unadmitted_bytes`` of the board check, ``reconnects``, and ``missed_reads`` of a tap."""
         counters = {
             **self._decoder.counters,
             "unadmitted_bytes": self._door.unadmitted_bytes,
@@ -115,7 +115,7 @@ class SerialSource:
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the board said of itself."""
+        """Hello of the board."""
         return self._decoder.board
 
     @property
@@ -125,11 +125,11 @@ class SerialSource:
 
     @property
     def clock_ppm(self) -> float | None:
-        """How much faster the board's clock runs than the monotonic one."""
+        """Rate of the board's clock over the monotonic one [1e-6]."""
         return self._decoder.clock_ppm
 
     def pulse(self) -> SourceHealth:
-        """Whether line and task live."""
+        """Health of line and task."""
         now_s = self._line.now_s
         return SourceHealth(self._monotonic() - self._tended_s, now_s - self._arrived_s, self._line.waiting)
 
