@@ -49,7 +49,10 @@ COMPILED_IN = (
 
 
 def _cache_folder() -> Path | None:
-    """Where compiled kernels go: NUMBA_CACHE_DIR, systemd's CacheDirectory, or the user's cache; None: nowhere."""
+    """Return the folder of compiled kernels: NUMBA_CACHE_DIR, systemd's CacheDirectory, or the user's cache.
+
+    None without any.
+    """
     digest = hashlib.sha256()
     for source in COMPILED_IN:
         digest.update(source.read_bytes())

@@ -66,7 +66,7 @@ def _fields(dtype: np.dtype[Any], offset: int) -> Iterator[tuple[int, tuple[int,
 
 
 def room(words: int) -> Words:
-    """Where ``pack`` can put a record of so many words, whatever they are."""
+    """Return the buffer size for a packed record of that many words."""
     return np.zeros(words + (words + WORD_BITS - 1) // WORD_BITS, np.uint64)
 
 

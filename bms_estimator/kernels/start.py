@@ -35,7 +35,7 @@ def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, tempe
 
 @njit(cache=True)
 def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, voltage_v: float) -> None:
-    """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, to ``soc_std``; the load before is not known."""
+    """Restart after an unmeasured gap: SOC as in ``s.filter`` with ``soc_std``; the load before is unknown."""
     f = s.filter
     f.current_a, f.step.phase = current_a, UNHELD
     update_arrhenius_factors(f)

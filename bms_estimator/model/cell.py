@@ -139,7 +139,7 @@ class Ladder(Strict):
 
 
 class Bounds(Strict):
-    """What (3.18) needs of one parameter: its bounds, the confidence in each, where it starts."""
+    """Settings of (3.18) for one parameter: its bounds, the confidence in each, the initial value."""
 
     upper: Positive = Field(description="a_iu")
     lower: Positive = Field(description="a_il")
@@ -157,17 +157,17 @@ class Bounds(Strict):
 
     @property
     def rate(self) -> float:
-        """How fast the parameter goes to its limit, lambda_x + lambda_y [1/s]."""
+        """Rate at which the parameter approaches its limit, lambda_x + lambda_y [1/s]."""
         return self.weight_upper + self.weight_lower
 
     @property
     def limit(self) -> float:
-        """Where the parameter goes, whatever the data say: Lemma 4.1.3."""
+        """Limit of the parameter for any data: Lemma 4.1.3."""
         return (self.weight_upper * self.upper + self.weight_lower * self.lower) / self.rate
 
 
 class Rated(Strict):
-    """What every pack has, whatever it is made of."""
+    """Ratings that every pack has."""
 
     name: str
     description: str = ""
@@ -188,7 +188,7 @@ class Rated(Strict):
 
 
 class Cell(Rated):
-    """What the cell is."""
+    """Ratings of the cell."""
 
     capacity_ah: Positive = Field(description="rated capacity in ampere-hours")
     capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
@@ -289,7 +289,7 @@ def shipped_fuel_cells() -> list[str]:
 
 
 def is_fuel_cell(name_or_path: str | Path) -> bool:
-    """Whether a fuel cell is called so, or a readable file is that of one: it has a section ``[fuel_cell]``."""
+    """Return True for the name or readable file of a fuel cell, which has a section ``[fuel_cell]``."""
     if str(name_or_path) in shipped_fuel_cells():
         return True
     try:

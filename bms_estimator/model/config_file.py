@@ -167,7 +167,7 @@ def _within(model: type[BaseModel], keys: list[str]) -> list[type[BaseModel]]:
 
 
 def _has(table: object, key: object) -> bool:
-    """Whether a key leads on."""
+    """Return True if a key leads further."""
     return key in table if isinstance(table, dict) else isinstance(table, list)
 
 

@@ -1,4 +1,4 @@
-"""What a person can mend: shown without a traceback, exit code 2."""
+"""Errors that a user can fix: shown without a traceback, exit code 2."""
 
 
 class UserError(Exception):

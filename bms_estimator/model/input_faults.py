@@ -1,4 +1,4 @@
-"""What the identifier suspects of its input, and what a person may do about it."""
+"""Faults that the identifier suspects in its input, and remedies."""
 
 from enum import IntFlag
 
@@ -17,7 +17,7 @@ class InputFault(IntFlag):
 
     @property
     def text(self) -> str:
-        """What was seen and what to do, of every bit set; empty when none is."""
+        """Describe every set bit and its remedy; empty if none is set."""
         return "; ".join(_TEXT[suspect] for suspect in InputFault if suspect in self)
 
 

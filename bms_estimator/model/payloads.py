@@ -117,7 +117,7 @@ class ParameterReport(Payload):
 
 
 class LoopHealth(Payload):
-    """How long what comes in waits, and for what."""
+    """Delays of the event loop, and their causes."""
 
     latency_p50_s: float | None = Field(
         description="from the arrival of bytes to their estimate since the last health, median [s]; null without samples"
@@ -161,7 +161,7 @@ class HookHealth(Payload):
 
 
 class Totals(Payload):
-    """What is counted over restarts; what came after the last checkpoint before a kill is missing."""
+    """Totals over restarts; those after the last checkpoint before a kill are missing."""
 
     since: str = Field(description="when counting began, ISO 8601, UTC")
     crashes: int = Field(description="starts after a run that had not ended cleanly: a fault, a kill, a power cut")

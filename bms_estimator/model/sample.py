@@ -40,7 +40,7 @@ LEAST_CELL_V, MOST_CELL_V = -5.0, 10.0
 
 
 class SampleStatus(IntFlag):
-    """What the board says of a sample."""
+    """Status bits of a sample."""
 
     VOLTAGE_SATURATED = 1
     CURRENT_SATURATED = 2

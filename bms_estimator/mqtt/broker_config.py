@@ -1,4 +1,4 @@
-"""Where the brokers are, and what opens their doors: addresses, password, certificates."""
+"""Addresses, passwords and certificates of the brokers."""
 
 import ssl
 from pathlib import Path

@@ -38,7 +38,7 @@ log = structlog.get_logger(__name__)
 
 
 class _ToLog(logging.Handler):
-    """What paho and aiomqtt have to say goes where all lines go; why a socket broke the link says."""
+    """Forward log lines of paho and aiomqtt; skip the cause of a broken socket, which the reconnect loop reports."""
 
     def emit(self, record: logging.LogRecord) -> None:
         said = record.getMessage()
@@ -53,7 +53,7 @@ _logger.addHandler(_ToLog())
 
 
 class Timeouts(NamedTuple):
-    """How long silence is borne."""
+    """Timeouts of a connection."""
 
     connected_s: float = 10.0
     """Timeout of name resolution, TCP, TLS and the broker's CONNACK together [s]."""
@@ -213,7 +213,7 @@ class Client(aiomqtt.Client):
             self._why = said.removeprefix(SOCKET_BROKE)
 
     def _on_socket_open(self, client: Any, userdata: Any, sock: Any) -> None:
-        """As the base has it; a socket that nobody waits for any more is shut: the loop that would watch it may be about to end."""
+        """Handle a new socket as the base class does; shut an abandoned one, because its loop may be about to end."""
         if self._abandoned:
             with contextlib.suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
@@ -269,7 +269,7 @@ def refusal(error: aiomqtt.MqttError) -> str:
 
 
 def should_retry_with_v311(error: aiomqtt.MqttError) -> bool:
-    """Whether what refused MQTT 5 so may be a broker of the older one."""
+    """Return True if a refusal of MQTT 5 may come from a broker with MQTT 3.1.1 only."""
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
         return error.rc.value == UNSUPPORTED_VERSION
     return isinstance(error, ClosedError) and not str(error).startswith(TLS_ALERT)

@@ -1,4 +1,4 @@
-"""What a connection to a broker must be able to do. ``client`` has the real one."""
+"""Interface of a connection to a broker, implemented by ``client``."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
@@ -30,7 +30,7 @@ class PublishRejection(NamedTuple):
 
 
 class ConnectOptions(NamedTuple):
-    """How each connection of a client begins."""
+    """Options of each connection of a client."""
 
     identifier: str
     """Client identifier, equal for all connections, so that the broker ends an older one first and publishes its will

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class DeliveryStats:
-    """What became of what one pack sends and of what is asked of it, since start; topic ``health`` shows it."""
+    """Counters of a pack's sent messages and received requests since start; topic ``health`` publishes them."""
 
     drops: int = 0
     """States and events that found no room while the broker was away, or that it refused."""

@@ -1,4 +1,4 @@
-"""What must reach the broker, sent oldest first, several messages on their way at a time."""
+"""Sender of messages that must reach the broker: oldest first, several in flight."""
 
 import asyncio
 from collections.abc import Sequence

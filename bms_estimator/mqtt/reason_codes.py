@@ -1,4 +1,4 @@
-"""What a broker means by a reason code, for people. MQTT 5 has them; what 3.1.1 has is a part of them."""
+"""Descriptions of MQTT 5 reason codes; those of 3.1.1 are a subset."""
 
 from paho.mqtt.reasoncodes import ReasonCode
 
@@ -32,7 +32,7 @@ FINAL = {
 
 
 def is_final(reason: ReasonCode) -> bool:
-    """Whether a message that is refused so will always be."""
+    """Return True if a message with this reason will always be rejected."""
     return reason.value in FINAL
 
 

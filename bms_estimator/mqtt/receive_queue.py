@@ -1,4 +1,4 @@
-"""What came from the broker and waits to be read."""
+"""Queue of received messages."""
 
 import asyncio
 from collections.abc import Callable

@@ -75,7 +75,7 @@ class Subscriber:
 
     @property
     def devices(self) -> Mapping[str, DeviceTopics]:
-        """What each published last, by name, in the order in which they were heard first."""
+        """Last publications of each device by name, in the order of their first message."""
         return self._published.devices
 
     @property

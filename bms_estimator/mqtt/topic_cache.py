@@ -40,7 +40,7 @@ class DeviceMessage(NamedTuple):
 
 @dataclass
 class DeviceTopics:
-    """What one device published last."""
+    """Last publications of one device."""
 
     topics: dict[str, Any] = field(default_factory=dict)
     """Payloads by topic, parsed JSON or text."""

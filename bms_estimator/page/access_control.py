@@ -43,11 +43,11 @@ class AccessControl:
 
     @property
     def cookie(self) -> str:
-        """What a browser that has shown the token keeps in its place."""
+        """Return the cookie that replaces the token in a browser."""
         return hashlib.sha256(b"bms-estimator page " + (self._token or b"")).hexdigest()
 
     def knows_host(self, header: str) -> bool:
-        """Whether a ``Host`` header names us; an address always does, for no name can be made to lead there."""
+        """Return True if a ``Host`` header names this server; an address always does, because DNS cannot redirect it."""
         try:
             host = urlsplit(f"//{header}").hostname or ""
         except ValueError:
@@ -55,11 +55,11 @@ class AccessControl:
         return host in self._hosts or _is_address(host)
 
     def knows_token(self, token: str) -> bool:
-        """Whether it is the token, or none is asked for; takes as long whatever is wrong with it."""
+        """Return True for the right token, or if none is required; takes equally long for any wrong one."""
         return self._token is None or hmac.compare_digest(_bytes(token), self._token)
 
     def knows_cookie(self, cookie: str) -> bool:
-        """Whether it is what was given in place of the token."""
+        """Return True for the cookie that was given for the token."""
         return self._token is None or hmac.compare_digest(_bytes(cookie), self.cookie.encode())
 
 

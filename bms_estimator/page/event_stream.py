@@ -15,7 +15,7 @@ LINK = "link"
 
 
 class LatestValues:
-    """What is known: JSON as text in one line, by key."""
+    """Latest values: JSON text in one line, by key."""
 
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}
@@ -23,7 +23,7 @@ class LatestValues:
 
     @property
     def readers(self) -> int:
-        """How many read now."""
+        """Number of present readers."""
         return len(self._readers)
 
     def keys(self) -> list[str]:
@@ -41,7 +41,7 @@ class LatestValues:
             self.broadcast(key)
 
     def set_link_state(self, trouble: str | None) -> None:
-        """Whether what fills this is connected: why not, or None when it is."""
+        """Set the state of the connection behind the values: the error, or None if connected."""
         self.set_value(LINK, json.dumps({"up": trouble is None, "reason": trouble}))
 
     def broadcast(self, key: str) -> None:

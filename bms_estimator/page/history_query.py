@@ -29,7 +29,7 @@ FIELDS = (
 
 
 class Span(NamedTuple):
-    """How far back, and how fine."""
+    """Span and resolution of a query."""
 
     length_s: int
     step_s: int

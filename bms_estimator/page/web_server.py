@@ -38,7 +38,7 @@ log = structlog.get_logger(__name__)
 
 
 class File(NamedTuple):
-    """What is served as it stands."""
+    """File that is served unchanged."""
 
     path: Path
     kind: str
@@ -93,7 +93,7 @@ class WebServer:
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds it."""
+        """Address at which a browser on this machine finds the page."""
         host, port = self._listening
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 - told, and with a token only
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/"

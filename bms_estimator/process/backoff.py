@@ -1,4 +1,4 @@
-"""How long to wait before something is tried once more."""
+"""Delays before retries."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""Moments that outlive the process: how long nobody measured."""
+"""Timestamps that outlive the process, which give the length of unmeasured gaps."""
 
 import ctypes
 import math
@@ -35,7 +35,7 @@ class BootTimestamp:
     boot: str
 
     def since(self, before: "BootTimestamp") -> float:
-        """How long after ``before`` this is [s]; infinite when nobody knows."""
+        """Return the time since ``before`` [s]; infinite if unknown."""
         if self.boot and self.boot == before.boot:
             return self.boot_s - before.boot_s
         passed_s = self.wall_s - before.wall_s
@@ -43,7 +43,7 @@ class BootTimestamp:
 
 
 def synchronised() -> bool:
-    """Whether the wall clock is held for right: by the kernel, whoever sets it; where it may not be asked, by systemd-timesyncd."""
+    """Return True if the wall clock counts as set: by the kernel, or by systemd-timesyncd if the kernel may not be asked."""
     only_read = ctypes.create_string_buffer(TIMEX_BYTES)
     state = int(ctypes.CDLL(None).adjtimex(only_read))
     return TIMESYNCD.exists() if state < 0 else state < TIME_ERROR

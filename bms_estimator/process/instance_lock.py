@@ -80,7 +80,7 @@ def _hold(held: socket.socket, folder: Path, pack: str) -> None:
 
 
 def _name(folder: Path, pack: str) -> str:
-    """Of a length that a socket's may have."""
+    """Return a name within the length limit of a socket's."""
     place = os.path.realpath(folder)
     return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{place}/{pack}')).hexdigest()[:32]}"
 

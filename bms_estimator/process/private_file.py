@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class UnsafeFileError(Exception):
-    """What has the name of a private file is none of ours."""
+    """The file with a private file's name is not ours."""
 
 
 def read_private(path: Path, longest: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Where a service keeps what outlives a restart."""
+"""State folder of a service."""
 
 import os
 from pathlib import Path

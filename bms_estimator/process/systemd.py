@@ -38,7 +38,7 @@ class SystemdNotifier:
         self._send_with_last(pack, "READY=1", f"\n{self._status}")
 
     def status(self, pack: str, text: str) -> None:
-        """How the pack is, for ``systemctl status``."""
+        """Set the pack's status text for ``systemctl status``."""
         self._texts[pack] = text
         self._send(self._status)
 
@@ -81,6 +81,6 @@ def credential(name: Path) -> Path:
 
 
 def is_for_the_service(name: Path) -> bool:
-    """Whether only the running service can read it: no file here, but where or as a credential of systemd is named."""
+    """Return True for a file that only the running service can read: a name or path of a systemd credential that is absent here."""
     named = not name.is_absolute() or name.is_relative_to(CREDENTIALS)
     return named and not os.access(credential(name), os.R_OK)

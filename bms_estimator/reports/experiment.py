@@ -1,4 +1,4 @@
-"""What chapter 5 is run on: real captures, or the simulated pack through two sensor chains."""
+"""Data of chapter 5: real captures, or the simulated pack through two sensor chains."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -81,7 +81,7 @@ class Experiment:
 
     @property
     def on(self) -> str:
-        """Where the numbers come from."""
+        """Return the source of the numbers."""
         if self.recorded is None:
             return "the simulated 6S pack"
         return f"{len(self.recorded.samples)} captures of {self.recorded.cell.cell.name}"

@@ -68,7 +68,7 @@ def current_sensor() -> tuple[float, float]:
 
 
 def current_errors_percent() -> dict[str, float]:
-    """How far each printed current is from Ohm's law [%]."""
+    """Return the deviation of each printed current from Ohm's law [%]."""
     return {
         load: 100.0 * (printed_values.CURRENTS_A[load] / mean_current_a(ohm) - 1.0)
         for load, ohm in printed_values.RESISTORS_OHM.items()

@@ -52,7 +52,7 @@ STEADY = 0.15
 
 
 class Kind(Enum):
-    """What a capture serves for."""
+    """Purpose of a capture."""
 
     RELAXATION = "voltage relaxation test"
     CONSTANT = "constant load"
@@ -115,7 +115,7 @@ class Procedure:
 
     @property
     def loads(self) -> list[Capture]:
-        """What the model is compared on: constant loads and steps. All but ``smallest`` validate."""
+        """Captures that the model is compared on: constant loads and steps. All but ``smallest`` validate."""
         return self.of(Kind.CONSTANT, Kind.STEPS)
 
     @property
@@ -247,7 +247,7 @@ class Procedure:
 
     @cached_property
     def static(self) -> dict[str, Prediction]:
-        """The same with its elements frozen at one SOC (chapter 6)."""
+        """Run the model with its elements fixed at one SOC (chapter 6)."""
         return {c.name: self._predict(c, static_elements(self.a_for(c.name), STATIC_SOC)) for c in self.loads}
 
     @cached_property

@@ -1,11 +1,11 @@
-"""What a report is made of: tables and figures of the thesis, each with what became of it."""
+"""Items of a report: tables and figures of the thesis, each with its reproduction."""
 
 from dataclasses import dataclass, field
 from enum import Enum
 
 
 class Reproduction(Enum):
-    """What became of a table or figure."""
+    """Reproduction of a table or figure."""
 
     FITTED = "fitted"
     """Comes out as printed once errata are corrected and free parameters, which the thesis does not print, are fitted to it."""

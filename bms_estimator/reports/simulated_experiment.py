@@ -69,7 +69,7 @@ def pack() -> CellModel:
 
 
 def resistance_ohm(load: str) -> float:
-    """Of a load; infinite for none."""
+    """Resistance of a load; infinite without one."""
     if not load:
         return float("inf")
     return printed_values.RESISTORS_OHM.get(load, MEAN_VOLTAGE_V / printed_values.CURRENTS_A[load])

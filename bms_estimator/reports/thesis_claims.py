@@ -40,7 +40,7 @@ class Result:
 
     @property
     def met(self) -> bool:
-        """Whether the claim is true of the capture."""
+        """True if the claim holds for the capture."""
         return self.found <= self.limit
 
 
@@ -74,7 +74,7 @@ class Claim:
 
     @property
     def span(self) -> str:
-        """What was found, from the least to the most."""
+        """Return the range of the results."""
         if not self.results:
             return "-"
         ends = [f"{end([result.found for result in self.results]):.3g}" for end in (min, max)]

@@ -277,7 +277,7 @@ class _PublishHook(_Hook):
 
 
 class _RelayHook(_Hook):
-    """Keeps the board's relay at its level: told again and again, since a reset releases it."""
+    """Hook that keeps the board's relay at its level by repeated commands, because a reset releases it."""
 
     def __init__(self, hook: AlarmHook, device: str, switch: SetRelay) -> None:
         super().__init__(hook, device)
@@ -348,7 +348,7 @@ def relay_of(settings: Settings, switch: SetRelay | None) -> SetRelay | None:
 
 
 async def _switch_nothing(_: Relay) -> None:
-    """Of no board."""
+    """Do nothing, for a pack without a board."""
 
 
 def _made(i: int, hook: AlarmHook, device: str, say: PublishRaw | None, switch: SetRelay | None) -> _Hook:

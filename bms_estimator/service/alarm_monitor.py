@@ -86,7 +86,7 @@ class AlarmMonitor:
         self._tell()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
-        """Somebody knows of an alarm; None: of all. Returns of which."""
+        """Acknowledge an alarm, or all with None. Return the acknowledged ones."""
         known = self.alarms.acknowledge(name)
         self._tell()
         return known

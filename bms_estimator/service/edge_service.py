@@ -69,7 +69,7 @@ async def _take(source: Source, edge: BlockSender) -> None:
 async def _keep_alive(
     source: SerialSource | LineSource, edge: BlockSender, notifier: SystemdNotifier, name: str
 ) -> None:
-    """Pat the watchdog while somebody looks after the line, and say how it is."""
+    """Notify the watchdog while the source's task runs, and report the status."""
     said = ""
     while True:
         if source.pulse().task_idle_s <= UNTENDED_S:

@@ -1,4 +1,4 @@
-"""How long bytes wait until they are an estimate."""
+"""Latency from bytes to an estimate."""
 
 import math
 

@@ -167,7 +167,7 @@ async def _estimate(
 
 
 async def _keep_alive(publisher: Publisher, notifier: SystemdNotifier, name: str, clock: Clock) -> None:
-    """Publish that nothing comes, and pat the watchdog while samples come or somebody still tries to have them."""
+    """Publish missing samples, and notify the watchdog while samples come or the source still tries."""
     longest_s = notifier.watchdog_s / 3.0 or publisher.period_s
     said, online, said_s = "", False, -math.inf
     while True:
@@ -184,7 +184,7 @@ async def _keep_alive(publisher: Publisher, notifier: SystemdNotifier, name: str
 
 
 async def _measure_lag(publisher: Publisher) -> None:
-    """Tell the publisher how late the loop wakes: so long samples and answers may wait for what blocks it."""
+    """Measure how late the loop wakes, which is how long samples and requests may wait."""
     loop = asyncio.get_running_loop()
     while True:
         due_s = loop.time() + LAG_STEP_S
@@ -283,7 +283,7 @@ def _offer(
 
 
 async def _acknowledge_alarm(publisher: Publisher, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Somebody knows of the alarm ``name``, or of all."""
+    """Acknowledge the alarm ``name``, or all."""
     name, watched = arguments.get("name"), publisher.watch.alarms.names()
     if name is not None and name not in watched:
         raise UserError(f"name = {reprlib.repr(name)}: must be one of {', '.join(watched)}, or left out for all")

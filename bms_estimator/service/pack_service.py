@@ -144,7 +144,7 @@ def export_sinks(settings: Settings) -> list[Sink]:
 
 
 def recording_health(tap: ReadTap | None) -> RecordingHealth | None:
-    """State of a recording; None where there is none."""
+    """Return the state of a recording; None without one."""
     if not isinstance(tap, CaptureRecorder):
         return None
     return RecordingHealth(on=not tap.ended.done(), bytes=tap.bytes, missed_reads=tap.missed_reads)

@@ -122,7 +122,7 @@ class Publisher:
         self.snapshot = self._first_snapshot()
 
     def set_rate(self, rate_hz: float) -> None:
-        """Publish so often from the next publication on [1/s]."""
+        """Set the publish rate from the next publication on [1/s]."""
         publish = self._settings.publish.model_copy(update={"rate_hz": rate_hz})
         self._settings = self._settings.model_copy(update={"publish": publish})
         self.period_s = 1.0 / rate_hz
@@ -170,13 +170,13 @@ class Publisher:
             sink.publish(self.snapshot)
 
     def publish_last(self) -> None:
-        """Publish the end, all of it made anew."""
+        """Publish a last snapshot with all payloads recomputed."""
         self._slow_s = -math.inf
         self.publish()
 
     @property
     def alive(self) -> bool:
-        """Whether samples flow, or what brings them still tries and says why they do not."""
+        """True if samples flow, or if the source still tries and reports why they do not."""
         fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
         return fresh or self._pulse is None or self._pulse().task_idle_s <= UNTENDED_S
 

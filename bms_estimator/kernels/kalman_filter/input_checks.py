@@ -159,7 +159,7 @@ def passes_innovation_gate(
 
 @njit(cache=True)
 def gate_persists(c: Record) -> bool:
-    """So many samples in a row are no glitch."""
+    """Return True if enough successive samples lie beyond the gate, which then are not glitches."""
     return c.gated_in_row >= GATE_SAMPLES and c.gated_s >= GATE_S
 
 
@@ -242,7 +242,7 @@ def unusable_input_bits(c: Record, p: Record) -> int:
 
 @njit(cache=True)
 def sign_is_wrong(c: Record, p: Record) -> bool:
-    """Whether the voltage rises with what is said to be discharge; what is suspected already is so until it falls."""
+    """Return True if the voltage rises with a reported discharge; a present suspicion stays until it falls."""
     steep = 0.25 * reference_series_resistance(p) * c.change_a2
     return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > LEAST_EVIDENCE
 
@@ -310,6 +310,6 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
 
 @njit(cache=True)
 def is_significant_bias(value: float, variance: float, expected: float, before: int) -> bool:
-    """Whether a bias is more than it was expected to be, and known to be so."""
+    """Return True if a bias exceeds its expected size significantly."""
     part = TAKEN_BACK if before else 1.0
     return expected > 0.0 and abs(value) > part * max(expected, PRESENT_STDS * math.sqrt(variance))

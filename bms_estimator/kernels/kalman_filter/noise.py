@@ -77,7 +77,7 @@ def resistance_std(s: Record, p: Record) -> float:
 
 @njit(cache=True)
 def offset_variance(p: Record) -> float:
-    """Of OFFSET before anything is learned [A^2]."""
+    """Return the initial variance of OFFSET [A^2]."""
     return (p.offset_c * p.capacity_as / 3600.0) ** 2
 
 

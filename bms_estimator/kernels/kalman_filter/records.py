@@ -35,7 +35,7 @@ HYPOTHESES = 7
 
 @dataclass(frozen=True)
 class Noise:
-    """What is not known, of one cell in series. 1 C is the current that empties the cell in an hour."""
+    """Uncertainties of one cell in series. 1 C is the current that empties the cell in an hour."""
 
     model_v: float = 0.05
     """R: error of the ladder in the mean of one second, std at 25 C [V]."""

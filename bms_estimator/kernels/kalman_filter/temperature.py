@@ -59,7 +59,10 @@ def propagate_self_heating(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def is_temperature(temperature_c: float) -> bool:
-    """Whether a cell can have it: sensors say -127 or -300 C where a wire is off. NaN is none."""
+    """Return True for a temperature that a cell can have; sensors report -127 or -300 C for an open wire.
+
+    NaN gives False.
+    """
     return COLDEST_C <= temperature_c <= HOTTEST_C
 
 

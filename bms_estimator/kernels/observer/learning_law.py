@@ -105,7 +105,10 @@ def inject_output_error(m: Record, q: Record, dt_s: float, e: float) -> None:
 
 @njit(cache=True)
 def accumulate_information(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """Kreisselmeier's filters: psi psi' and psi (e + psi' theta). What is remembered is forgotten while a load tells anew."""
+    """Update Kreisselmeier's filters: psi psi' and psi (e + psi' theta).
+
+    Old information is discounted while the load excites new.
+    """
     told, known = 0.0, e
     for j in range(q.count):
         told += m.psi[j] * m.psi[j]

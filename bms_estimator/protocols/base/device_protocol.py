@@ -15,7 +15,7 @@ from bms_estimator.protocols.base.relay import Relay
 
 @dataclass
 class Command:
-    """What was asked of a device. Who asked may set ``done``: then it is not sent any more."""
+    """Command to a device. Its sender may set ``done`` to cancel it."""
 
     done: bool = False
     refusal: str | None = None
@@ -41,7 +41,7 @@ class DeviceProtocol(ABC):
     @property
     @abstractmethod
     def fault(self) -> str | None:
-        """What is wrong with the line as a whole, for people; None while samples come."""
+        """Fault of the line as a whole; None while samples come."""
 
     @property
     @abstractmethod
@@ -50,17 +50,17 @@ class DeviceProtocol(ABC):
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the device said of itself: ``serial`` where it has a number of its own; empty until it did."""
+        """Hello of the device: ``serial`` if it has a serial number; empty before the hello."""
         return {}
 
     @property
     def clock_ppm(self) -> float | None:
-        """How much faster the device's clock runs than that of the arrivals [1e-6]; None while or where unknown."""
+        """Rate of the device's clock over that of arrivals [1e-6]; None if unknown."""
         return None
 
     @property
     def allowed_silence_s(self) -> float:
-        """So long it may say nothing while all is well [s]."""
+        """Maximum time without data of a working device [s]."""
         return 0.0
 
     @abstractmethod

@@ -27,7 +27,7 @@ FRESH_S = 3.0
 
 
 class ParseResult(Enum):
-    """What stands where a frame might begin, if its length is not known."""
+    """Result at a possible frame start whose length is unknown."""
 
     MORE = "its beginning has not come yet"
     NOISE = "no frame of this device"
@@ -63,7 +63,7 @@ class PolledProtocol(ReadingProtocol):
 
     @property
     def fault(self) -> str | None:
-        """What came first since the last sample that is no answer."""
+        """First invalid response since the last sample."""
         if self._wrong is None and self._noise > NOISE_BYTES:
             return f"bytes come that are no answer of a {self._name}: wrong baud rate, or another sensor.protocol?"
         return self._wrong
@@ -78,7 +78,7 @@ class PolledProtocol(ReadingProtocol):
 
     @abstractmethod
     def _is_whole(self, frame: bytes) -> bool:
-        """Whether its checksum is right."""
+        """Return True if its checksum is right."""
 
     @abstractmethod
     def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
@@ -154,17 +154,17 @@ class PolledProtocol(ReadingProtocol):
         return frames
 
     def _next(self, data: bytes, at: int) -> int:
-        """Where the next frame might begin; -1: nowhere."""
+        """Return the position of the next possible frame start; -1 without one."""
         found = self._start.search(data, at)
         return found.start() if found else -1
 
     def _skip(self, count: int) -> None:
-        """So many bytes are in no frame."""
+        """Skip bytes outside of frames."""
         self._counts["noise_bytes"] += count
         self._noise += count
 
     def _is_other(self, address: int) -> bool:
-        """Whether an answer is another pack's; the first one settles which is ours where that was not told."""
+        """Return True if a response is from another pack; without a configured address the first response selects ours."""
         if self._address is None:
             self._address = address
         if address == self._address:
@@ -175,7 +175,7 @@ class PolledProtocol(ReadingProtocol):
         return True
 
     def _mean_c(self, probes_c: Sequence[float]) -> float:
-        """Of the pack, from its probes; one that is not there, or broken, reads beyond what a pack has [degC]."""
+        """Return the pack's mean temperature from its probes [C]; an absent or broken probe reads beyond a pack's range."""
         there = [probe_c for probe_c in probes_c if LEAST_C <= probe_c <= MOST_C]
         self._counts["implausible"] += len(probes_c) - len(there)
         return sum(there) / len(there) if there else math.nan

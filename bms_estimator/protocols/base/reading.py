@@ -1,4 +1,4 @@
-"""What a printed line says of a pack: columns, key=value or JSON."""
+"""Parser of printed lines: columns, key=value or JSON."""
 
 import json
 import math
@@ -14,7 +14,7 @@ CONNECTED = b""
 
 
 class Reading(NamedTuple):
-    """What one line says."""
+    """Values of one line."""
 
     voltage_v: float
     current_a: float

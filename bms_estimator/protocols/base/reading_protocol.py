@@ -45,7 +45,7 @@ class ReadingProtocol(DeviceProtocol):
 
     @property
     def fault(self) -> str | None:
-        """What was wrong with the first frame since the last good one."""
+        """Fault of the first bad frame since the last good one."""
         return self._wrong
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
@@ -73,7 +73,7 @@ class ReadingProtocol(DeviceProtocol):
         """Decode a chunk; report its faults to ``_count_fault``."""
 
     def _count_fault(self, counter: str, wrong: str) -> None:
-        """Count a fault; the first since the last good reading is told to people."""
+        """Count a fault; the first one since the last good reading is reported."""
         self._counts[counter] += 1
         self._wrong = self._wrong or wrong
 

@@ -59,7 +59,7 @@ class DalyProtocol(PolledProtocol):
 
     @property
     def description(self) -> str | None:
-        """How many cells it has, once that and a sample have come."""
+        """Number of cells, once that and a sample have come."""
         return f"Daly BMS, {self._cells} cells" if self._told and self._cells is not None else None
 
     def on_port_opened(self) -> None:

@@ -28,7 +28,7 @@ ZERO_C = 2731
 
 
 def checksum(data: bytes) -> bytes:
-    """Of what stands before it from the third byte on."""
+    """Return the checksum of the bytes from the third one on."""
     return (-sum(data) & 0xFFFF).to_bytes(2, "big")
 
 

@@ -92,7 +92,7 @@ class JkProtocol(PolledProtocol):
 
     @property
     def allowed_silence_s(self) -> float:
-        """Where another asks, its answers come at its pace [s]."""
+        """Maximum silence [s]; longer if another master polls at its own pace."""
         return LISTEN_S if math.isfinite(self._overheard_s) else 0.0
 
     @property

@@ -54,7 +54,7 @@ class PylontechProtocol(ReadingProtocol):
 
     @property
     def description(self) -> str | None:
-        """How many batteries, and the last values."""
+        """Number of batteries, and the last values."""
         if self._good is None:
             return None
         n = len(self._batteries)

@@ -73,5 +73,5 @@ def clock_ppm(d: Record) -> float:
 
 @njit(cache=True)
 def _above(x: np.ndarray, y: np.ndarray, begin: int, middle: int, end: int) -> bool:
-    """Whether the middle one of three points lies on or above the line through the other two."""
+    """Return True if the middle one of three points lies on or above the line through the others."""
     return bool((y[middle] - y[begin]) * (x[end] - x[begin]) >= (y[end] - y[begin]) * (x[middle] - x[begin]))

@@ -33,7 +33,7 @@ _MESSAGES = 8
 
 
 class FrameFault(Enum):
-    """What is wrong with the line as a whole; the value says so to people."""
+    """Fault of the line as a whole; the value is its text."""
 
     WRONG_BAUD = "bytes come, but no valid frame among them: wrong baud rate?"
     TEXT = "the board prints text, not frames: sensor.protocol should be text, --text without a settings file"
@@ -43,7 +43,7 @@ class FrameFault(Enum):
 
 @dataclass(frozen=True)
 class FrameCounters:
-    """What came over the line since start."""
+    """Counters of the line since start."""
 
     bytes_received: int = 0
     frames_received: int = 0
@@ -103,7 +103,7 @@ class FrameDecoder:
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the board said of itself, for people; empty before its hello."""
+        """Description of the board; empty before its hello."""
         hello = self.hello
         if hello is None:
             return {}
@@ -143,7 +143,7 @@ class FrameDecoder:
 
     @property
     def fault(self) -> FrameFault | None:
-        """What is wrong with the line as a whole; None while frames come."""
+        """Fault of the line as a whole; None while frames come."""
         state = self._state[0]
         if state["bytes_received"] - state["heard_at"] > DEAF_BYTES:
             return FrameFault.TEXT if self._printable > DEAF_BYTES else FrameFault.WRONG_BAUD
@@ -164,7 +164,7 @@ class FrameDecoder:
         return found
 
     def forget_hello(self) -> None:
-        """There is none until the next comes; samples keep the scaling of the last."""
+        """Forget the hello until the next one; samples keep the scaling of the last."""
         self._hello = None
 
     def take_acks(self) -> list[Ack]:
@@ -241,5 +241,5 @@ _COUNTERS = [field.name for field in fields(FrameCounters) if field.name in (DEC
 
 
 def is_text(data: bytes) -> bool:
-    """Whether bytes could be printed lines."""
+    """Return True if bytes could be printed lines."""
     return not data.translate(None, PRINTABLE)

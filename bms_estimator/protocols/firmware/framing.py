@@ -226,13 +226,13 @@ def take_hello(d: Record, s: Record) -> None:
 
 @njit(cache=True)
 def is_early(d: Record, arrival_s: float, time_s: float) -> bool:
-    """Whether a sample of ``time_s`` would have come long before it was taken, by how late those before it came."""
+    """Return True if a sample of ``time_s`` would have arrived long before it was measured, by the delays of earlier samples."""
     return bool(arrival_s - time_s < d.least_late_s - EARLY_S)
 
 
 @njit(cache=True)
 def is_consistent_with_clock(d: Record, samples: int, step_us: int) -> bool:
-    """Whether one board can have taken so many samples in that time of its clock."""
+    """Return True if one board can have measured that many samples in that time of its clock."""
     apart_us = abs(samples * d.period_us - step_us)
     return apart_us <= max(_MOST_APART * step_us, _REORDER_WINDOW * d.period_us)
 

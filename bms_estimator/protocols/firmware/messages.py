@@ -45,7 +45,7 @@ class MessageType(IntEnum):
 
 
 class AckResult(IntEnum):
-    """What became of a command."""
+    """Result of a command."""
 
     OK = 0
     UNKNOWN_COMMAND = 1
@@ -64,7 +64,7 @@ class BoardStatus(IntFlag):
 
 
 class Channels(IntFlag):
-    """What is built onto a board, as its hello says."""
+    """Hardware options of a board in its hello."""
 
     NTC = 0x01
     CURRENT_RATIOMETRIC = 0x02
@@ -174,7 +174,7 @@ def relay_word(relay: Relay) -> int:
 
 @dataclass(frozen=True)
 class Hello:
-    """What a board says of itself; units as on the line."""
+    """Description that a board sends of itself; units as on the line."""
 
     firmware_major: int
     firmware_minor: int

@@ -60,7 +60,7 @@ class BoardProtocol(DeviceProtocol):
 
     @property
     def fault(self) -> str | None:
-        """What is wrong with the line as a whole."""
+        """Fault of the line as a whole."""
         return fault.value if (fault := self._decoder.fault) else None
 
     @property
@@ -70,12 +70,12 @@ class BoardProtocol(DeviceProtocol):
 
     @property
     def board(self) -> Mapping[str, str]:
-        """Of its hello."""
+        """Fields of the board's hello."""
         return self._decoder.board
 
     @property
     def clock_ppm(self) -> float | None:
-        """How much faster the board's clock runs than that of the arrivals."""
+        """Rate of the board's clock over that of arrivals [1e-6]."""
         return self._decoder.clock_ppm
 
     @property
@@ -92,7 +92,7 @@ class BoardProtocol(DeviceProtocol):
         return self._decoder.reference_v
 
     def serial_number_in(self, data: bytes) -> str | None:
-        """Of the last hello that ends in ``data``."""
+        """Return the serial number of the last hello in ``data``."""
         return self._decoder.serial_number_in(data)
 
     def on_port_opened(self) -> None:

@@ -87,7 +87,7 @@ def reference(s: Record) -> float:
 
 @njit(cache=True, error_model="numpy")  # a board that scales by zero gives inf or NaN, which the estimator drops
 def temperature(s: Record) -> float:
-    """Of the NTC [degC]; NaN without one or when it is open or shorted."""
+    """Return the temperature of the NTC [C]; NaN without one or if it is open or shorted."""
     x = s.ntc_mean / s.full_scale
     if not s.ntc_fitted or s.ntc_weight == 0.0 or not _RAIL < x < 1.0 - _RAIL:
         return math.nan
