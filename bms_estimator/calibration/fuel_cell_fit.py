@@ -53,7 +53,7 @@ class Source:
         time_s: Increasing [s]; None: a polarisation curve, where each point has settled.
         current_a: Positive when the stack delivers [A].
         voltage_v: Of the stack [V].
-        temperature_c: NaN where nobody measured it [C].
+        temperature_c: NaN without a sensor [C].
     """
 
     name: str

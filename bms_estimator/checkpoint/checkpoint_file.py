@@ -107,7 +107,7 @@ class CheckpointFile:
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 
     def save(self, state: NDArray[np.void], ledger: RunCounters) -> None:
-        """Write atomically: after a power cut there is the old file or the new one. A folder that is gone is made anew.
+        """Write atomically: after a power cut there is the old file or the new one. A missing folder is created.
 
         Args:
             state: Shape (1,), dtype ESTIMATOR_STATE.

@@ -34,7 +34,7 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
     Args:
         estimator: A new one; as it was when the state cannot be used.
         saved: Fields by their names.
-        unseen_s: How long nobody measured [s]; infinite when nobody knows.
+        unseen_s: Length of the unmeasured gap [s]; infinite if unknown.
 
     Returns:
         Why the state cannot be used; empty when it is.

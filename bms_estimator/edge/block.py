@@ -86,7 +86,7 @@ def decode(data: bytes) -> Block:
     """Decode a block.
 
     Raises:
-        BlockError: It is none, or damaged.
+        BlockError: It is not a block, or damaged.
     """
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         raise BlockError(f"{len(data)} bytes that do not begin as a block does")

@@ -208,13 +208,13 @@ def _topic(subject: str) -> str:
 
 
 def check_edge(settings: EdgeSettings) -> list[str]:
-    """Whether addresses, password and certificates can be used.
+    """Check that addresses, password and certificates can be used.
 
     Returns:
-        A sentence for each secret that every user of this machine may read.
+        A sentence for each secret that every user of this machine can read.
 
     Raises:
-        UserError: One cannot be used.
+        UserError: One of them cannot be used.
     """
     try:
         return [warning.replace("mqtt.", "edge.", 1) for warning in check(_mqtt(settings))]

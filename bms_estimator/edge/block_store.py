@@ -43,7 +43,7 @@ class BlockStore:
         resend_s: Between two times that the same block is sent again on request [s].
 
     Attributes:
-        connected: Whether there is a broker; whoever sends says so.
+        connected: True if a broker is connected, as set by the sender.
         dropped: Blocks that found no room, or could not be read, since start.
     """
 

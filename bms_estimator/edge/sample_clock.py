@@ -31,7 +31,7 @@ class SampleClock:
         last_s: Of the last sample that was placed, in an earlier run, too [s since 1970]; none: minus infinity.
 
     Attributes:
-        steps: So often was a clock set, or the source began anew.
+        steps: Number of times that a clock was set, or the source restarted.
     """
 
     def __init__(self, last_s: float = -math.inf) -> None:

@@ -139,12 +139,12 @@ class Estimator:
             store_last_good_state(c, f)
 
     def resume(self, unseen_s: float) -> None:
-        """Prepare for samples of another clock, after a time in which nobody measured.
+        """Prepare for samples of another clock, after a time without measurements.
 
         The next sample comes after a gap of ``unseen_s``, as gaps in the samples do: the load may have gone on or changed.
 
         Args:
-            unseen_s: How long nobody measured [s]; infinite when nobody knows.
+            unseen_s: Length of the unmeasured gap [s]; infinite if unknown.
         """
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
         if self.identifying:

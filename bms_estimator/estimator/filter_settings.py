@@ -101,7 +101,7 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
     """Fill in the error of E_o at 25 C, hysteresis and the temperature coefficient.
 
     Args:
-        p: Of dtype EKF_SETTINGS, with E_o; written.
+        p: Record of dtype EKF_SETTINGS, with E_o; written.
         cell: The pack as one object.
         hysteresis_v: OCV after charge less that after discharge, of one cell [V]; None: the cell file's.
     """

@@ -35,7 +35,7 @@ def fuel_cell_settings(cell: FuelCellModel, of_observer: np.void) -> NDArray[np.
 
     Args:
         cell: The stack as one object.
-        of_observer: Of dtype ``OBSERVER_SETTINGS``.
+        of_observer: Record of dtype ``OBSERVER_SETTINGS``.
 
     Returns:
         Shape (1,), dtype ``LEARNING_SETTINGS``.

@@ -42,7 +42,7 @@ def present_elements(record: np.void) -> dict[str, IdentifiedValue]:
     """Return the elements at the present SOC by name: ``ELEMENT_NAMES``, in ohm and farad.
 
     Args:
-        record: Of dtype ESTIMATOR_STATE, after a sample, identifying.
+        record: Record of dtype ESTIMATOR_STATE, after a sample, identifying.
     """
     elements, ages = record["elements"], record["unlearned_s"]
     order = R_TS, R_TL, C_TS, C_TL, R_S
@@ -63,7 +63,7 @@ def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
     """a_index, 1..15, of the fit over SOC; None where its element was seen in fewer than ``LEAST_BINS`` bins.
 
     Args:
-        record: Of dtype ESTIMATOR_STATE.
+        record: Record of dtype ESTIMATOR_STATE.
         index: 1..15.
     """
     element = (index - 1) // 3
@@ -83,8 +83,8 @@ def relative_series_resistance(record: np.void, settings: np.void) -> Identified
     """R_s over that of the cell file at the same SOC and temperature.
 
     Args:
-        record: Of dtype ESTIMATOR_STATE, after a sample, identifying.
-        settings: Of dtype ESTIMATOR_SETTINGS.
+        record: Record of dtype ESTIMATOR_STATE, after a sample, identifying.
+        settings: Record of dtype ESTIMATOR_SETTINGS.
     """
     ratio, variance = ln_r_s_ratio(record["filter"], settings["filter"])
     value = math.exp(ratio)
@@ -117,8 +117,8 @@ def ocv_correction_with_std(
     """Return the learned correction of the cell file's OCV by the most likely hypothesis, and its standard deviation.
 
     Args:
-        record: Of dtype ESTIMATOR_STATE.
-        settings: Of dtype ESTIMATOR_SETTINGS.
+        record: Record of dtype ESTIMATOR_STATE.
+        settings: Record of dtype ESTIMATOR_SETTINGS.
         soc: Shape (n,), 0..1.
 
     Returns:

@@ -34,7 +34,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
     Args:
         cell: The pack as one object.
         observer: Its ``[observer]`` section.
-        of_observer: Of dtype ``OBSERVER_SETTINGS``.
+        of_observer: Record of dtype ``OBSERVER_SETTINGS``.
 
     Returns:
         Shape (1,), dtype ``LEARNING_SETTINGS``.

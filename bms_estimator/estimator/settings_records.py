@@ -116,7 +116,7 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
     """Fill in the settings of every observer: gain, dead zone, lock, limits of a sample.
 
     Args:
-        p: Of dtype ``OBSERVER_SETTINGS``; written.
+        p: Record of dtype ``OBSERVER_SETTINGS``; written.
         cell: The pack's ratings.
         observer: Its ``[observer]`` section.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].

@@ -347,7 +347,7 @@ def existing(text: str) -> Path:
     """Return the path of a cell file.
 
     Raises:
-        UserError: There is none.
+        UserError: It does not exist.
     """
     path = Path(text)
     if not text or not path.exists():

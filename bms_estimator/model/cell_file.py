@@ -19,7 +19,7 @@ def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None
     """Write a cell file that ``load_any`` reads.
 
     Args:
-        path: Written anew, whatever is there.
+        path: Overwritten if it exists.
         cell: Numbers are rounded to ``DIGITS`` significant ones.
         remarks: Where the values come from, one line each, for the head of the file.
 

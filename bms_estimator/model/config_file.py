@@ -195,7 +195,7 @@ def without_secrets(text: str) -> str:
 
 
 def write_text(path: Path, text: str, *, make_folder: bool = False) -> None:
-    """Write a file anew, in UTF-8.
+    """Write a file in UTF-8.
 
     Args:
         path: Whatever is there.

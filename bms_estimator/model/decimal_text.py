@@ -18,7 +18,7 @@ def number(text: str) -> float:
     """Parse a number in ``text``, with blanks around it allowed.
 
     Raises:
-        ValueError: It is none, or one that is too large to be held.
+        ValueError: It is not a number, or too large.
     """
     text = text.strip(" \t\r\n")
     if not _WHOLE.fullmatch(text) or not math.isfinite(value := float(text)):

@@ -52,7 +52,7 @@ def password(settings: MqttSettings) -> str | None:
 
 
 def tls_context(settings: MqttSettings) -> ssl.SSLContext:
-    """Whom to trust and what to show, read anew: certificates end, and are replaced while the service runs.
+    """Whom to trust and what to show, reloaded, because certificates are replaced while the service runs.
 
     Raises:
         UserError: A file cannot be read, or is not what it should be.
@@ -68,13 +68,13 @@ def tls_context(settings: MqttSettings) -> ssl.SSLContext:
 
 
 def check(settings: MqttSettings) -> list[str]:
-    """Whether addresses, password and certificates can be used.
+    """Check that addresses, password and certificates can be used.
 
     Returns:
-        A sentence for each secret that every user of this machine may read.
+        A sentence for each secret that every user of this machine can read.
 
     Raises:
-        UserError: One cannot be used.
+        UserError: One of them cannot be used.
     """
     password(settings)
     if any(broker.tls for broker in brokers(settings)):

@@ -46,7 +46,7 @@ class ConnectOptions(NamedTuple):
 
 
 class Connection(Protocol):
-    """A connection while it lasts; every method raises LinkError when it is lost."""
+    """A connection while it lasts; every method raises BrokerConnectionError when it is lost."""
 
     protocol: str
     """For people: which MQTT is spoken."""
@@ -76,4 +76,4 @@ class Connection(Protocol):
 
 
 Connect = Callable[[Broker, ConnectOptions], AbstractAsyncContextManager[Connection]]
-"""Connects to a broker; entering raises LinkError, and within a bounded time."""
+"""Connects to a broker; entering raises BrokerConnectionError, and within a bounded time."""

@@ -19,8 +19,8 @@ class BrokerConnector:
     """Connects by MQTT 5; by 3.1.1 where the broker refuses that or does not know what to say.
 
     Args:
-        settings: Name, password and certificates. The files are read anew for each connection.
-        patience: How long silence is borne.
+        settings: Name, password and certificates. The files are reloaded for each connection.
+        patience: Timeouts of the connection.
     """
 
     def __init__(self, settings: MqttSettings, patience: Timeouts = PATIENCE) -> None:
@@ -32,7 +32,7 @@ class BrokerConnector:
         """As ``Connect`` has it.
 
         Raises:
-            LinkError: The broker cannot be reached, or refuses.
+            BrokerConnectionError: The broker cannot be reached, or refuses.
         """
         async with contextlib.AsyncExitStack() as stack:
             try:
@@ -65,7 +65,7 @@ class BrokerConnector:
         """For aiomqtt; reads files.
 
         Raises:
-            UserError: One cannot be used.
+            UserError: One of them cannot be used.
         """
         return {
             "hostname": broker.host,

@@ -19,7 +19,7 @@ class MessageQueue(Protocol):
     """Messages in order, each with a number, as ``Outbox`` keeps them.
 
     Attributes:
-        connected: Whether there is a broker; whoever sends says so.
+        connected: True if a broker is connected, as set by the sender.
     """
 
     connected: bool
@@ -64,7 +64,7 @@ class QueueSender:
         """Send what is there and what comes, until the connection is lost.
 
         Raises:
-            LinkError: It is, alone or in a group.
+            BrokerConnectionError: It is, alone or in a group.
         """
         self._outbox.connected = True
         self._pauses.reset()

@@ -26,7 +26,7 @@ class BootTimestamp:
         wall_s: Wall clock [s since 1970]. Without a battery it stands still while the machine is off.
         synchronised: Whether the wall clock is known to be right.
         boot_s: Since the machine was started, its sleep included [s].
-        boot: Which start of the machine; empty where nobody says.
+        boot: Identifier of the boot; empty if unknown.
     """
 
     wall_s: float

@@ -29,7 +29,7 @@ def instance_lock(folder: Path, pack: str) -> Iterator[None]:
 
     Held is an abstract socket named after folder and pack. It is gone with the process however that ends, is no file that
     could be planted, deleted or left over, and does not depend on a disk. Whoever is on the machine could take the name
-    first; so a holder that may not write the folder anyway does not count. One of whom nothing can be told counts: two
+    first; so a holder that may not write the folder anyway does not count. One of whom nothing is known counts: two
     services are worse than none. A container with a network of its own has names of its own.
 
     Args:
@@ -89,7 +89,7 @@ def _holder(name: str) -> tuple[int, int]:
     """Process and user that hold a name, as the system has it.
 
     Raises:
-        ConnectionRefusedError: Nobody holds it, or does not listen.
+        ConnectionRefusedError: No process holds it, or the holder does not listen.
         BlockingIOError: Others have asked before. A holder answers nobody: the system tells whose it is to so many as
             may wait for an answer, even once they are gone.
     """

@@ -14,10 +14,10 @@ def read_private(path: Path, longest: int) -> bytes:
 
     Args:
         path: The file.
-        longest: A longer one is none of ours [bytes].
+        longest: Maximum size [bytes].
 
     Raises:
-        NotOursError: It is too long or no file.
+        UnsafeFileError: It is too long or no file.
         OSError: It cannot be read.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
@@ -36,7 +36,7 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
         content: All of it.
 
     Raises:
-        OSError: The disk does not take it. The old file is as it was.
+        OSError: The disk cannot be written. The old file is as it was.
     """
     new = path.with_suffix(".new")
     new.unlink(missing_ok=True)  # left by a power cut, or an unexpected symlink

@@ -16,7 +16,7 @@ class Stderr:
     """Lines for stderr, written by a thread that the end of the process does not wait for.
 
     Attributes:
-        lost: Lines that nobody has read.
+        lost: Number of lost lines.
     """
 
     def __init__(self) -> None:

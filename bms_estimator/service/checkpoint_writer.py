@@ -88,7 +88,7 @@ class CheckpointWriter:
     async def _save(self, *, clean: bool = False) -> bool:
         """Save what is not saved yet: False, it cannot be written.
 
-        What is saved already keeps its time: it would seem to be of now, and not of before nobody measured.
+        What is saved already keeps its time: it would seem to be of now, and not of before nothing was measured.
         """
         taught, ledger = self._taught, self._ledger(clean=clean)
         if not taught[0] or taught == self._saved:

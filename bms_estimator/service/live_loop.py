@@ -70,7 +70,7 @@ async def run_estimation_loop(
         stop: Set to end cleanly.
         checkpoint: Where the state outlives a restart; None: it does not.
         requests: Where this loop offers what it can answer.
-        delivery: What became of what was sent and asked.
+        delivery: Counters of sent messages and received requests.
         current_zero: Has the board take the present current as zero; None: it cannot.
         notifier: Who hears that the loop is ready and alive.
         clock: The clocks.
@@ -227,7 +227,7 @@ def _set_soc(estimator: Estimator, soc: float) -> float:
         What it was.
 
     Raises:
-        UserError: There is none.
+        UserError: It does not exist.
     """
     if not estimator.state["started"][0]:
         raise UserError("no sample has been taken yet")

@@ -60,7 +60,7 @@ class Publisher:
         tally: What is counted over restarts; else begins with this run.
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the checkpoint at start.
-        delivery: What became of what was sent and asked.
+        delivery: Counters of sent messages and received requests.
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
         edge: Of raw samples on their way to a fleet; None where none are sent.
@@ -69,7 +69,7 @@ class Publisher:
 
     Attributes:
         watch: Its alarms.
-        checkpoint: What became of the last checkpoint.
+        checkpoint: Result of restoring the last checkpoint.
         disk_free_mib: Where it is [MiB].
         log_lines_lost: Since start.
         kept: What has flowed, as the next start will find it; None: nothing will be found.

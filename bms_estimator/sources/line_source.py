@@ -46,7 +46,7 @@ class LineProducer(ABC):
         Called again, after a pause, when it has ended or raised. It never blocks the event loop, and is closed at the end.
 
         Raises:
-            NothingComesError, OSError: It cannot be reached, or was lost.
+            SourceUnavailableError, OSError: It cannot be reached, or was lost.
         """
 
     @property
@@ -66,7 +66,7 @@ class LineProducer(ABC):
 
 
 class LineSource:
-    """Async source of SAMPLE blocks from a bringer, which is begun anew whenever it ends.
+    """Async source of SAMPLE blocks from a bringer, which is restarted whenever it ends.
 
     All that makes a sample passes ``decoder.feed(arrival_s, line)``: a capture of these calls replays to the same bits.
 
@@ -78,7 +78,7 @@ class LineSource:
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Before what is missing or lost is tried again; doubles with each attempt [s].
-        look_s: So often is looked whether samples come [s].
+        look_s: Interval of the check that samples come [s].
     """
 
     def __init__(

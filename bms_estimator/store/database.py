@@ -53,8 +53,8 @@ class Database:
     Args:
         path: The file, made where it is not there.
         tables: What makes its tables, as ``MIGRATIONS``.
-        sync_s: The first transaction after so long waits for the platter [s].
-        hang_s: How long a transaction may take [s].
+        sync_s: Minimum interval between two fsyncs [s].
+        hang_s: Timeout of a transaction [s].
         retry_s: After a failure, before the disk is tried again [s].
 
     Attributes:
@@ -117,7 +117,7 @@ class Database:
         """Run ``work`` in a transaction.
 
         Raises:
-            StoreError: It was not committed, or nobody knows.
+            StoreError: It was not committed, or that is unknown.
         """
         now_s = asyncio.get_running_loop().time()
         if (self._stuck and not self._stuck.done()) or now_s - self._failed_s < self._retry_s:

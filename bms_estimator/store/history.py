@@ -55,7 +55,7 @@ class History:
 
     Args:
         database: Where.
-        days: So many days of minutes are kept, of a service that runs all day.
+        days: Number of days of one-minute rows that are kept.
     """
 
     def __init__(self, database: Database, *, days: int) -> None:

@@ -27,10 +27,10 @@ class Outbox:
 
     Args:
         database: Where they wait for a broker that is away; None: in memory only.
-        most: So many are kept; of more the oldest that is not on its way is dropped.
+        most: Maximum number of stored messages; beyond it the oldest one not in flight is dropped.
 
     Attributes:
-        connected: Whether there is a broker; whoever sends says so.
+        connected: True if a broker is connected, as set by the sender.
     """
 
     def __init__(self, database: Database | None, *, most: int) -> None:

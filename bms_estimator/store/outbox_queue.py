@@ -27,7 +27,7 @@ class Queue:
     """Messages in order.
 
     Attributes:
-        most: So many are kept; of more the oldest that is not on its way is dropped.
+        most: Maximum number of stored messages; beyond it the oldest one not in flight is dropped.
         dropped: Messages that found no room.
         next: The number of the next message.
         in_flight: On their way, not yet acknowledged.

@@ -35,7 +35,7 @@ class AlarmState:
         watched: What is watched.
         raising: Of an alarm that is active; None of one that is not.
         cause_cleared: The cause is gone, but it is latched.
-        acknowledged: Somebody knows: it ends once the cause is gone.
+        acknowledged: True if acknowledged: the alarm ends once its cause is gone.
         known: A value has come.
         lost_s: Shorter times without values count toward a delay [s].
     """
@@ -56,7 +56,7 @@ class AlarmState:
 
         Args:
             times_s: Shape (n,): when, on the samples' clock [s].
-            steps_s: Shape (n,): since the sample before, 0 after a gap [s]: what nobody saw holds nothing.
+            steps_s: Shape (n,): since the sample before, 0 after a gap [s]: an unmeasured time does not count.
             values: Shape (n,): in the unit of the limit; NaN: not measured, which neither raises nor ends anything.
             wall_s: Wall clock less the samples' clock [s].
 

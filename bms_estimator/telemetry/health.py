@@ -52,8 +52,8 @@ def suspicions(record: np.void, settings: np.void) -> list[str]:
     """Return the filter's suspicions of its input, one sentence each.
 
     Args:
-        record: Of dtype ESTIMATOR_STATE.
-        settings: Of dtype ESTIMATOR_SETTINGS.
+        record: Record of dtype ESTIMATOR_STATE.
+        settings: Record of dtype ESTIMATOR_SETTINGS.
     """
     suspects = InputFault(int(record["checks"]["suspects"]))
     texts = {suspect: suspect.text for suspect in InputFault if suspect in suspects}
@@ -88,19 +88,19 @@ def make_health_payload(
     """Topic ``health``.
 
     Args:
-        record: Of dtype ESTIMATOR_STATE.
-        settings: Of dtype ESTIMATOR_SETTINGS.
+        record: Record of dtype ESTIMATOR_STATE.
+        settings: Record of dtype ESTIMATOR_SETTINGS.
         line: The source's counters.
         now_s: Wall clock [s since 1970].
         uptime_s: Since the service started [s].
         loop_lag_s: By how much the event loop woke too late at worst since the last report [s].
         restarts: Starts that found a checkpoint.
-        checkpoint: What became of the last checkpoint.
+        checkpoint: Result of restoring the last checkpoint.
         sensor_message: Why values are not fresh; None when they are.
-        delivery: What became of what was sent and asked.
+        delivery: Counters of sent messages and received requests.
         clock_ppm: The source's.
         total: Counted over restarts.
-        unseen_s: How long nobody measured last [s]; None: never, or nobody knows.
+        unseen_s: length of the last unmeasured gap [s]; None if there was none or it is unknown.
         loop: How long what comes in waits.
         recording: The state of one; None: nothing is recorded.
         edge: Of raw samples on their way; None: none are sent.

@@ -30,7 +30,7 @@ class LifetimeTotals:
 
     Attributes:
         estimator: The same.
-        unseen_s: How long nobody measured in the last gap or before the start [s]; None: never, or nobody knows.
+        unseen_s: Length of the last unmeasured gap, also before the start [s]; None if there was none or it is unknown.
     """
 
     def __init__(self, estimator: Estimator, before: Totals) -> None:
@@ -76,7 +76,7 @@ def gap_lengths(
         times_s: Shape (n,): time stamps of accepted samples [s].
         before_s: That of the one before [s]; infinite at the first of a new clock.
         step_s: Between the two before [s].
-        gap_s: What is shorter is none [s].
+        gap_s: Minimum length of a gap [s].
         restart_s: Before the first sample of a new clock [s].
     """
     found = []

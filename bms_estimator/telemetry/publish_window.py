@@ -22,9 +22,9 @@ class WindowSummary:
         current_a: Mean [A], positive on discharge.
         power_w: Mean of voltage times current [W].
         temperature_c: Mean [C], NaN without a sensor.
-        sample_rate_hz: On the stream's clock [Hz], NaN when it cannot be told.
+        sample_rate_hz: On the stream's clock [Hz], NaN if unknown.
         last: Row of dtype TRACE.
-        cells_v: Shape (m,): the last voltages of single cells [V], NaN where one was not told; m is 0 without any.
+        cells_v: Shape (m,): the last voltages of single cells [V], NaN if not reported; m is 0 without any.
     """
 
     arrival_s: float

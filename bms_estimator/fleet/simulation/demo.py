@@ -351,7 +351,7 @@ def free_port() -> int:
     """Return a free loopback port; never the same one twice in a row.
 
     Raises:
-        UserError: There is none.
+        UserError: It does not exist.
     """
     for number in itertools.islice(_numbers, len(_PORTS)):
         port = _PORTS[number % len(_PORTS)]

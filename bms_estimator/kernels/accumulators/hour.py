@@ -57,7 +57,7 @@ def accumulate_hour(sums: Records, trace: Records, new_clock: bool, gap_s: float
         trace: Shape (n,), dtype TRACE.
         new_clock: The time stamps have nothing to do with those before.
         gap_s: A longer step is a gap, unless the one before was about as long [s].
-        rest_a: A smaller current is none [A].
+        rest_a: Currents below this count as zero [A].
     """
     h = sums[0]
     known = h.store != 0 and not new_clock

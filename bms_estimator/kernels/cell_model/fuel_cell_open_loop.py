@@ -19,7 +19,7 @@ def open_loop(
         theta: ln of each parameter over the file's, shape (8,).
         time_s: Shape (n,), increasing [s].
         current_a: Shape (n,), positive when the stack delivers [A].
-        temperature_c: Shape (n,), NaN where nobody measured it [C].
+        temperature_c: Shape (n,), NaN without a sensor [C].
 
     Returns:
         Voltage [V], shape (n,), and its derivatives by theta, shape (n, 8).

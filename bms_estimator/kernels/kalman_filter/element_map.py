@@ -110,7 +110,7 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
 def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float, float, float]:
     """Amplitude, exponent and offset of the element fitted last, within bounds.
 
-    Where a bound holds one of them, the others are fitted anew: each clipped by itself would be another function.
+    Where a bound holds one of them, the others are fitted again, because clipping each by itself would give another function.
 
     Args:
         fit: Record of ELEMENT_FIT, as ``fit_element`` left it for this element.

@@ -252,7 +252,7 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     """Process a sample without using its voltage, while voltage and current do not belong together.
 
     With the wrong sign of the current the SOC errs by twice the charge, always the same way; a current that is not measured may be
-    anything common. What was learned with the wrong sign is worth nothing: the filter starts anew afterwards.
+    anything common. What was learned with the wrong sign is worth nothing: the filter is initialized again afterwards.
     """
     moved = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
     wrong = UNCOUNTED * moved

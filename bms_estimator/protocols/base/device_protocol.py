@@ -115,7 +115,7 @@ class DeviceProtocol(ABC):
         """Have ``next_output`` send what sets the level of the relay pin.
 
         Raises:
-            UserError: There is none.
+            UserError: It does not exist.
         """
         raise UserError("this board has no relay pin")
 

@@ -102,7 +102,7 @@ class BleBringer(LineProducer):
         """Find the BMS and the driver of its kind.
 
         Raises:
-            NothingComesError: It does not advertise, or nobody knows its kind.
+            SourceUnavailableError: It does not advertise, or its kind is unknown.
         """
         heard: list[AdvertisementData] = []
 

@@ -32,8 +32,8 @@ class CaptureRecorder:
     Args:
         path: A file that does not exist yet.
         header: What is recorded.
-        waiting_reads: So many reads may wait for the disk.
-        sync_s: The disk has to have all this often [s].
+        waiting_reads: Maximum number of chunks waiting for the disk.
+        sync_s: Interval at which data are synced to the disk [s].
 
     Attributes:
         bytes: Of the line, taken so far.

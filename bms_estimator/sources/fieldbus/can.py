@@ -123,7 +123,7 @@ class CanBringer(LineProducer):
         """Return the next frame if it comes soon.
 
         Raises:
-            NothingComesError: The bus is lost.
+            SourceUnavailableError: The bus is lost.
         """
         try:
             return bus.recv(LISTEN_S)

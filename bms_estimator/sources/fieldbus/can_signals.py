@@ -81,7 +81,7 @@ class _Frame:
 class CanMap:
     """The newest values of a bus, and the readings that they make, the current as the bus counts it.
 
-    A reading is made when voltage and current have both come anew; temperature and cells are the newest.
+    A reading is made when voltage and current have both been updated; temperature and cells are the newest.
 
     Args:
         settings: Where the values lie.

@@ -123,7 +123,7 @@ class ModbusBringer(LineProducer):
         """Read all wanted registers.
 
         Raises:
-            NothingComesError: No answer, or none with voltage and current.
+            SourceUnavailableError: No answer, or none with voltage and current.
         """
         words: dict[tuple[Table, int], int] = {}
         waiting, done = list(self._requests), list[Request]()
@@ -143,7 +143,7 @@ class ModbusBringer(LineProducer):
         """Return the requests to send instead of one that was refused.
 
         Raises:
-            NothingComesError: There is no reading without it.
+            SourceUnavailableError: There is no reading without it.
         """
         self._counters["refused"] += 1
         if error.code in NO_SUCH_REGISTER:

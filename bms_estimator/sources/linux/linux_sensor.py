@@ -40,7 +40,7 @@ class LinuxSensor(LineProducer):
     Args:
         settings: Which chip, its files, divider and shunt.
         root: Of sysfs.
-        hung_s: A bus that has not answered for so long hangs [s].
+        hung_s: Timeout of the bus [s].
     """
 
     def __init__(self, settings: LinuxSource, root: Path = SYS, hung_s: float = HUNG_S) -> None:
@@ -69,7 +69,7 @@ class LinuxSensor(LineProducer):
         """Yield a line each interval.
 
         Raises:
-            NothingComesError, OSError: The chip or a file of it is not there, or its bus hangs.
+            SourceUnavailableError, OSError: The chip or a file of it is not there, or its bus hangs.
         """
         chip = await self._read(self._find)
         yield CONNECTED
@@ -114,7 +114,7 @@ class LinuxSensor(LineProducer):
         """Return amperes per unit of the channel, by the shunt.
 
         Raises:
-            NothingComesError: The settings do not say, or the driver does not.
+            SourceUnavailableError: The settings do not say, or the driver does not.
         """
         shunt_ohm = self._settings.shunt_ohm
         if current.kind == "in":
@@ -136,7 +136,7 @@ class LinuxSensor(LineProducer):
         """As the chip is set, at least 0.1 s; else the default [s].
 
         Raises:
-            NothingComesError: It is so long that the estimator would take it for gaps.
+            SourceUnavailableError: It is so long that the estimator would take it for gaps.
         """
         try:
             own_s = 1e-3 * read_number(find_chip(self._settings.chip, self._root) / "update_interval")

@@ -53,7 +53,7 @@ def read_number(path: Path) -> float:
 
     Raises:
         OSError: It cannot be read now.
-        JunkError: It is none.
+        JunkError: It is not a number.
     """
     with path.open("rb") as file:
         text = file.read(LONGEST_BYTES)
@@ -71,7 +71,7 @@ def find_chip(chip: str, root: Path = SYS) -> Path:
         root: Of sysfs.
 
     Raises:
-        NothingComesError: There is none, or more than one of this name.
+        SourceUnavailableError: There is none, or more than one of this name.
     """
     if chip.startswith("/"):
         if not Path(chip).is_dir():
@@ -97,7 +97,7 @@ def find_channel(name: str, chip: str, root: Path = SYS) -> Channel:
         root: Of sysfs.
 
     Raises:
-        NothingComesError: There is none.
+        SourceUnavailableError: There is none.
     """
     folder, _, file = name.rpartition("/")
     channel = Channel(find_chip(folder or chip, root) / file)

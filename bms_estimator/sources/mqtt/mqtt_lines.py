@@ -79,7 +79,7 @@ class MqttReports(LineProducer):
         """Lines as samples are complete; each time the next broker is tried.
 
         Raises:
-            NothingComesError: The broker cannot be reached, was lost, or does not let us read.
+            SourceUnavailableError: The broker cannot be reached, was lost, or does not let us read.
         """
         self._broker = next(self._brokers)
         try:

@@ -39,7 +39,7 @@ def read_value(payload: bytes, place: ValueLocation, path: str) -> float:
     """Read the quantity in SI units.
 
     Raises:
-        NoNumberError: It is not there, or no finite number.
+        InvalidValueError: It is not there, or no finite number.
     """
     return _si(_found(_parsed(payload, path), path), place)
 
@@ -48,7 +48,7 @@ def read_cells(payload: bytes, place: ValueLocation, path: str) -> dict[int, flo
     """Cells by their numbers from 1: of a list, or of what ``{cell}`` in the path stands for. A cell that has no number is NaN.
 
     Raises:
-        NoNumberError: There are none.
+        InvalidValueError: There are none.
     """
     found = dict(_cells(_parsed(payload, path), path))
     cells = {}

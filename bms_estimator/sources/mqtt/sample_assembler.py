@@ -36,7 +36,7 @@ class SampleAssembler:
 
     A sample is complete when voltage and current have come again, or one of them has and the other has not within
     ``settle_s``: who publishes changes only says nothing of what is as it was. That one counts for ``max_age_s``.
-    What the broker had kept from earlier is never taken: nobody knows how old it is.
+    What the broker had kept from earlier is never taken: its age is unknown.
     """
 
     def __init__(self, settings: MqttSource) -> None:
@@ -150,7 +150,7 @@ class SampleAssembler:
         """Keep what a payload tells.
 
         Raises:
-            NoNumberError: Nothing.
+            InvalidValueError: Nothing.
         """
         if way.quantity != "cells":
             self._told[way.quantity] = _TimestampedValue(read_value(payload, way.place, way.path), now_s)

@@ -28,7 +28,7 @@ class OtherBoardError(Exception):
 
 
 class BoardCheck:
-    """Lets the reads of one board pass; those of a port opened anew wait until its serial number is known.
+    """Lets the reads of one board pass; those of a reopened port wait until its serial number is known.
 
     Args:
         make: A decoder that hears them meanwhile.
@@ -80,7 +80,7 @@ class BoardCheck:
         """Return the chunks that ``decoder``, which knows the pack's board, may be fed now.
 
         Raises:
-            OtherBoardError: Neither this one nor those after it, until the port is opened anew.
+            OtherBoardError: Neither this one nor those after it, until the port is reopened.
         """
         if self._refused:
             self._drop((read,))

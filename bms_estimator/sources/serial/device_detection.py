@@ -196,7 +196,7 @@ class BoardClient:
         """Wait for a response.
 
         Raises:
-            UserError: There is none.
+            UserError: It does not exist.
         """
 
         def answer_or_text() -> Answer | None:

@@ -23,7 +23,7 @@ log = structlog.get_logger(__name__)
 class KnownBoardFile:
     """``<pack.name>.board.json`` in the state folder, for its owner alone.
 
-    A file of its own, not the checkpoint: that one is kept for each meaning of the state and begins anew with another
+    A file of its own, not the checkpoint: that one is kept for each meaning of the state and restarts with another
     cell, while the board on the line stays the same; and what is in it may be read, and forgotten, by a person.
 
     Args:
@@ -53,7 +53,7 @@ class KnownBoardFile:
         """Whether nothing at all has the file's name.
 
         Raises:
-            OSError: The disk does not tell.
+            OSError: The disk cannot be read.
         """
         try:
             self.path.lstat()
@@ -62,10 +62,10 @@ class KnownBoardFile:
         return False
 
     def save(self, board: Mapping[str, str]) -> None:
-        """Write atomically. A folder that is gone is made anew.
+        """Write atomically. A missing folder is created.
 
         Raises:
-            OSError: The disk does not take it.
+            OSError: The disk cannot be written.
         """
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_private(self.path, json.dumps(dict(board)).encode() + b"\n")

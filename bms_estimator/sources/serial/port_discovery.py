@@ -34,10 +34,10 @@ class PortDiscovery:
         """Device path to open now.
 
         Args:
-            serial: Of the board that is looked for; empty: there is no way to know it on another port.
+            serial: Serial number of the wanted board; empty if it cannot be recognized on another port.
 
         Raises:
-            NoPortError: There is none.
+            NoPortError: No such port.
         """
         if not serial:
             self.is_preferred = True

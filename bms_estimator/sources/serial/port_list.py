@@ -39,7 +39,7 @@ class NoPortError(Exception):
 
 
 class PortBusyError(NoPortError):
-    """Somebody has the port at ``path`` open.
+    """Another process has the port at ``path`` open.
 
     Its text names who: that is looked for in all processes, milliseconds long, whenever the text is asked for.
     """
@@ -103,7 +103,7 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
         timeout_s: How long a read waits [s].
 
     Raises:
-        HeldPortError: Somebody has it open.
+        PortBusyError: Another process has it open.
         NoPortError: It cannot be opened.
     """
     try:

@@ -32,7 +32,7 @@ class SerialPort:
 
     Args:
         open_next: Opens the port, wherever it is: its path, and the port.
-        say: Is told why the port is not open.
+        say: Called with the reason why the port is not open.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Before a missing or lost port is tried again [s].

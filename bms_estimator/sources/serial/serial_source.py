@@ -55,7 +55,7 @@ class SerialSource:
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Before a missing or lost port is tried again [s].
-        silent_s: Without a frame for so long the line is at fault [s].
+        silent_s: Time without a frame that counts as a fault of the line [s].
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class SerialSource:
     async def current_zero(self) -> None:
         """Have the board take the present current as zero, for good: nothing may flow meanwhile.
 
-        Samples after it are decoded with the new zero. Somebody must iterate over the blocks meanwhile.
+        Samples after it are decoded with the new zero. The blocks must be iterated over meanwhile.
 
         Raises:
             UserError: The board is not connected, takes no commands, does not answer, or refuses.
@@ -210,7 +210,7 @@ class SerialSource:
         await self._ask(lambda: self._decoder.command("current_zero"))
 
     async def relay(self, relay: Relay) -> None:
-        """Have the board set its relay pin; somebody must iterate over the blocks meanwhile.
+        """Have the board set its relay pin; the blocks must be iterated over meanwhile.
 
         Raises:
             UserError: As ``current_zero``.
@@ -251,7 +251,7 @@ class SerialSource:
         """Open the port on which the board may be.
 
         Raises:
-            NoPortError: There is none, or it cannot be opened.
+            NoPortError: No such port, or it cannot be opened.
         """
         path = self._where.next(self._door.serial)
         try:
