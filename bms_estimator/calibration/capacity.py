@@ -78,7 +78,7 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Capacity:
-    """What was measured.
+    """Result of a capacity measurement.
 
     Attributes:
         capacity_ah: [Ah].

@@ -71,7 +71,7 @@ class Source:
 
 @dataclass(frozen=True)
 class FuelCellFit:
-    """What came out.
+    """Result of the fit.
 
     Attributes:
         model: The stack with its parameters, and their errors in ``std``.

@@ -51,7 +51,7 @@ log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class RunCounters:
-    """What a checkpoint tells of the runs that wrote it.
+    """Counters of the runs that wrote a checkpoint.
 
     Attributes:
         restarts: Starts that found a checkpoint.

@@ -44,7 +44,7 @@ class BlockError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """What an edge sends at once.
+    """Block of samples that an edge sends at once.
 
     Attributes:
         store: When the edge's store was made [ns since 1970].

@@ -64,7 +64,7 @@ class FuelCellModel(Strict):
 
     @property
     def a(self) -> NDArray[np.float64]:
-        """What the kernels take, shape (16,).
+        """Constants for the kernels, shape (16,).
 
         From 1 on the parameters of ``kernels.cell_model.fuel_cell.NAMES``, then cells in series, temperature [C], hydrogen and
         oxygen [atm].

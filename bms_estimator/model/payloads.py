@@ -1,4 +1,4 @@
-"""What leaves the service: the estimate, the parameters, health and info of one pack.
+"""Published payloads: estimate, parameters, health and info of one pack.
 
 Every number that can be missing is ``None`` and never NaN: the payloads are JSON. The field descriptions
 are published as JSON schema.

@@ -12,7 +12,7 @@ MOST_BYTES = 16_384
 
 
 class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):
-    """What waits to be read; bounded in bytes, too, and without a log line for each message that is lost.
+    """Queue of received messages, bounded in number and bytes; lost messages are logged at intervals.
 
     Args:
         lose: Hears why and on which topic a message is lost.

@@ -1,4 +1,4 @@
-"""What devices published last, by topic: from messages to values. Pure: no connection, no clock.
+"""Last publications of devices by topic: from messages to values. Pure: no connection, no clock.
 
 Whoever may publish may put anything there, so all that is kept is bounded, and a payload of any kind has its place.
 """
@@ -60,7 +60,7 @@ class DeviceTopics:
 
 
 class TopicCache:
-    """What each device below a base topic published last.
+    """Last publications of each device below a base topic.
 
     Args:
         base_topic: First part of all topics.

@@ -31,7 +31,7 @@ _Row = tuple[float, tuple[float | None, ...]]
 
 
 class PackTopics(LatestValues):
-    """What is known of all packs.
+    """Values of all packs.
 
     Keys are ``<pack>/<topic>``, values JSON as text in one line.
 

@@ -12,7 +12,7 @@ log = structlog.get_logger(__name__)
 
 
 def state_folder(settings: Settings) -> Path:
-    """Where checkpoints go: the folder of the settings, else systemd's StateDirectory, else the user's XDG state folder.
+    """Return the folder of checkpoints: that of the settings, else systemd's StateDirectory, else the user's XDG state folder.
 
     Made where it is not there; where it cannot be made, what is saved there later says so.
 

@@ -152,7 +152,7 @@ class Procedure:
 
     @cached_property
     def lowest_soc(self) -> float:
-        """Where validation ends: ``LOWEST_SOC``, or above it the last point of step 1, of all tests together.
+        """Return the SOC at which validation ends: ``LOWEST_SOC``, or above it the last point of step 1 of all tests.
 
         Below that (2.10) is a guess.
         """

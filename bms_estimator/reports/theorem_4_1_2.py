@@ -1,4 +1,4 @@
-"""What Theorem 4.1.2 claims, measured: do the products R_ts C_ts, R_tl C_tl converge to the truth?
+"""Test of Theorem 4.1.2: do the products R_ts C_ts, R_tl C_tl converge to the truth?
 
 The theorem says so for a small current, whatever a1..a12 converge to. Here the observer runs at several currents and
 with several bounds on a cell whose truth is known.

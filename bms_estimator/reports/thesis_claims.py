@@ -1,4 +1,4 @@
-"""What chapters 4 to 7 claim of the thesis's recordings, tested on other captures.
+"""Claims of chapters 4 to 7 about the thesis's recordings, tested on other captures.
 
 A claim holds when what is printed is reached on more than half of the captures. Of SOC and of RC products nothing is printed
 that could be a limit; those are ours, and so is the limit 1 for the order of the dynamic and the static model.
@@ -46,7 +46,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Claim:
-    """What the thesis claims and what other captures say of it.
+    """Claim of the thesis, and the results on other captures.
 
     Attributes:
         key: Mark in the tables: "mean, constant loads".

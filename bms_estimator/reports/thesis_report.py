@@ -73,7 +73,7 @@ CHAPTERS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Report:
-    """What was made.
+    """Result of a report.
 
     Attributes:
         on: What chapter 5 was run on.

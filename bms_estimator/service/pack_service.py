@@ -129,7 +129,7 @@ async def run_pack_service(
 
 
 def export_sinks(settings: Settings) -> list[Sink]:
-    """Where values go beside the broker.
+    """Return the sinks beside MQTT.
 
     Raises:
         UserError: A file of the settings cannot be used.

@@ -53,7 +53,7 @@ class AlarmDefinition(NamedTuple):
 
 
 class Chemistry(NamedTuple):
-    """What a cell may have [V], and from where on it is well again."""
+    """Voltage limits of a cell [V], and the levels at which they clear."""
 
     over_v: float
     over_clear_v: float

@@ -30,7 +30,7 @@ ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
 
 
 class AlarmRule(Strict):
-    """What all alarms have."""
+    """Settings that all alarms share."""
 
     enabled: bool = True
     severity: Literal["warning", "critical"] = "warning"
@@ -74,7 +74,7 @@ class LinkRule(AlarmRule):
 
 
 class AlarmHook(Strict):
-    """What is done when alarms are raised and end: run a program, publish a message, or switch the board's relay."""
+    """Action when alarms are raised and end: run a program, publish a message, or switch the board's relay."""
 
     alarms: tuple[AlarmName, ...] = Field(default=(), description="which ones; all but hook_failed when left out")
     on: tuple[Literal["raised", "cleared"], ...] = Field(
@@ -130,7 +130,7 @@ PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value
 
 
 class AlarmSettings(Strict):
-    """What is an alarm; a table for each, as in pack_over_voltage = {limit_v = 29.2, delay_s = 5}. docs/alarms.md."""
+    """Limits of alarms; a table for each, as in pack_over_voltage = {limit_v = 29.2, delay_s = 5}. docs/alarms.md."""
 
     pack_over_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=2.0, clear_delay_s=10.0, latch=True)
     pack_under_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=5.0, clear_delay_s=30.0)

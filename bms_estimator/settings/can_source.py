@@ -1,4 +1,4 @@
-"""Where the frames of a CAN bus have a pack's values: ``[source]`` with ``kind = "can"``."""
+"""Frames of a CAN bus with a pack's values: ``[source]`` with ``kind = "can"``."""
 
 from collections.abc import Mapping
 from pathlib import Path

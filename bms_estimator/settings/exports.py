@@ -1,4 +1,4 @@
-"""Where values go beside MQTT: InfluxDB, Prometheus."""
+"""Exports beside MQTT: InfluxDB, Prometheus."""
 
 from pathlib import Path
 from typing import Annotated, Self

@@ -1,4 +1,4 @@
-"""How a pack stands in Home Assistant."""
+"""Settings of a pack in Home Assistant."""
 
 from typing import Annotated, Literal
 
@@ -11,7 +11,7 @@ Topic = Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")]
 
 
 class HomeAssistantSettings(Strict):
-    """What Home Assistant is told over the broker, docs/home-assistant.md."""
+    """Home Assistant discovery over the broker, docs/home-assistant.md."""
 
     enabled: bool = Field(default=True, description="false: it is told nothing, and a device that it has goes")
     discovery_prefix: Topic = Field(default="homeassistant", description="as in its MQTT integration")

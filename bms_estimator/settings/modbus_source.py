@@ -1,4 +1,4 @@
-"""Where a Modbus device has its values: ``[source]`` with ``kind = "modbus"``."""
+"""Registers of a Modbus device with its values: ``[source]`` with ``kind = "modbus"``."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self

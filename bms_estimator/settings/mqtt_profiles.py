@@ -1,4 +1,4 @@
-"""What others publish of a battery by MQTT: settings of ``[source]`` by the name of the project.
+"""Profiles of battery projects that publish over MQTT: settings of ``[source]`` by the project's name.
 
 ``{prefix}`` is ``source.prefix``, ``{instance}`` is ``source.instance``, ``{cell}`` the number of a cell from 1. What the settings
 themselves tell goes before what stands here. Where the forms come from stands at each; looked up in November 2026.

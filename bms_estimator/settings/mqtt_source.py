@@ -31,7 +31,7 @@ LINEAR: Mapping[Unit, tuple[float, float]] = {
 
 
 class ValueLocation(Strict):
-    """Where a quantity is found, and what makes SI of it. A text alone is the path."""
+    """Location of a quantity in messages, and its conversion to SI. A text alone is the path."""
 
     topic: Name | tuple[Name, ...] | None = Field(
         default=None, description="or several, of which one comes; source.topic when left out; {cell}: number of a cell"
@@ -62,7 +62,7 @@ class ValueLocation(Strict):
 
 
 class MqttSource(PolledSource):
-    """What somebody else publishes of a battery by MQTT: see docs/sources-mqtt.md."""
+    """Battery readings that another program publishes over MQTT: see docs/sources-mqtt.md."""
 
     kind: Literal["mqtt"]
     profile: ProfileName | None = Field(default=None, description="who publishes; tells all that is not set here")

@@ -49,7 +49,7 @@ class PackSettings(Strict):
 
 
 class PublishSettings(Strict):
-    """How often what is estimated goes out."""
+    """Publish rate."""
 
     rate_hz: Annotated[float, Field(ge=LEAST_RATE_HZ, le=MOST_RATE_HZ)] = Field(
         default=1.0, description="snapshots per second"
@@ -57,7 +57,7 @@ class PublishSettings(Strict):
 
 
 class StateSettings(Strict):
-    """What outlives a restart."""
+    """State that outlives a restart."""
 
     folder: Path | None = Field(
         default=None,
@@ -72,7 +72,7 @@ class StateSettings(Strict):
 
 
 class StoreSettings(Strict):
-    """What is kept in the state folder: messages for a broker that is away, and the pack's history."""
+    """Data in the state folder: messages for a broker that is away, and the pack's history."""
 
     outbox_messages: Annotated[int, Field(ge=1, le=10_000_000)] = Field(
         default=90_000,
@@ -84,7 +84,7 @@ class StoreSettings(Strict):
 
 
 class LogSettings(Strict):
-    """What goes to the log."""
+    """Logging."""
 
     level: LogLevel = Field(default="info", description="and what is worse")
 

@@ -13,7 +13,7 @@ DEFAULT_LISTEN = "127.0.0.1:8765"
 
 
 class Listen(NamedTuple):
-    """Where a server listens."""
+    """Address on which a server listens."""
 
     host: str
     port: int

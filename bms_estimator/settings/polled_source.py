@@ -1,4 +1,4 @@
-"""What all kinds of ``[source]`` have in common."""
+"""Settings that all kinds of ``[source]`` share."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -11,7 +11,7 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class PolledSource(Strict):
-    """What all kinds have in common."""
+    """Settings that all kinds of sources share."""
 
     @property
     def period_s(self) -> float:

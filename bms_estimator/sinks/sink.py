@@ -1,4 +1,4 @@
-"""Where estimates go: MQTT, the console, CSV and Parquet files.
+"""Sinks of estimates: MQTT, terminal, CSV and Parquet files.
 
 All sinks are peers: async context managers whose ``publish`` neither blocks nor fails.
 """

@@ -97,7 +97,7 @@ class MinuteAccumulator:
 
 
 def seen(span_s: float, before_s: float) -> float:
-    """How much of the time between two publications was measured [s]: nothing of a gap.
+    """Return the measured part of the time between two publications [s]: nothing of a gap.
 
     Args:
         span_s: From one to the other on the board's clock [s].

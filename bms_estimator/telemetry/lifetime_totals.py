@@ -70,7 +70,7 @@ class LifetimeTotals:
 def gap_lengths(
     times_s: NDArray[np.float64], before_s: float, step_s: float, gap_s: float, restart_s: float
 ) -> list[float]:
-    """How long the gaps before some samples were [s], as ``kernels.step.is_gap`` finds them.
+    """Return the lengths of the gaps before some samples [s], as ``kernels.step.is_gap`` finds them.
 
     Args:
         times_s: Shape (n,): time stamps of accepted samples [s].

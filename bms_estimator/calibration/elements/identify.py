@@ -81,7 +81,7 @@ NO_WORSE = 1.05
 
 @dataclass(frozen=True)
 class CaptureFit:
-    """What the fit says of one capture.
+    """Result of the fit for one capture.
 
     Attributes:
         name: What it is called.
@@ -319,7 +319,7 @@ class _Candidate:
         return fit, new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
 
     def _shapes(self) -> Floats:
-        """How weak and strong part of each resistance usually go along SOC, at ``SOC_NODES``, over what they are in the middle.
+        """Return the usual ratio of the weak and strong part of each resistance to its value at mid SOC, at ``SOC_NODES``.
 
         As an identified ladder; halfway between level and a typical one: cells differ. Level for one with a plateau: the
         LFP cell that there are captures of is not like the generic one there.

@@ -87,7 +87,7 @@ LOWEST, HIGHEST = 0.02, 1.01
 
 @dataclass(frozen=True)
 class Moments:
-    """What one capture says: X'WX and X'Wy of its rows, y less the given OCV, whatever its miscount.
+    """Moments of one capture: X'WX and X'Wy of its rows, y less the given OCV, for any miscount.
 
     Attributes:
         information: X'WX, the miscount marginalised.
@@ -143,7 +143,7 @@ class LadderFit:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known beforehand.
+    """Prior of the fit.
 
     Attributes:
         ocv_error_v: Shape (201,), std of the OCV at evenly spaced SOC [V]; tiny: held.

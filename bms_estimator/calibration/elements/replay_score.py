@@ -1,4 +1,4 @@
-"""How good an estimator with a cell is when switched on anywhere: replays cut in mid-load, started too low and too high.
+"""Score of an estimator with a cell: replays that start in mid-load, with an SOC too low and too high.
 
 The measure is the interval score of the band SOC +- 2 std (Gneiting and Raftery, JASA 102 (2007) 359): its width, and
 forty times what the truth lies outside. Neither a wider nor a narrower band than is true betters it.

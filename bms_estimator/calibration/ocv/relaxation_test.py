@@ -79,7 +79,7 @@ class Rest:
 
 @dataclass(frozen=True)
 class RelaxationTest:
-    """What a capture says of the open-circuit voltage.
+    """Open-circuit voltage from the rests of a capture.
 
     Attributes:
         name: Where it came from.

@@ -90,7 +90,7 @@ class SlowBranch:
 
 @dataclass(frozen=True)
 class SlowCurve:
-    """What a pair, or a lone branch, says of the open-circuit voltage.
+    """Open-circuit voltage from a paired or unpaired low-rate curve.
 
     Attributes:
         branches: One, or discharge and charge.

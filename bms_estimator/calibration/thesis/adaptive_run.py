@@ -24,7 +24,7 @@ FIRST_SAMPLES = 200
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where a stability condition of Lemma 4.1.1 is met: a dashed line of Fig. 19.
+    """Point at which a stability condition of Lemma 4.1.1 is met: a dashed line of Fig. 19.
 
     Attributes:
         parameter: "a8" or "a11".

@@ -102,7 +102,7 @@ def _folder(settings: FleetSettings, given: Path | None) -> Path:
 
 
 def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, ...]:
-    """Where all nodes are heard by each other.
+    """Return the addresses on which all nodes hear each other.
 
     Raises:
         UserError: What --of says cannot be, or needs keys and certificates that are not there.

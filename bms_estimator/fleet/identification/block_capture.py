@@ -21,7 +21,7 @@ ROWS = 65_536
 
 @dataclass
 class BlockCapture:
-    """What was found of one pack; ``add`` its blocks in the stream's order.
+    """Blocks of one pack; ``add`` them in the stream's order.
 
     As workers do, a store that is older than one already met is left out: its edge has been given another.
 

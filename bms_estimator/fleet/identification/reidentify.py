@@ -61,7 +61,7 @@ class HoldoutError:
 
 @dataclass(frozen=True)
 class ReidentificationResult:
-    """What came of one pack.
+    """Result for one pack.
 
     Attributes:
         pack: Its name.

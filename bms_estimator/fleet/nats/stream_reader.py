@@ -1,4 +1,4 @@
-"""What a stream holds, read in batches from a sequence number on, without a consumer on the server.
+"""Messages of a stream, read in batches from a sequence number on, without a consumer on the server.
 
 The server's direct gets by batch (https://github.com/nats-io/nats-architecture-and-design, ADR-31), which nats-py does not
 know: each request stands for itself, so that nothing is to be set up again after a server was killed.

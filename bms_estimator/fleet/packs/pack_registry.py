@@ -1,4 +1,4 @@
-"""What a worker knows of packs: rows and cell files as they come, and what they make of each pack.
+"""Registry of packs: rows and cell files as they come, and the settings and model of each pack.
 
 Packs with the same bytes share one settings object and one model; those that nobody asks for are never made. Whatever is
 wrong with a row makes its packs unknown, with the reason.

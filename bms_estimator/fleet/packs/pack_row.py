@@ -1,4 +1,4 @@
-"""What a fleet is told of one pack: a row of its table, and what the estimator makes of it.
+"""Row of the table of packs, and the settings and model that follow from it.
 
 On the server a row stands under its pack's name as JSON without that name, so that packs of one kind have the same bytes.
 """

@@ -23,7 +23,7 @@ Digest = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class PackType:
-    """What packs with the same settings have in common.
+    """Settings, estimator and digests that packs of one type share.
 
     Attributes:
         settings: Of the packs, but for the name.

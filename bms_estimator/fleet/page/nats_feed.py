@@ -36,7 +36,7 @@ log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class Server:
-    """Where the fleet's server is.
+    """Address and credentials of the fleet's server.
 
     Attributes:
         urls: nats://host:port, or tls://; several with commas between.

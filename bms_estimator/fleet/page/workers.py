@@ -21,7 +21,7 @@ class _Heard(NamedTuple):
 
 
 class FleetWorkers:
-    """What workers have said; all times are of one clock that never goes back [s].
+    """Heartbeats of workers; times are on one monotonic clock [s].
 
     Args:
         partitions: How many there are.

@@ -22,7 +22,7 @@ MOST_CONNECTIONS = 200_000
 
 @dataclass(frozen=True)
 class Cluster:
-    """What a node knows of the others.
+    """Cluster settings of a node.
 
     Attributes:
         listen: Where this one hears them, host:port.

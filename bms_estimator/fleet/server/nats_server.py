@@ -50,7 +50,7 @@ CONFIGURATION = "nats-server.conf"
 
 @dataclass(frozen=True)
 class NodeLocation:
-    """Where a node is among the others, and where its files are.
+    """Place of a node in the cluster, and its folder.
 
     Attributes:
         folder: For streams and keys.
@@ -91,7 +91,7 @@ def find_server() -> Path:
 
 @dataclass(frozen=True)
 class ServerSpec:
-    """What the settings say.
+    """Settings of the server.
 
     Attributes:
         settings: Of the fleet.

@@ -52,7 +52,7 @@ Say = Callable[[str], object]
 
 @dataclass
 class DemoObserver:
-    """What was heard.
+    """Observer of a demo.
 
     Attributes:
         partitions: Those that have packs.
@@ -98,7 +98,7 @@ class DemoObserver:
 
 @dataclass(frozen=True)
 class Demo:
-    """What a demo is.
+    """Parameters of a demo.
 
     Attributes:
         packs: How many.

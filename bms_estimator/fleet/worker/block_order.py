@@ -35,7 +35,7 @@ class BlockOrder(Enum):
 
 
 def classify_block(d: np.void, block: Block) -> BlockOrder:
-    """Where a block stands, with what its header tells.
+    """Classify a block by its header.
 
     Args:
         d: The pack's record of DELIVERY; updated but for ``NEXT`` itself, which ``mark_taken`` notes.

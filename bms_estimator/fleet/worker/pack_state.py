@@ -1,4 +1,4 @@
-"""What a worker knows of one pack: which block comes next, what has flowed, the hour's sums, the estimator's record.
+"""State of one pack in a worker: next block, totals, the hour's sums, the estimator's record.
 
 One record of numbers, kept packed (``kernels.packed_record``) in bytes that never change: whoever holds them has the pack as it
 was.

@@ -38,7 +38,7 @@ log = structlog.get_logger(__name__)
 
 
 class BlockResult(NamedTuple):
-    """What came of a block.
+    """Result of a block.
 
     Attributes:
         pack: Whose.

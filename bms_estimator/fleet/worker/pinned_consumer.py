@@ -72,7 +72,7 @@ class PinnedConsumer:
         return bool(self._pin)
 
     async def is_pinned(self) -> bool:
-        """Whether the server has pinned it to anybody.
+        """Return True if the server has pinned it to any worker.
 
         Raises:
             StreamError: The server does not know it.

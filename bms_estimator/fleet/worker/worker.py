@@ -42,7 +42,7 @@ log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class Options:
-    """How a worker works.
+    """Options of a worker.
 
     Attributes:
         servers: As ``connect`` has them, like ``creds`` and ``ca``.
@@ -93,7 +93,7 @@ async def _start(options: Options, notifier: SystemdNotifier) -> "Worker":
 
 
 def _check(nc: Client, options: Options) -> None:
-    """Whether the connection can come back.
+    """Check that the connection can come back.
 
     Raises:
         UserError: The server has closed it for good.

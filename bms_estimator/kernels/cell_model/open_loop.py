@@ -1,4 +1,4 @@
-"""What a cell's branches do under a measured current, from rest: no voltage is looked at.
+"""Response of a cell's branches to a measured current, from rest; the voltage is not used.
 
 Between two samples the current is taken as the filter takes it (``interpolated_current``, ``ramp_correction``), of a source that is no slower
 than one a minute.

@@ -1,4 +1,4 @@
-"""What the identifier has learned of each element over SOC, and the thesis's functions fitted to it.
+"""Map of each element over SOC as identified, and the thesis's functions fitted to it.
 
 The identifier knows the elements where the cell is now. A map keeps, for each SOC bin, the information-weighted mean
 of what it knew there. (2.5)-(2.9) are fitted to the map: one nonlinear exponent, searched; amplitude and offset, linear.

@@ -1,4 +1,4 @@
-"""What keeps the filter sane for years: samples that are not believed, a watch on its input, the last good state.
+"""Protection of the filter: an innovation gate, a watch on its input, the last good state.
 
 ``c`` is a record of CHECKS, ``n`` of COUNTERS, ``f`` of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -124,7 +124,7 @@ def passes_innovation_gate(
     current_a: float,
     voltage_v: float,
 ) -> bool:
-    """Whether the filter may see a sample: its voltage is near what was predicted, or stays where it is.
+    """Return True if the filter may use a sample: its voltage is near the prediction, or stays beyond the gate.
 
     Args:
         c: Record of CHECKS.
@@ -208,7 +208,7 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
 
 @njit(cache=True)
 def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
-    """How fast changes of the voltage go with those of the current: by -R_s when the sign is right.
+    """Track how fast changes of the voltage follow those of the current: by -R_s if the sign is right.
 
     A ramp is no change: where the curve ends, the voltage has one by itself.
     """

@@ -1,4 +1,4 @@
-"""Where the noise of the filter comes from: each term of R, Q and P(0).
+"""Noise of the filter: each term of R, Q and P(0).
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """

@@ -1,4 +1,4 @@
-"""How warm a cell makes itself, where nobody measures it.
+"""Self-heating of a cell without a temperature sensor.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """

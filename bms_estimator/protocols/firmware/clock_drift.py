@@ -1,4 +1,4 @@
-"""How fast the board's clock runs by the host's: a line under the times at which its samples came.
+"""Rate of the board's clock by the host's: a line under the arrival times of its samples.
 
 A sample comes late by what the line, the USB bridge and the host's scheduler take, never early. So of each ten seconds only
 the sample that came with the least delay counts, and of those the ones on the lower hull: the line lies under all of them
@@ -43,7 +43,7 @@ def take_arrival(d: Record, arrival_s: float) -> None:
 
 @njit(cache=True)
 def clock_ppm(d: Record) -> float:
-    """How much faster the board's clock runs than the host's [1e-6].
+    """Return the rate of the board's clock over the host's [1e-6].
 
     NaN before it has been seen for a minute, and where all samples came at once.
     """

@@ -123,7 +123,7 @@ class FrameDecoder:
 
     @property
     def clock_ppm(self) -> float | None:
-        """How much faster the board's clock runs than that of the arrivals [1e-6]; None before a minute has told, and where it cannot be.
+        """Rate of the board's clock over that of arrivals [1e-6]; None during the first minute, and if implausible.
 
         To 0.1. It changes no time stamp.
         """

@@ -165,7 +165,7 @@ class InfluxSink:
 
 
 def target(settings: InfluxSettings) -> Target:
-    """Where lines go; files are read anew each time, so that they can be replaced.
+    """Return the destination of the lines; files are reloaded each time, so that they can be replaced.
 
     Raises:
         UserError: A file cannot be used.

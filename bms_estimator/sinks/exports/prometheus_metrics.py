@@ -1,4 +1,4 @@
-"""What Prometheus fetches of a pack: names end in the base unit of Prometheus, made of the names of the payloads' fields.
+"""Prometheus metrics of a pack: names of the payloads' fields with the base unit of Prometheus at the end.
 
 ``voltage_v`` is ``bms_voltage_volts``, ``energy_out_kwh`` is ``bms_energy_out_joules_total``. Needs prometheus-client.
 """

@@ -1,4 +1,4 @@
-"""What Home Assistant is shown and when: a value that has moved and rested long enough.
+"""Values for Home Assistant: a value is published when it has moved and enough time has passed.
 
 Its recorder writes a row for each. Of entities that all move all the time those that have rested longest come first.
 """

@@ -119,7 +119,7 @@ class RequestDispatcher:
 
 
 class RateLimiter:
-    """So many in a minute, at once or spread.
+    """Rate limiter: a number of requests in a minute, at once or spread.
 
     Args:
         per_minute: How many.

@@ -1,4 +1,4 @@
-"""What is published on which topic, and the version of it all.
+"""Topics of all payloads, and their common version.
 
 ``PAYLOAD_VERSION`` goes up by one when a topic or a field vanishes, or a field gets another type, unit or meaning: what a
 reader relied on. What is added does not raise it: a reader passes over what it does not know.

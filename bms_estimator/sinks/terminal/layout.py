@@ -1,4 +1,4 @@
-"""What of a screen is shown where: text flows by the width, and what matters least goes where the height is short."""
+"""Layout of a screen: text flows by the width, and the least important lines are dropped for lack of height."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""How what a pack published looks on a terminal: pure functions from payloads to renderables.
+"""Views of published payloads for a terminal: pure functions from payloads to renderables.
 
 A large terminal gets two columns of panels, on a smaller one everything flows in one. On a low screen the least
 important parts are left out: SOC with its band, voltage, current, alarms and what is wrong go last.
@@ -231,7 +231,7 @@ def _measured(state: JsonFields, cells: int = 0) -> list[Text]:
 
 
 def _sparks(scene: ScreenState, width: int) -> Text:
-    """How voltage and current went over the last publications."""
+    """Return sparklines of voltage and current over the last publications."""
     cells = width - 2
     voltage, current = sparkline(scene.voltage_v, cells), sparkline(scene.current_a, cells)
     return Text.assemble(("V ", "dim"), (voltage, "cyan"), ("\nA ", "dim"), (current, "magenta"))

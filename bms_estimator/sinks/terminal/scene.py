@@ -1,4 +1,4 @@
-"""What a terminal shows at one moment, and a line for each thing that is heard. Pure."""
+"""State of a terminal view, and a line for each received message. Pure."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ class BrokerOutage(NamedTuple):
 
 @dataclass(frozen=True)
 class PackView:
-    """What one pack published last."""
+    """Last publications of one pack."""
 
     device: str = ""
     """Name of the device; empty without one."""
@@ -59,7 +59,7 @@ class PackView:
 
     @property
     def has_no_charge(self) -> bool:
-        """Whether it is a fuel cell."""
+        """True for a fuel cell."""
         return self.info.is_null("capacity_ah")
 
     @cached_property

@@ -265,7 +265,7 @@ def _header(path: Path, text: TextIOWrapper) -> tuple[list[str], int]:
 
 
 def _columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
-    """Where the columns are.
+    """Find the columns.
 
     Raises:
         UserError: Some are missing; the message says which, and what there is.

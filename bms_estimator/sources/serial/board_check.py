@@ -1,4 +1,4 @@
-"""Whether the board on the line is the pack's: the one that was told, or remembered, or with which this run began.
+"""Check that the board on the line is the pack's: the configured or stored one, or the first one of this run.
 
 Another board has another divider: its voltages would be wrong by several percent, and nothing else would tell.
 """

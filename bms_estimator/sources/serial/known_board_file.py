@@ -50,7 +50,7 @@ class KnownBoardFile:
             return {}
 
     def is_gone(self) -> bool:
-        """Whether nothing at all has the file's name.
+        """Return True if no file has the name.
 
         Raises:
             OSError: The disk cannot be read.
