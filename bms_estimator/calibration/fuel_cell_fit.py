@@ -114,7 +114,7 @@ def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFi
 
 
 def _fit(sources: Sequence[Source], file: Floats, told: list[int]) -> tuple[Floats, Floats]:
-    """Fit theta, shape (8,); return it with the covariance of the parameters ``told``."""
+    """Fit theta, shape (8,); return it with the covariance of the determined parameters."""
     theta, weights = np.zeros(LEARNABLE), np.ones(len(sources))
 
     def all_of(values: Floats) -> Floats:

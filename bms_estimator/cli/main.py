@@ -94,7 +94,7 @@ def _root(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process.
 
-    Exit codes: 0 done, 1 a fault of ours (with its traceback), or nobody reads stdout any more, or a disk is full or broken
+    Exit codes: 0 done, 1 an internal error (with its traceback), or the reader of stdout has gone, or a disk is full or broken
     (without), 2 something a person can mend, 130 interrupted.
 
     Args:

@@ -96,7 +96,7 @@ class Totals:
     """A sink that remembers the last estimate, and how far it was from the truth.
 
     Args:
-        first_error: Of the SOC that the estimator was told, 0..1.
+        first_error: Error of the SOC that the estimator starts with, 0..1.
         true_soc: The pack's SOC 0..1 at the last sample.
     """
 

@@ -107,7 +107,7 @@ def unpack(packed: Words, mirror: Mirror, words: Words) -> bool:
         words: Shape (n,), n words of a record.
 
     Returns:
-        False: ``packed`` is none of this layout, and what ``words`` are now means nothing.
+        False: ``packed`` does not have this layout, and ``words`` have no meaning.
     """
     n = words.shape[0]
     bitmap = (n + WORD_BITS - 1) // WORD_BITS

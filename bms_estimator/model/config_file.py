@@ -200,7 +200,7 @@ def write_text(path: Path, text: str, *, make_folder: bool = False) -> None:
     Args:
         path: Whatever is there.
         text: All of it.
-        make_folder: Whether its folder is made where there is none.
+        make_folder: True to create a missing folder.
 
     Raises:
         UserError: It cannot be written.

@@ -69,7 +69,7 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
 def _alarms(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Found]:
     """Those that were raised or ended. One that ended and came again in between has another ``since``.
 
-    What was raised before the start has been told of by the run before.
+    An alarm raised before the start was reported by the run before.
     """
     was = {alarm.name: alarm.since for alarm in before.alarms} if before else {}
     for alarm in snapshot.alarms:

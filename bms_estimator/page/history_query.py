@@ -70,7 +70,7 @@ class HistoryQuery:
             name: Of ``SPANS``.
 
         Raises:
-            UserError: There is none, or it cannot be read.
+            UserError: The file is missing or cannot be read.
         """
         if pack not in self._files:
             raise UserError(f"{pack}: no history is kept here")

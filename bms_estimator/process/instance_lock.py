@@ -52,7 +52,7 @@ def _hold(held: socket.socket, folder: Path, pack: str) -> None:
 
     Raises:
         UserError: One has it.
-        OSError: The system gives nobody such a name.
+        OSError: The system refuses such a name.
     """
     name, told = _name(folder, pack), None
     for _ in range(ATTEMPTS):

@@ -10,7 +10,7 @@ CREDENTIALS = Path("/run/credentials")
 
 
 class SystemdNotifier:
-    """Sends states to the socket of ``NOTIFY_SOCKET``; silent where there is none.
+    """Sends states to the socket of ``NOTIFY_SOCKET``; does nothing without one.
 
     One process may serve several packs. Systemd knows one service: a state is sent when all of them have it, since it was
     sent last. So it is ready with the last of them, and alive while each is.

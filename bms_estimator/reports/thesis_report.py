@@ -129,7 +129,7 @@ def build(
         recorded: Real captures for chapter 5; None: the simulated pack.
         table: Only this one.
         figure: Only this one.
-        progress: Told what is made next, how many are done, of how many.
+        progress: Called with the name of the next item, the number done, and the total.
 
     Raises:
         UserError: No such table or figure, or captures that chapter 5 cannot be run on.

@@ -31,7 +31,7 @@ class CheckpointWriter:
     Args:
         checkpoint: Where to.
         estimator: Read only.
-        publisher: Is told what becomes of it.
+        publisher: Gets the result.
         tally: What is counted over restarts.
         restarts: Starts that found a checkpoint.
         every_s: How often is saved at least [s].

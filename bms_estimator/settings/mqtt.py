@@ -16,7 +16,7 @@ def of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
     """Addresses as they must be.
 
     Raises:
-        ValueError: One is none, or holds a name or a password.
+        ValueError: One is not valid, or holds a name or a password.
     """
     urls = (value,) if isinstance(value, str) else value
     if not urls:

@@ -1,4 +1,4 @@
-"""``[source] kind = "mqtt"``: what somebody else publishes of a battery."""
+"""``[source] kind = "mqtt"``: battery readings that another program publishes."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -40,7 +40,7 @@ class SimulatedBms(SimulatedMeter):
         seed: Of the differences between the cells, and of noise.
 
     Raises:
-        ValueError: No BMS of this protocol has so many cells.
+        ValueError: No BMS of this protocol has that many cells.
     """
 
     def __init__(

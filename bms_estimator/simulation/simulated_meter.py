@@ -164,7 +164,7 @@ class SimulatedJunctek(SimulatedMeter):
 
 
 class SimulatedPylontech(SimulatedMeter):
-    """The console of one battery of so many cells.
+    """Console of one battery with a number of cells.
 
     Args:
         signal: What is at its sensors.

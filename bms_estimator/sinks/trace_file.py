@@ -109,14 +109,14 @@ class ParquetSink:
 
 
 WRITERS: dict[str, type[CsvSink | ParquetSink]] = {".csv": CsvSink, ".csv.gz": CsvSink, ".parquet": ParquetSink}
-"""End of a file's name -> who writes it."""
+"""Sinks by file name extension."""
 
 
 def table_sink(path: Path) -> TableSink:
-    """Who writes ``path`` by the end of its name.
+    """Return the sink of ``path`` by its file name extension.
 
     Raises:
-        UserError: Nobody does.
+        UserError: The extension is not known.
     """
     for suffix, writer in WRITERS.items():
         if path.name.lower().endswith(suffix):

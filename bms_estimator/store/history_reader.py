@@ -38,7 +38,7 @@ class HistoryFile:
         Args:
             since_s: From [s since 1970].
             until_s: To before [s since 1970].
-            step_s: A row for each so many [s], whole minutes; for one minute two where the clock went through it twice.
+            step_s: Length of a row [s], whole minutes; one minute has two rows if the clock went through it twice.
 
         Raises:
             UserError: It cannot be read.

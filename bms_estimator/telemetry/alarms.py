@@ -146,7 +146,7 @@ class AlarmEvaluator:
         self._keep()
 
     def on_silence(self, silent_s: float, now_s: float, reason: str) -> None:
-        """No sample has come for so long.
+        """Handle missing samples.
 
         Args:
             silent_s: On the monotonic clock [s].
@@ -184,7 +184,7 @@ class AlarmEvaluator:
         self._keep()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
-        """Somebody knows of an alarm, or of all. Returns which ones: those whose cause is gone have ended by that.
+        """Acknowledge an alarm, or all. Return the acknowledged ones: those whose cause has ended end by that.
 
         Args:
             name: Which; None: all.

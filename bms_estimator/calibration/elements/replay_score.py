@@ -30,7 +30,7 @@ def interval_score(cell: CellModel, load: CleanCapture, soc: Floats) -> float:
     """Mean over the replays, in percent of SOC; NaN when none is long enough.
 
     Args:
-        cell: What the estimator is told of the cell.
+        cell: Cell that the estimator uses.
         load: The capture.
         soc: Shape (n,), the truth.
     """

@@ -67,7 +67,7 @@ class SlowBranch:
         current_a: Mean magnitude [A].
         temperature_c: Mean [C]; NaN without a sensor.
         before_ah: What the capture discharged before it [Ah].
-        start_v: Voltage of the rest before it [V]; NaN when there is none.
+        start_v: Voltage of the rest before it [V]; NaN without one.
         step_v: What the voltage jumped by at the end of it that is at full [V]; NaN when no rest is there.
         whole: A discharge down to empty.
     """

@@ -91,7 +91,7 @@ class OcvSources:
 
     Attributes:
         capacity_ah: Given, else measured [Ah].
-        measured_ah: By a whole slow discharge [Ah]; NaN when there is none.
+        measured_ah: By a full slow discharge [Ah]; NaN without one.
         sources: Slow curves, given curves, rests.
         tests: Those captures that are relaxation tests, as ``sources`` has them.
         hysteresis_v: At ``NODES`` and 25 C [V], of the source nearest to it that tells, as far as rests keep it; None when

@@ -193,7 +193,7 @@ def _shifts(soc: Floats, slope_v: Floats) -> Floats:
 def _solved(model: _Model, points: Points, std_v: Floats, cells: float) -> Floats:
     """Solve for the model's coefficients under increasing spline coefficients, which make the spline increase.
 
-    What a source is off can be told from another only: 0 where there is one.
+    The systematic error of a source shows only beside another source: 0 if there is only one.
     """
     told = model.splines + model.warmths if points.source.max() == 0 else model.points.shape[1]
     rows = np.vstack([model.points / std_v[:, None], model.prior])[:, :told]

@@ -193,7 +193,7 @@ def _moving(one: Recording) -> NDArray[np.float64]:
 
 
 def _cells_in_series(voltage_v: NDArray[np.float64], told: int | None) -> int:
-    """As told, else by the usual voltage of a cell.
+    """Return the configured value, else one by the usual voltage of a cell.
 
     Raises:
         UserError: No cell has what each of them would have.

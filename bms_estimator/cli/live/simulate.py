@@ -93,7 +93,7 @@ def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int
     """With a cell for each in series.
 
     Raises:
-        UserError: It has no room for so many.
+        UserError: Not enough room for them.
     """
     try:
         return SimulatedBms(

@@ -31,7 +31,7 @@ def _whole(text: str) -> int:
     """Parse an integer.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is not a number.
     """
     if not re.fullmatch("[-+]?[0-9]+", text):
         raise ValueError(f"{text[:40]!r}: no whole number")

@@ -69,7 +69,7 @@ def reject_soc_for_fuel_cell(model: PackModel, told: str) -> None:
 
     Args:
         model: The pack as one object.
-        told: The setting or option that has told one.
+        told: Setting or option that the name came from.
 
     Raises:
         UserError: It is a fuel cell.
@@ -88,7 +88,7 @@ def with_sensor(settings: Settings, **changes: object) -> Settings:
     """Return settings with changed values of ``[sensor]``; None leaves a value unchanged.
 
     Raises:
-        UserError: It is about a serial line, and the source is none.
+        UserError: It is about a serial port, and the source is another one.
     """
     given = {name: value for name, value in changes.items() if value is not None}
     if given and settings.source is not None:
@@ -103,7 +103,7 @@ def with_broker(settings: Settings, url: str) -> Settings:
     """Return settings with another broker.
 
     Raises:
-        UserError: ``url`` is none.
+        UserError: ``url`` is not a broker's address.
     """
     others = settings.mqtt.model_dump() if settings.mqtt else {}
     try:

@@ -72,7 +72,7 @@ def _probed(ports: Sequence[str]) -> Given:
     """Return the settings for the detected device, and print what it is.
 
     Raises:
-        UserError: There is none, or more than one.
+        UserError: No device, or more than one.
     """
     if not ports:
         raise UserError("--probe: no serial port is there that may be a board's or a BMS's; name it with --port")

@@ -1,4 +1,4 @@
-"""Identify a pack anew from what it has sent, and judge the outcome on samples that had no part in it.
+"""Re-identify a pack from its stored samples, and judge the result on samples that had no part in it.
 
 Two thirds of the samples, the earlier ones, go to two ways of finding the cell: what the estimator's filter has learned of
 it by their end, and from there the fit of ``calibration.elements.identify`` to their longest piece without a gap. The last third
@@ -52,7 +52,7 @@ class HoldoutError:
 
     Attributes:
         rms_v: Of measured less predicted voltage, of one object of the cell file [V]; infinite where its SOC left 0..1.
-        samples: So many, over SOC 0.1.
+        samples: Number of samples above SOC 0.1.
     """
 
     rms_v: float
@@ -108,7 +108,7 @@ def reidentify(pack: str, samples: SampleBlock, kind: PackSpec, cell_file: str |
     Args:
         pack: Its name.
         samples: Dtype ``SAMPLE``, as the pack has sent them.
-        kind: What the fleet is told of it.
+        kind: Row of the pack's kind.
         cell_file: The text of the cell file that it names, if it does.
     """
     seconds = float(np.ptp(samples["time_s"])) if samples.size else 0.0

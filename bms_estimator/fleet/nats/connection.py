@@ -90,7 +90,7 @@ async def connect(
         linked: Called with why there is no connection, and with None when there is one again.
 
     Raises:
-        UserError: ``creds`` or ``ca`` cannot be read, or an address is none.
+        UserError: ``creds`` or ``ca`` cannot be read, or an address is not valid.
     """
     nc = Client()
     said = _Said(nc, servers, linked)

@@ -21,7 +21,7 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
     """Connect without reconnecting: a lost connection ends the command.
 
     Raises:
-        UserError: Nobody answers there, or refuses; a file cannot be read; later, as a stream cannot be read.
+        UserError: No response or a refusal; an unreadable file; later, an unreadable stream.
     """
     troubles = list[Exception]()
 

@@ -60,7 +60,7 @@ async def make_streams(
     raw_bytes: int = RAW_BYTES,
     raw_age_s: float = RAW_AGE_S,
 ) -> None:
-    """Make what is missing, and let limits and replicas be as told.
+    """Create missing streams, and set limits and replicas as configured.
 
     Args:
         nc: Connected as the tenant.
@@ -180,7 +180,7 @@ async def _repeated(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.k
     """Ask until there is an answer; whatever is asked here may be asked twice.
 
     Raises:
-        NoAnswerError: There is none.
+        NoAnswerError: No response.
         UserError: As ``ask``.
     """
     for _ in range(ATTEMPTS):

@@ -53,7 +53,7 @@ class PackRegistry:
         return None if data is None else self._kind(data)
 
     def cell_file(self, name: str) -> str | None:
-        """Return the text of a cell file; None if there is none or a shipped cell has this name."""
+        """Return the text of a cell file; None if it is missing or a shipped cell has this name."""
         return None if name in known_cells() else self._cells.get(name)
 
     def set_row(self, pack: str, data: bytes | None) -> bool:

@@ -110,7 +110,7 @@ def model_of(kind: PackSpec, cell_file: str | None) -> PackModel:
 
     Args:
         kind: Names the cell, and says what it holds and how many there are.
-        cell_file: The text of the loaded file of that name; None: there is none. A cell of the package goes before.
+        cell_file: Text of the loaded file of that name; None without one. A shipped cell takes precedence.
 
     Raises:
         UserError: There is no such cell, or a value in it that is not allowed; a capacity that is missing or cannot be.

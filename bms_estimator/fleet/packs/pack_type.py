@@ -28,7 +28,7 @@ class PackType:
     Attributes:
         settings: Of the packs, but for the name.
         made_of: Digest of all that the estimator is made of.
-        state_digest: Digest of what gives a state its meaning; under another it begins anew.
+        state_digest: Digest of all that gives a state its meaning; under another one it restarts.
         estimator: Works on the record of the partition.
         meter: Counts for one pack after the other.
         capacity_ah: Of the pack, rated; None of a fuel cell.

@@ -1,6 +1,6 @@
 """All packs of a fleet as its page shows them: who is alive, how they are spread, who needs attention. Pure.
 
-Of each pack the bytes of its newest state are kept, and what is ranked by in columns; the rest is decoded when somebody asks.
+Of each pack the bytes of its newest state are kept, and the ranked values in columns; the rest is decoded on request.
 """
 
 import bisect

@@ -22,7 +22,7 @@ def answer(folder: Path, name: str) -> dict[str, Any]:
         name: Of the question.
 
     Returns:
-        ``columns``, the first ``rows``, and how many there are (``count``); or why there is none (``reason``).
+        ``columns``, the first ``rows``, and their number (``count``); or the reason why they are missing (``reason``).
     """
     try:
         found = run_query(folder, name)

@@ -57,7 +57,7 @@ class FleetWorkers:
 
         Returns:
             ``workers`` (each: id, alive, what it holds and does), ``holders`` (of each partition the place of its worker, -1
-            where nobody holds it), ``unheld`` and ``twice`` (partitions), ``lag_s`` (the longest).
+            without an owner), ``unheld`` and ``twice`` (partitions), ``lag_s`` (the largest).
         """
         for name in [name for name, heard in self._heard.items() if heard[-1].at_s < now_s - REMEMBERED_S]:
             del self._heard[name]

@@ -43,12 +43,12 @@ log = structlog.get_logger(__name__)
 
 
 class Collector:
-    """Collects until it is told to stop.
+    """Collects until it is stopped.
 
     Args:
         nc: Connected as the tenant; it reconnects by itself.
         folder: Of the days.
-        period_s: A row waits at most so long for its file [s].
+        period_s: Maximum time that a row waits for its file [s].
         clock: Of wall and monotonic time.
 
     Attributes:

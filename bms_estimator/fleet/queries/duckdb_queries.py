@@ -100,7 +100,7 @@ def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limit
     Args:
         folder: Of the days, as ``fleet collect`` writes it.
         name: Of the question.
-        days: Only the last so many that have rows, whole days UTC; None: all.
+        days: Number of last days with rows, whole days UTC; None: all.
         limits: What is taken as given.
 
     Raises:

@@ -3,7 +3,7 @@
 ::
 
     operator.nk              signs accounts; whoever has it may do all
-    claims.json              what servers are told; public, the same on all nodes
+    claims.json              claims for the servers; public, equal on all nodes
     TENANT/account.nk        is the account
     TENANT/<role>.nk         signs users of that role, as ``claims.Role`` has them
     TENANT/admin.creds ...   with which programs connect: admin, worker, reader

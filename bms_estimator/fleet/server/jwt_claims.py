@@ -93,7 +93,7 @@ class Key:
     """A key pair.
 
     Attributes:
-        seed: The private half, which nobody is shown.
+        seed: Private half, which is never shown.
     """
 
     seed: bytes
@@ -120,7 +120,7 @@ def key_of(seed: bytes) -> Key:
     """Return the key of a seed in its text form.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is not a key.
     """
     try:
         nkeys.from_seed(seed)

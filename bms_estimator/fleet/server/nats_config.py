@@ -77,7 +77,7 @@ class Node:
         partitions: Of the stream ``RAW``.
         disk_bytes: The most that streams take; None: as the server has it, three quarters of what is free.
         memory_bytes: As above.
-        sync_s: So often files are made safe from a power cut; None: each message before it is acknowledged.
+        sync_s: Interval between two fsyncs [s]; None: each message before it is acknowledged.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A nats-server as a child: started, waited for, given its streams, told what signals tell us.
+"""A nats-server as a child process: start it, wait for it, make its streams, forward signals.
 
 It ends with us, even where we are killed. It is not started again: that is the work of who has started us.
 """
@@ -72,7 +72,7 @@ def find_server() -> Path:
     """Find nats-server beside the running Python, else in PATH.
 
     Raises:
-        UserError: There is none, or it is too old.
+        UserError: It is missing or too old.
     """
     beside = Path(sys.executable).with_name("nats-server")
     found = str(beside) if beside.exists() else shutil.which("nats-server")
@@ -148,7 +148,7 @@ def _check(tls: Tls) -> None:
 
 
 async def serve(place: NodeLocation, read: Callable[[], ServerSpec], say: Callable[[str], None]) -> int:
-    """Run a node until it ends. SIGHUP lets it read its settings anew: tenants, limits, who is revoked.
+    """Run a node until it ends. SIGHUP reloads its settings: tenants, limits, revoked users.
 
     Args:
         place: Of this node.

@@ -28,7 +28,7 @@ class SimulatedEdges:
         fleet: The packs.
         start_s: Wall clock at which the first block began [s since 1970].
         speed: The packs' seconds per second.
-        last: Number of the last block; None: there is none.
+        last: Number of the last block; None without end.
 
     Attributes:
         next: Number of the block that each edge sends next, shape (packs,).

@@ -146,7 +146,7 @@ def read_checkpoint(data: bytes) -> PartitionCheckpoint:
     """Read a whole checkpoint written by ``PartitionCheckpoint.chunks``.
 
     Raises:
-        CheckpointError: It is none, damaged, or of a version that is not known.
+        CheckpointError: It is damaged, not a checkpoint, or of an unknown version.
     """
     try:
         return _read(memoryview(data))

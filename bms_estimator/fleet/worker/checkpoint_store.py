@@ -97,7 +97,7 @@ class CheckpointStore:
         """Take a partition over, whoever had it.
 
         Raises:
-            FencedError: Somebody else does the same just now.
+            FencedError: Another worker does it at the same time.
         """
         found = await self._look(partition)
         revision, before = found or (0, None)

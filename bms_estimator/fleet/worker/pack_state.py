@@ -86,7 +86,7 @@ class WorkRecord:
         """Lay a pack there.
 
         Raises:
-            StateError: It is none of this layout.
+            StateError: It does not have this layout.
         """
         whole = len(packed) % WORD_BYTES == 0
         if not (whole and unpack(np.frombuffer(packed, np.uint64), self._mirror, self._words)):
@@ -103,7 +103,7 @@ class WorkRecord:
             The fields of its estimator, by their names.
 
         Raises:
-            ValueError: It is none of this layout, or the layout is none of a pack.
+            ValueError: It does not have this layout, or the layout is not that of a pack.
         """
         former = WorkRecord(dtype)
         former.put(packed)

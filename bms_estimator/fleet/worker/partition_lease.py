@@ -47,7 +47,7 @@ log = structlog.get_logger(__name__)
 
 
 class PartitionLease:
-    """A partition that this worker tries for, and has while nobody else has claimed it.
+    """Partition that this worker claims, and owns while no other has claimed it.
 
     Args:
         nc: Connected.
@@ -65,7 +65,7 @@ class PartitionLease:
         partition: The state; None: not taken over.
         claim: That it is ours; None: it is not.
         hours: Summaries that the server has not acknowledged yet: (id, pack, row).
-        lag_s: The longest since somebody last set it to None [s].
+        lag_s: Largest lag since it was last reset to None [s].
         blocks: Taken here, as are ``samples``.
         faults: Of ours: blocks that were left out.
         due_s: When a checkpoint is to be written, of a monotonic clock [s].

@@ -1,4 +1,4 @@
-"""Charge that nobody saw: in a gap of the samples, between two runs of the service, or because a source tells little.
+"""Unmeasured charge: in a gap of the samples, between two runs of the service, or because a source reports little.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """

@@ -198,7 +198,7 @@ def branch_covariance(t: float, tau_k: float, tau_m: float) -> float:
 
 @njit(cache=True)
 def initial_branch_currents(p: Record, current_a: float, mean: Floats, covariance: Floats) -> None:
-    """x_k of a load that nobody saw: mean and covariance, given the current at switch-on.
+    """Set mean and covariance of x_k for an unknown load before switch-on, given the current at switch-on.
 
     The load was a level, normal with mean ``load_mean_c`` and std ``load_level_c``, and on it a Gauss-Markov process of
     time constant t = ``load_s`` and std ``load_c``. Of that, the stationary covariance of branch k and the current is t/(t+tau_k).

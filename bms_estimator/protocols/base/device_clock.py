@@ -22,7 +22,7 @@ class DeviceClock:
     come, would lose charge without a word: what it lost counts with one step, and arrivals from then on.
 
     Attributes:
-        jumps: So often were times not believed.
+        jumps: Number of rejected times.
     """
 
     def __init__(self) -> None:

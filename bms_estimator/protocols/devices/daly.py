@@ -117,8 +117,8 @@ class DalyProtocol(PolledProtocol):
 
         Args:
             frames: By their numbers.
-            each: So many values are in one.
-            count: So many values there are; None: not known, zeros behind the last other one are none.
+            each: Number of values in one frame.
+            count: Number of values; None: unknown, and zeros behind the last other value do not count.
         """
         if not frames:
             return []

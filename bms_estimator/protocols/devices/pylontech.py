@@ -154,7 +154,7 @@ def _whole(text: str) -> int:
     """Parse an integer of the table.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is not an integer.
     """
     if not re.fullmatch(rf"-?[0-9]{{1,{DIGITS}}}", text):
         raise ValueError(text)

@@ -239,7 +239,7 @@ def is_consistent_with_clock(d: Record, samples: int, step_us: int) -> bool:
 
 @njit(cache=True)
 def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
-    """Go on by the board's clock. Whole turns of its 32 bits, which only an outage can hide, are told by arrival.
+    """Follow the board's clock. Wraps of its 32 bits, which only an outage can hide, are recognized by arrival.
 
     Returns:
         Whether the step can be right: a sample may come late, but not before it was taken, and as many samples are lost as fit

@@ -43,7 +43,7 @@ class BoardProtocol(DeviceProtocol):
 
     Args:
         current_sign: What the board calls positive; samples are positive on discharge.
-        rate_hz: Samples per second that the board is told to take; None: as it does.
+        rate_hz: Sample rate that the board is set to [Hz]; None: unchanged.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive", rate_hz: int | None = None) -> None:

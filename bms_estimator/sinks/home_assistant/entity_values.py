@@ -36,7 +36,7 @@ def values_to_publish(
     """Return the values to publish; ``shown`` itself if nothing changed enough.
 
     Args:
-        shown: What was told last.
+        shown: Values published last.
         snapshot: The snapshot.
         described: Which entities there are.
         now_s: Monotonic clock [s].

@@ -22,15 +22,15 @@ class JsonFields:
         return bool(self._of)
 
     def number(self, name: str) -> float | None:
-        """Return a number; None if there is none."""
+        """Return a number; None if missing."""
         return _number(self._of.get(name))
 
     def count(self, name: str) -> int:
-        """Return an integer; 0 if there is none."""
+        """Return an integer; 0 if missing."""
         return int(self.number(name) or 0)
 
     def text(self, name: str) -> str:
-        """Return a text without terminal control characters; empty if there is none."""
+        """Return a text without terminal control characters; empty if missing."""
         return _text(self._of.get(name))
 
     def flag(self, name: str) -> bool:

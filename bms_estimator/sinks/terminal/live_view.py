@@ -50,7 +50,7 @@ class LiveView:
         devices: What each pack published last.
         log: Log lines to show below, the last ones; the screen hides what others write.
         hint: A line that stays at the foot of the screen.
-        true_soc: The pack's SOC 0..1 at the last sample, where somebody knows it: a simulation does.
+        true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
         lost: Since when there is no broker, where one is needed.
         first: The pack that is shown first, where it is there.
         wall: Wall clock, seconds since 1970.
@@ -104,7 +104,7 @@ class LiveView:
         """Have drawn what there is now.
 
         Raises:
-            OSError: Standard output could not be written: nobody reads it any more, or its disk is full.
+            OSError: Standard output could not be written: its reader has gone, or its disk is full.
         """
         if self._error is not None:
             raise self._error

@@ -20,7 +20,7 @@ class TerminalSink:
     Args:
         log: Log lines to show below, the last ones.
         hint: A line that stays at the foot of the screen.
-        true_soc: The pack's SOC 0..1 at the last sample, where somebody knows it.
+        true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
         clock: The clocks.
     """
 

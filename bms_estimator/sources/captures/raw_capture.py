@@ -279,7 +279,7 @@ def _checked_header(path: Path, text: bytes) -> CaptureHeader:
     """Parse and check a header's JSON.
 
     Raises:
-        UserError: It is none, or one of a later version; the message names the file and what is wrong.
+        UserError: It is not a header, or one of a later version; the message names the file and the error.
     """
     try:
         found = _VERSIONED.validate_json(text)

@@ -54,7 +54,7 @@ class RawCapture:
     Attributes:
         decoder: What the bytes have gone through so far.
         damaged: The file has no readable record behind those that were read although it has not ended.
-        unread_bytes: So many at its end are no whole record: it was cut off there, or a length is damaged.
+        unread_bytes: Number of bytes at its end without a whole record: it was cut off there, or a length is damaged.
 
     Raises:
         UserError: No capture, or one of a later version.

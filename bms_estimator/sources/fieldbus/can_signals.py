@@ -172,7 +172,7 @@ class CanMap:
         )
 
     def _get(self, quantity: str, now_s: float, number: int = 0, kept_s: float = KEPT_S) -> float:
-        """Return the newest value; NaN if there is none or it is too old."""
+        """Return the newest value; NaN if it is missing or too old."""
         came_s, value = self._newest.get((quantity, number), (-math.inf, math.nan))
         return value if now_s - came_s <= kept_s else math.nan
 

@@ -136,7 +136,7 @@ class LinuxSensor(LineProducer):
         """As the chip is set, at least 0.1 s; else the default [s].
 
         Raises:
-            SourceUnavailableError: It is so long that the estimator would take it for gaps.
+            SourceUnavailableError: The interval is so long that the estimator would see gaps.
         """
         try:
             own_s = 1e-3 * read_number(find_chip(self._settings.chip, self._root) / "update_interval")

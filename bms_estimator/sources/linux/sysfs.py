@@ -71,7 +71,7 @@ def find_chip(chip: str, root: Path = SYS) -> Path:
         root: Of sysfs.
 
     Raises:
-        SourceUnavailableError: There is none, or more than one of this name.
+        SourceUnavailableError: No chip, or more than one, has this name.
     """
     if chip.startswith("/"):
         if not Path(chip).is_dir():
@@ -97,7 +97,7 @@ def find_channel(name: str, chip: str, root: Path = SYS) -> Channel:
         root: Of sysfs.
 
     Raises:
-        SourceUnavailableError: There is none.
+        SourceUnavailableError: No such channel.
     """
     folder, _, file = name.rpartition("/")
     channel = Channel(find_chip(folder or chip, root) / file)

@@ -56,7 +56,7 @@ class DetectedDevice:
 
 
 def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
-    """Who is on ``port``, or for people why nobody is known to be.
+    """Detect the device on ``port``; return it, or the reason why it is unknown.
 
     A board of the firmware is looked for first. Then every protocol that ``sensor.protocol`` knows is tried at its own baud
     rate, one question at a time: questions only, which change nothing, and settings stay as they are.

@@ -40,7 +40,7 @@ class KnownBoardFile:
         return f"bms-estimator board --folder {self.path.parent} --accept"
 
     def load(self) -> Mapping[str, str]:
-        """Load the stored board; empty if there is none or it is not valid, which is logged."""
+        """Load the stored board; empty if it is missing or not valid, which is logged."""
         try:
             return _checked(json.loads(read_private(self.path, LONGEST_FILE)))
         except FileNotFoundError:
