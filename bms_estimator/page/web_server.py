@@ -95,7 +95,7 @@ class WebServer:
     def url(self) -> str:
         """Address at which a browser on this machine finds the page."""
         host, port = self._listening
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 - told, and with a token only
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 - configured, and with a token only
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
     async def __aenter__(self) -> Self:

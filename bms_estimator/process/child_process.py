@@ -11,10 +11,10 @@ PR_SET_PDEATHSIG = 1
 
 
 def ends_with_us() -> Callable[[], None] | None:
-    """For ``preexec_fn``: the kernel sends the child SIGTERM when the thread that has started it is no more.
+    """Return a ``preexec_fn`` with which the kernel sends the child SIGTERM when its parent thread ends.
 
-    SIGKILL of this process is an end that nobody else can pass on. Start the child from the main thread. None where the
-    kernel knows no such thing, as only Linux does.
+    Only the kernel can do this after a SIGKILL of the parent. Start the child from the main thread. None on systems other than
+    Linux.
     """
     if sys.platform != "linux":
         return None

@@ -86,12 +86,12 @@ def _name(folder: Path, pack: str) -> str:
 
 
 def _holder(name: str) -> tuple[int, int]:
-    """Process and user that hold a name, as the system has it.
+    """Return process and user that hold a name.
 
     Raises:
         ConnectionRefusedError: No process holds it, or the holder does not listen.
-        BlockingIOError: Others have asked before. A holder answers nobody: the system tells whose it is to so many as
-            may wait for an answer, even once they are gone.
+        BlockingIOError: The listen queue of the holder is full. It accepts no connection, and the system reports the holder only to
+            as many clients as the queue holds, even after they have gone.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)

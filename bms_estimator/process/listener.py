@@ -55,7 +55,7 @@ class _Connection:
 class Connections:
     """Open connections, limited in total and for each address.
 
-    A new connection beyond a limit displaces the oldest one that has no request in progress. It is refused if there is none.
+    A new connection beyond a limit displaces the oldest one that has no request in progress. It is refused if all have one.
 
     Args:
         limit: Maximum number of connections; None derives it from RLIMIT_NOFILE.

@@ -178,9 +178,9 @@ class Procedure:
 
     @cached_property
     def smallest(self) -> Capture:
-        """The constant load of the smallest current: Algorithm 1 asks for a very small one.
+        """Constant load of the smallest current, because Algorithm 1 needs a very small one.
 
-        Where it is all there is to validate, or there is none, a relaxation test.
+        A relaxation test, if that load is the only one to validate with, or missing.
         """
         spare = len(self.loads) > 1 and self.of(Kind.CONSTANT)
         return min(spare or self.of(Kind.RELAXATION), key=lambda c: float(np.mean(c.samples["current_a"])))

@@ -15,7 +15,7 @@ WORDS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2}
 PROFILES: dict[str, dict[str, object]] = {
     # Victron's register list (attributes.csv of dbus_modbustcp), service com.victronenergy.battery; functions 3 and 4
     # do the same. The unit is the one under Settings, Services, Modbus TCP, Available services; 225 is a BMV's.
-    # What the service does not measure reads 0 (Mappings::getValue of dbus_modbustcp): a BMV without a sensor is not at 0 degC.
+    # Unmeasured values read 0 (Mappings::getValue of dbus_modbustcp): a BMV without a sensor is not at 0 degC.
     "victron-gx": {
         "unit": 225,
         "voltage": {"address": 259, "type": "uint16", "scale": 0.01, "absent": 0},

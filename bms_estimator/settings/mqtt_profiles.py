@@ -97,7 +97,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
         0.1,
         _node("daly-bms"),
     ),
-    # victronenergy/dbus-flashmq, README: values are told when they change, and when they are asked for; the keep-alive lasts
+    # victronenergy/dbus-flashmq, README: values are published on change and on request; the keep-alive lasts
     # 60 s. Cells as dbus-serialbattery has them with BATTERY_CELL_DATA_FORMAT = 1.
     "venus": Profile(
         {

@@ -199,7 +199,7 @@ class VirtualBoard:
         os.close(self._slave)  # the line hangs up while no process has it open
         self._slave, line = -1, select.poll()
         line.register(self._master, 0)
-        while line.poll(0):  # noqa: ASYNC110 - the system tells nobody when a line is opened
+        while line.poll(0):  # noqa: ASYNC110 - the system does not report when a line is opened
             await asyncio.sleep(_LOOK_S)
         self._slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._slave)

@@ -1,14 +1,13 @@
-"""The table of open-circuit voltage: one smooth curve through points of several sources, with its error.
+"""Fit of the OCV table: one smooth curve through points of several sources, with its error.
 
 One linear Gaussian model over all points (a smoothing spline with random effects; Wahba 1990, Rasmussen and Williams
 2006, chapter 2):
 
     v = f(SOC) + (T - 25 C) u(SOC) + c(T) w(SOC) + f'(SOC) (s + q (1 - SOC)) + d(SOC) + noise
 
-f is a cubic spline that bends no more than cells do; u is dE/dT; w is what cold cells have not relaxed, alike in all
-sources and hardly to be told from u, so that they share what is seen as their sizes are; s, q are each source's errors of
-its first SOC and of its capacity; d is what a source is off as a whole. All but f are pulled to 0 by what is known of
-their size beforehand. The curve's standard deviation is that of the model: wide in gaps.
+f is a cubic spline with the curvature of real cells. u is dE/dT. w is the error of cold, unrelaxed rests; it is common to all
+sources and hardly distinguishable from u, so that the priors share what is seen between both. s and q are each source's errors
+of its first SOC and of its capacity. d is the systematic error of a source. Priors pull all but f to 0. The curve's standard deviation is that of the model: wide in gaps.
 """
 
 import itertools

@@ -54,10 +54,10 @@ def identify(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Identify packs anew from the blocks that the server still has of them.
+    """Re-identify packs from the blocks that the server still has of them.
 
     Two thirds of the samples identify; the last third judges the old cell and the new one by the voltage that each
-    predicts. A cell file is written only where the new one is better; why not is said of each other pack.
+    predicts. A cell file is written only if the new one is better; the reason is given for each other pack.
     """
     where = (server, creds, ca)
     names = _names(packs or [], from_file)

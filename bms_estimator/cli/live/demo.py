@@ -46,7 +46,7 @@ def demo(
 
     A simulated 275 mAh cell under a changing load is at the pins of a board: the real firmware in simavr where that is
     built (make firmware), else its stand-in in Python. The real service reads it from a pseudo-terminal and publishes
-    to a broker of its own on the loopback. It is told a SOC that is 20 % wrong; beside its estimate stands the true one.
+    to a broker of its own on the loopback. Its initial SOC is 20 % wrong; the true SOC is shown beside the estimate.
     """
     build = None if python_board else find_build(firmware)
     log = deque[str](maxlen=LOG_LINES)

@@ -64,18 +64,18 @@ def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackMode
     return model
 
 
-def reject_soc_for_fuel_cell(model: PackModel, told: str) -> None:
-    """Say that a fuel cell has no SOC.
+def reject_soc_for_fuel_cell(model: PackModel, key: str) -> None:
+    """Reject an SOC for a fuel cell.
 
     Args:
         model: The pack as one object.
-        told: Setting or option that the name came from.
+        key: Setting or option that gives an SOC.
 
     Raises:
         UserError: It is a fuel cell.
     """
     if isinstance(model, FuelCellModel):
-        raise UserError(f"{told}: {model.cell.name} is a fuel cell, which has no state of charge: leave it out")
+        raise UserError(f"{key}: {model.cell.name} is a fuel cell, which has no state of charge: leave it out")
 
 
 def with_pack(settings: Settings, **changes: object) -> Settings:

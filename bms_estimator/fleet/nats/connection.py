@@ -69,7 +69,7 @@ class _Transport(TcpTransport):
                 self._io_writer.transport.abort()
 
 
-nats.aio.client.TcpTransport = _Transport  # type: ignore[attr-defined] # the library asks nobody which to take
+nats.aio.client.TcpTransport = _Transport  # type: ignore[attr-defined] # the library has no option for it
 
 
 async def connect(

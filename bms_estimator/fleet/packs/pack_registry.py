@@ -1,7 +1,7 @@
 """Registry of packs: rows and cell files as they come, and the settings and model of each pack.
 
-Packs with the same bytes share one settings object and one model; those that nobody asks for are never made. Whatever is
-wrong with a row makes its packs unknown, with the reason.
+Packs with equal rows share one settings object and one model, which are made on first use. An error in a row makes its packs
+unknown, with the reason.
 """
 
 from collections.abc import Collection, Iterator

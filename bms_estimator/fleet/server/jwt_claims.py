@@ -68,8 +68,8 @@ _ESTIMATES = (
 )
 _HEARS = ("_INBOX.>", "bms.>", "fleet.>")
 _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    # publish, subscribe; {{name()}} is the user's. Before 2.12.4 the server asks for $MQTT.sub at QoS 1, which it lets nobody
-    # subscribe to by that name. bms/# is bms, too.
+    # Publish, subscribe; {{name()}} is the user's name. Before 2.12.4 the server requires $MQTT.sub at QoS 1, to which no client can
+    # subscribe by that name. bms/# includes bms.
     Role.EDGE: (("raw.{{name()}}",), ("edge.{{name()}}.awaits", "$MQTT.sub.>")),
     Role.DASHBOARD: ((), ("bms", "bms.>", "fleet", "fleet.>", "$MQTT.sub.>")),
     Role.READER: (_READS, _HEARS),

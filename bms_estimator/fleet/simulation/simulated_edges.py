@@ -22,7 +22,7 @@ class Due(NamedTuple):
 
 
 class SimulatedEdges:
-    """The edges of a fleet, each with its store of blocks: all of them, since any can be made anew.
+    """Edges of a fleet. Each one can send any earlier block again, because blocks are computed when needed.
 
     Args:
         fleet: The packs.
@@ -32,10 +32,10 @@ class SimulatedEdges:
 
     Attributes:
         next: Number of the block that each edge sends next, shape (packs,).
-        safe: All blocks before are, as workers said.
-        resends: How often a worker asked for one again.
-        sent: Blocks, those sent again among them.
-        again: Those.
+        safe: Number before which all blocks are safe, as workers reported.
+        resends: Number of requests to resend.
+        sent: Number of blocks sent, with repetitions.
+        again: Number of repetitions.
     """
 
     def __init__(self, fleet: SimulatedFleet, *, start_s: float, speed: float, last: int | None = None) -> None:

@@ -1,7 +1,7 @@
-"""In which order a pack's blocks are taken, and what its edge is told: it follows from what came alone.
+"""Order of a pack's blocks, and replies to its edge. Both follow from the received blocks alone.
 
-An edge keeps each block until it is told that all before another one are safe, and sends again from the one that is
-awaited. So of what comes late, twice or too early nothing is needed.
+An edge stores each block until a reply says that all earlier blocks are safe. It resends from the expected block on. Therefore
+late, repeated and early blocks can be dropped.
 """
 
 from enum import Enum

@@ -1,9 +1,8 @@
 """Checkpoints of partitions on the server: the bytes as objects of their own, and a pointer to them in a key-value bucket.
 
-A pointer is only ever replaced by who knows its last revision. Who takes a partition over replaces it at once, with its own
-name, so that whoever had the partition before, and is only slow or was stopped, fails when it writes its next checkpoint.
-An object is written before the pointer that names it; and a pointer names the object that comes next, so that what
-somebody left behind, who was killed between the two, is found and removed.
+A pointer is replaced only with knowledge of its last revision. A worker that takes over a partition replaces it at once with its
+own name. A slow or suspended former owner then fails to write its next checkpoint. An object is written before the pointer that
+names it. A pointer also names the next object, so that the object of a worker killed between the two writes is found and removed.
 """
 
 import asyncio

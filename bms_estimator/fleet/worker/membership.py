@@ -1,10 +1,9 @@
-"""Which worker tries for which partition: each computes the same from who has been heard of. Pure: the clock is a value.
+"""Assignment of partitions to workers, which each worker computes from heartbeats. Pure: the clock is an argument.
 
 Rendezvous hashing (Thaler and Ravishankar, "A name-based mapping scheme for rendezvous", 1996) with bounded loads (Mirrokni,
 Thorup and Zadimoghaddam, "Consistent hashing with bounded loads", 2016): a partition belongs to the worker with the highest
-hash of the pair, unless that one has its fair number already; so few partitions move when somebody joins or leaves, and
-nobody has more than his part. The workers need not agree at each moment: a partition is with whom the server has pinned it
-to.
+hash of the pair, unless that worker has its fair number already. Therefore few partitions move when a worker joins or leaves, and
+no worker has more than its share. The workers need not agree at each moment: the server's pin decides who owns a partition.
 """
 
 import math

@@ -1,8 +1,8 @@
-"""One partition in the hands of a worker: taken over, stepped message by message, kept, given back.
+"""Lease of one partition by a worker: take over, process message by message, save, release.
 
-What its state becomes follows from the order of the stream alone. So it is enough to know up to which message a state
-goes: wherever messages may have gone to somebody else, or were lost on the way, they are read from the stream once more;
-so, too, where nothing comes: what somebody was given who died then, comes to nobody again.
+The state follows from the order of the stream alone, so that the number of its last message defines it. Messages that may
+have gone to another worker, or were lost in transit, are read from the stream again. That is also done during silence, because
+messages that were delivered to a worker before it died are not delivered again.
 """
 
 import asyncio

@@ -1,8 +1,8 @@
-"""One partition's messages, from the durable consumer that the server pins to one worker at a time (ADR-42).
+"""Messages of one partition, from the durable consumer that the server pins to one worker at a time (ADR-42).
 
-Measured with nats-server 2.15.1: a pin lasts ``streams.PIN_S`` from the last *request* that names it, whatever was given
-meanwhile; so requests are renewed each ``RENEW_S`` and live longer than that, two or three at a time. A request without a
-pin waits until there is none. One that names a pin that is gone is answered with status 423.
+Measured with nats-server 2.15.1: a pin lasts ``streams.PIN_S`` from the last *request* that names it, with or without deliveries.
+Therefore requests are renewed each ``RENEW_S`` and expire later than that, so that two or three are pending. A request without a
+pin waits while another pin lasts. A request with an expired pin gets status 423.
 """
 
 import json

@@ -1,9 +1,9 @@
-"""Several filters side by side, from SOCs apart, until they agree: switched on anywhere.
+"""Filter bank: several filters that start at different SOCs and are merged when they agree.
 
-At switch-on neither the SOC nor the polarisation is known, and far from the truth the OCV's slope is another. So filters
-start at ``HYPOTHESES`` SOCs around the one that is told. Each is weighted by its likelihood to a power below 1, since
-successive errors of the model are not independent (tempering); those that agree become one, unlikely ones go. What
-goes out is mean and standard deviation of the mixture.
+At switch-on neither the SOC nor the polarization is known, and far from the true SOC the OCV has another slope. Therefore filters
+start at ``HYPOTHESES`` SOCs around the initial one. Each is weighted by its likelihood to a power below 1 (tempering), because
+successive errors of the model are not independent. Filters that agree are merged, and unlikely ones are removed. The output is
+mean and standard deviation of the mixture.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. At more than 1 Hz the filters see the mean of a second's samples.
 """

@@ -14,12 +14,12 @@ slow. Samples that merely waited would arrive together."""
 
 
 class DeviceClock:
-    """Seconds since the first sample, never less than before.
+    """Time since the first sample [s], which never decreases.
 
-    Samples that waited come late, and at once: their own times place them. A time that steps back, or one that lies
-    ahead of the arrivals, is one of a clock that was set or of a device that began anew: there the arrival counts, and so
-    it does where the clock stands still. One that is slow, as of a device that sleeps or of milliseconds where seconds
-    come, would lose charge without a word: what it lost counts with one step, and arrivals from then on.
+    Delayed samples arrive together, and their own timestamps place them. A timestamp that steps back, or lies ahead of its
+    arrival, shows that the clock was set or the device restarted: then the arrival counts. The arrival also counts while the
+    clock stands still. A slow clock, as of a sleeping device or one that sends milliseconds in place of seconds, would lose
+    charge. Its lost time is added in one step, and arrivals count from then on.
 
     Attributes:
         jumps: Number of rejected times.

@@ -62,7 +62,8 @@ def read_line(line: bytes) -> Reading | None:
 
     ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
     ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
-    ``time_s`` is when it was measured by the board's clock; a cell that is ``null`` was not. Other names are passed over; a name that comes twice, or a unit that is none of these, makes the line say nothing.
+    ``time_s`` is the board's timestamp; a cell that is ``null`` was not measured. Unknown names are skipped. A repeated name or an unknown
+    unit makes the line invalid.
     """
     if b";" in line and b"." not in line:
         line = line.replace(b",", b".")

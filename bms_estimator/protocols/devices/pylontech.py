@@ -33,12 +33,12 @@ ABSENT = "-"
 
 
 class PylontechProtocol(ReadingProtocol):
-    """The tables of a console to samples: mean voltage, sum of the currents, mean temperature of the cells.
+    """Decoder of the console's tables: mean voltage, sum of the currents, mean temperature of the cells.
 
-    Cells are those of all batteries one after the other, each battery's as it told them last, if that was of late.
+    The cells of all batteries follow each other, each battery's with its last recent values.
 
     Args:
-        current_sign: As the device has it: positive on charge.
+        current_sign: Direction that the device calls positive: charge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:

@@ -242,9 +242,9 @@ def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
     """Follow the board's clock. Wraps of its 32 bits, which only an outage can hide, are recognized by arrival.
 
     Returns:
-        Whether the step can be right: a sample may come late, but not before it was taken, and as many samples are lost as fit
-        it. Samples that waited come at once, and no longer apart by the board's clock than one takes. A clock that runs
-        steadily too fast, as a simulated one does, is told by its rate, not here.
+        True if the step is plausible: a sample may arrive late but not early, and the number of lost samples fits the step. Delayed
+        samples arrive together, at most one period apart by the board's clock. A clock that runs steadily too fast, as a
+        simulated one may, is detected by its rate and not here.
     """
     step_us = (board_us - d.board_us) & _MASK
     if lost > 0:

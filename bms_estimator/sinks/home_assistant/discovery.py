@@ -129,9 +129,9 @@ def _named(names: Mapping[str, str], key: str) -> dict[str, str]:
 
 
 def _identity(device: str, key: str, platform: str) -> dict[str, str]:
-    """Its entity's id does not depend on its name, so that a dashboard fits in any language.
+    """Return an entity id that does not depend on the name, so that a dashboard fits any language.
 
-    Before 2025.10 the id was ``object_id``, which later versions do not read where the other is told.
+    Before 2025.10 the key was ``object_id``, which later versions ignore beside the new one.
     """
     entity = f"{device_id(device)}_{key}"
     return {"unique_id": entity, "default_entity_id": f"{platform}.{entity}", "object_id": entity}

@@ -76,7 +76,7 @@ def _rounded(snapshot: Snapshot, shows: Mapping[str, Entity], sign: float) -> di
 def _values(snapshot: Snapshot) -> dict[str, float | None]:
     """All that a snapshot has, by the keys of the entities."""
     estimate, parameters = snapshot.estimate, snapshot.parameters
-    assert estimate is not None  # noqa: S101 - for the type checker: nothing is told without
+    assert estimate is not None  # noqa: S101 - for the type checker: nothing is published without
     health = parameters.state_of_health.get("capacity")
     return {
         **vars(estimate),

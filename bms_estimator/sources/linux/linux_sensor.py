@@ -133,10 +133,10 @@ class LinuxSensor(LineProducer):
             ) from None
 
     def _own_interval_s(self) -> float:
-        """As the chip is set, at least 0.1 s; else the default [s].
+        """Return the chip's own interval, at least 0.1 s, else the default [s].
 
         Raises:
-            SourceUnavailableError: The interval is so long that the estimator would see gaps.
+            SourceUnavailableError: The interval is longer than the estimator accepts without gaps.
         """
         try:
             own_s = 1e-3 * read_number(find_chip(self._settings.chip, self._root) / "update_interval")

@@ -14,15 +14,15 @@ BUSY_PORT_RETRY_S = 1.0
 
 
 class PortDiscovery:
-    """Which port is tried next.
+    """Choice of the next port to try.
 
     Args:
         port: Device path, or ``auto``.
         monotonic: Monotonic clock [s].
 
     Attributes:
-        is_preferred: Whether a device that tells nothing is waited for on the port that was chosen last. Else it may be
-            somebody else's: it is left soon.
+        is_preferred: True if a silent device on the last chosen port is waited for. Otherwise the port may belong to another device
+            and is left soon.
     """
 
     def __init__(self, port: str, monotonic: Callable[[], float] = time.monotonic) -> None:
