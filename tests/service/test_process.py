@@ -54,6 +54,15 @@ main()
 """The program on a disk that never answers once something is to be on it."""
 
 
+WITH_HANGUP = """
+import signal
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+from bms_estimator.cli.main import main
+main()
+"""
+"""Program with the default SIGHUP, which the tests themselves may ignore, as under nohup."""
+
+
 STARTING = """
 import os, signal
 from bms_estimator.cli.live import run
@@ -212,8 +221,8 @@ async def test_a_disk_that_never_answers_and_a_log_that_nobody_reads_stop_neithe
 async def test_hangup_ends_the_service_cleanly(
     tmp_path: Path, line: Line, broker: Broker, number: signal.Signals
 ) -> None:
-    pack = pack_file(tmp_path, line, broker, "house")
-    async with Listener(broker) as live, service(pack) as process:
+    pack, program = pack_file(tmp_path, line, broker, "house"), [sys.executable, "-c", WITH_HANGUP]
+    async with Listener(broker) as live, service(pack, program=program) as process:
         await live.wait("bms/house/health")
         process.send_signal(number)
         await live.wait("bms/house/availability", lambda payload: payload == b"offline")

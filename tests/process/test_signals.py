@@ -1,0 +1,29 @@
+"""Signals end a process cleanly."""
+
+import asyncio
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from bms_estimator.process.signals import stop_on_signal
+from tests.patience import LONG_S
+
+
+@pytest.fixture(params=[signal.SIG_DFL, signal.SIG_IGN], ids=["default", "ignored"])
+def hangup(request: pytest.FixtureRequest) -> Iterator[signal.Handlers]:
+    before = signal.signal(signal.SIGHUP, request.param)
+    yield request.param
+    signal.signal(signal.SIGHUP, before)
+
+
+async def test_hangup_stops_unless_it_is_ignored(hangup: signal.Handlers) -> None:
+    stop = stop_on_signal()
+    os.kill(os.getpid(), signal.SIGHUP)
+    if hangup is signal.SIG_IGN:
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    else:
+        await asyncio.wait_for(stop.wait(), LONG_S)
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().remove_signal_handler(number)
