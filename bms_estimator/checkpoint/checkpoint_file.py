@@ -57,7 +57,7 @@ class RunCounters:
         restarts: Starts that found a checkpoint.
         total: What is counted over restarts.
         clean: The last of them has ended by itself; False while it runs.
-        alarms: Those that outlive a restart, as ``Alarms.kept``.
+        alarms: Those that outlive a restart, as ``AlarmEvaluator.kept``.
     """
 
     restarts: int

@@ -111,7 +111,7 @@ class Publisher:
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
         self.watch = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks)
-        self._suspects = 0  # bits of ``Suspect``, as logged
+        self._suspects = 0  # bits of ``InputFault``, as logged
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s

@@ -41,7 +41,7 @@ class LineProducer(ABC):
 
     @abstractmethod
     def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """Connect; then ``CONNECTED``, and lines as ``report_line`` makes them, as they come.
+        """Connect; then ``CONNECTED``, and lines as ``sample_json_line`` makes them, as they come.
 
         Called again, after a pause, when it has ended or raised. It never blocks the event loop, and is closed at the end.
 

@@ -148,7 +148,7 @@ class Queue:
         return runs.first - first
 
     def left(self, runs: NumberRanges) -> None:
-        """Set the number of messages that are still only on disk."""
+        """Keep only the messages in ``runs`` of those that are only on disk; the others are lost."""
         before = len(self.stored)
         self.stored = self.stored.both(runs)
         self._lose(before - len(self.stored))

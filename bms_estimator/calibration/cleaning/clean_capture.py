@@ -97,7 +97,7 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
 
 
 def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
-    """Remove samples whose voltage or current differs from both neighbors."""
+    """Remove voltage jumps that the current does not explain, and current jumps without a change of voltage."""
     off_v = np.abs(_off_median(samples["voltage_v"]))
     off_a = np.abs(_off_median(samples["current_a"]))
     ohm = EXPLAINED * (cell.a[13] * np.exp(-0.5 * cell.a[14]) + cell.a[15])

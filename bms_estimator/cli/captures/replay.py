@@ -97,7 +97,7 @@ def replay(
 
 
 def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
-    """Return a warning about the part of a capture that was not read; empty if all was read."""
+    """Yield a warning for each part of a capture that was not read."""
     if source.damaged:
         yield f"damaged after {duration_s:.1f} s; the rest was not read"
     if source.unread_bytes:

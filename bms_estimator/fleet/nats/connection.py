@@ -134,7 +134,7 @@ def addresses(servers: str) -> list[str]:
 
 
 def readable(creds: Path) -> Path:
-    """Check that a credentials file can be read.
+    """Return the path of a credentials file after checking its content.
 
     Raises:
         UserError: It cannot be read, or holds none.

@@ -49,7 +49,7 @@ FLOW = np.dtype(
     ],
     align=True,
 )
-"""All that has flowed (``telemetry.charge_energy.ChargeEnergy``), and what ``Meter`` counts in."""
+"""All that has flowed (``telemetry.charge_energy.ChargeEnergy``), and what ``ChargeEnergyMeter`` counts in."""
 PACK_STATE = np.dtype(
     [("delivery", DELIVERY), ("flow", FLOW), ("hour", HOUR_SUMS), ("estimator", ESTIMATOR_STATE)], align=True
 )

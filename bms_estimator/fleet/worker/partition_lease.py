@@ -419,7 +419,7 @@ class PartitionLease:
 
 
 def _later(before: BlockResult | None, taken: BlockResult) -> BlockResult:
-    """Return the messages to send out of two successive ones of one pack."""
+    """Merge two successive results of one pack into one."""
     if before is None:
         return taken
     return taken._replace(

@@ -33,7 +33,7 @@ OUTLIERS_S = 3600.0
 def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> bool:
     """Return True if the voltage may be used.
 
-    Update how long voltage and current have been impossibly constant; call before ``watch_sign``.
+    Update how long voltage and current have been impossibly constant; call before ``track_current_sign``.
     """
     counted_s = min(dt_s, FAST_S)
     fast = dt_s <= FAST_S and c.slow_v != 0.0
@@ -87,7 +87,7 @@ def ocv_has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v:
 
 @njit(cache=True)
 def rewind_to_freeze(c: Record, f: Record, p: Record) -> None:
-    """Return to the SOC before a sensor froze, and count charge from there if the current is the live one."""
+    """Return to the SOC before a sensor froze; count the charge from there if only the voltage froze."""
     if c.frozen_a_s > FROZEN_S:
         f.soc, f.soc_std = c.same_soc, c.same_soc_std + p.load_mean_c * c.same_s / 3600.0
     else:

@@ -24,7 +24,7 @@ IDLE_C = 0.1
 
 @njit(cache=True)
 def initialize_load_statistics(s: Record, p: Record, current_a: float) -> None:
-    """Before a load is seen: what ``switch_on`` takes one to be.
+    """Before a load is seen: what ``initial_branch_currents`` takes one to be.
 
     The first sample tells more of a load that is small than of one that is large: that may be a peak.
     """

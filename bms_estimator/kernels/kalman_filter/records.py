@@ -13,7 +13,7 @@ The state vector, in this order (also of the rows and columns of the covariance)
  12   LN_Q       ln(true / declared capacity); a wrong gain of the current sensor looks the same
  13   HYST       hysteresis h, -1 after discharge, 1 after charge
  14   CURVE      error of the OCV at this SOC, here and now, in units of its standard deviation
-15-   NODE       error of the OCV curve at ``NODES`` SOCs from 0 to 1, in the same units: learned (``ocv_learning``)
+15-   NODE       error of the OCV curve at ``NODES`` SOCs from 0 to 1, in the same units: learned (``ocv_correction``)
 ====  =========  ==============================================================================================
 
 Several such filters run side by side from different SOCs until they agree (``hypotheses``).
@@ -99,7 +99,7 @@ EKF_SETTINGS = np.dtype(
         ("ocv_v", "f8", OCV_POINTS),  # E_o over SOC 0..1 at 25 C [V]
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
         ("curve_error_v", "f8", GRID),  # std of E_o [V]
-        ("learned", "f8"),  # part of its variance that is of the curve, the same each time: ``ocv_learning``
+        ("learned", "f8"),  # part of its variance that is of the curve, the same each time: ``ocv_correction``
         ("curve_soc", "f8", GRID),  # charge over which that error changes [SOC]
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
         ("hysteresis_v", "f8", GRID),  # half of what E_o is higher after charge than after discharge, at 25 C [V]

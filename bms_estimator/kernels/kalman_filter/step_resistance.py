@@ -31,7 +31,7 @@ SHAPE_STD = 0.3
 
 @njit(cache=True)
 def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: float) -> None:
-    """Take one sample, after ``count_on``: the current changed by ``change_a`` [A] within ``dt_s`` [s]."""
+    """Take one sample, after ``integrate_current``: the current changed by ``change_a`` [A] within ``dt_s`` [s]."""
     step, least_a = s.step, LEAST_C * p.capacity_as / 3600.0
     before, step.phase = step.phase, UNHELD
     step.variance += SHAPE_STD**2 * abs(s.current_a) * dt_s / p.capacity_as

@@ -1,4 +1,4 @@
-"""Boards that print text, as every hobby sketch does: ``text_line`` says what a line may be."""
+"""Boards that print text, as every hobby sketch does: ``protocols.base.reading`` says what a line may be."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,7 @@
 """The numbers that Home Assistant shows of a pack.
 
 Home Assistant keeps a row for each change of each entity. So it gets topics of its own, rounded and slow
-(``home_assistant_values``); what only a researcher looks at is there but disabled until he enables it.
+(``entity_values``); what only a researcher looks at is there but disabled until he enables it.
 """
 
 import math
