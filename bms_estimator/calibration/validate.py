@@ -17,7 +17,7 @@ from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 
 LOW_SOC = 0.1
-"""Below it the form of the elements fails for every cell; errors are given with and without."""
+"""SOC below which the form of the elements fails for every cell; errors are given with and without it."""
 
 
 @dataclass(frozen=True)

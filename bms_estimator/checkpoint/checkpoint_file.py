@@ -75,7 +75,7 @@ class CheckpointContent:
     unseen_s: float
     """Time since it was saved [s]; infinite if unknown."""
     ledger: RunCounters
-    """With this start counted; of nothing when it was not of this pack, or could not be read."""
+    """Counters with this start added; zero if the file was of another pack, or could not be read."""
     reason: str
     """Why it is not taken up; empty when it may be."""
 

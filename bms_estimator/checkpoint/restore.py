@@ -1,4 +1,4 @@
-"""From a checkpoint's fields to an estimator that goes on from them."""
+"""Restore of an estimator from a checkpoint's fields."""
 
 import math
 from collections.abc import Mapping

@@ -99,7 +99,7 @@ class DemoBroker:
 
     @property
     def url(self) -> str:
-        """For ``mqtt.url``."""
+        """Address for ``mqtt.url``."""
         return f"mqtt://{LOOPBACK}:{self.port}"
 
     @property
@@ -121,7 +121,7 @@ class DemoBroker:
         await self._broker.shutdown()
 
     async def _stand_idle(self) -> None:
-        """Until nothing has moved between two looks: what is being handed on shows in no queue."""
+        """Wait until nothing has moved between two checks: a message in transit is in no queue."""
         looks = 0
         while looks < 2:
             await asyncio.sleep(LOOK_S)

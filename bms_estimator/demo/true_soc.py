@@ -25,7 +25,7 @@ class TrueSoc:
     """
 
     missed_reads = 0
-    """It waits for nothing."""
+    """Number of missed reads: always 0."""
 
     def __init__(self, pack: SimulatedPack) -> None:
         self._pack = pack

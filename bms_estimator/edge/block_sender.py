@@ -39,7 +39,7 @@ MIB = 1 << 20
 OVERDUE = 1.5
 """Age at which a block is sent though no sample has completed it, in block lengths."""
 HANDOVER_S = 2.0
-"""At the end: how long what is not sent may still take [s]."""
+"""Time that unsent blocks may take at the end [s]."""
 PARTING_S = 1.0
 """Timeout of a disconnect from the server [s]."""
 

@@ -185,7 +185,10 @@ class BlockStore:
             self._wanted.set()
 
     def _give_up(self, first: int) -> None:
-        """Those from the cursor on cannot be read; where one before them is not safe yet, that waits until a worker asks for them."""
+        """Give up the unreadable blocks from the cursor on.
+
+        If an earlier block is not safe yet, wait until a worker asks for them.
+        """
         if self.oldest >= self._cursor:
             self._drop(first - self._cursor, "blocks on the disk are damaged")
             self._safe = first

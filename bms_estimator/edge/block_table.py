@@ -28,14 +28,14 @@ EDGE_TABLES = (
     CREATE TABLE block (number INTEGER PRIMARY KEY, data BLOB NOT NULL);
     """,
 )
-"""As ``store.migrations.MIGRATIONS``."""
+"""Statements that create the tables, as ``store.migrations.MIGRATIONS``."""
 
 
 class StoreState(NamedTuple):
     """A store and what is in it."""
 
     made_s: int
-    """When it was made [s since 1970]: whole seconds, so that times of its samples lose nothing."""
+    """Creation time [s since 1970]: whole seconds, so that sample times relative to it are exact."""
     next: int
     """Number of the next block."""
     last_s: float
@@ -43,13 +43,13 @@ class StoreState(NamedTuple):
     bytes: int
     """Size of the blocks [bytes]."""
     run: str
-    """Who put the last block ..."""
+    """Identifier of the process that put the last block."""
     taken: int
     """Number of blocks that it had put."""
 
 
 class StoreResult(NamedTuple):
-    """After a transaction."""
+    """State after a transaction."""
 
     kept: StoreState
     oldest: int
@@ -128,7 +128,7 @@ class Read:
     """Creation time of the store [s since 1970]."""
     first: int
     end: int
-    """After the last one."""
+    """Number after the last block."""
     most: int
 
     def __call__(self, connection: sqlite3.Connection) -> Page:

@@ -10,9 +10,9 @@ Times = NDArray[np.float64]
 BAND_S = 1.0
 """Maximum difference between a source's clock and the host's that is not corrected [s]: transport delays vary, too."""
 STEP_S = 10.0
-"""Beyond it a clock was set: what it skipped is a gap [s]."""
+"""Difference of a source's clock beyond which it was set; the skipped time is a gap [s]."""
 SLEW = 0.01
-"""Between the two a source's clock is followed faster or slower by this, relative: no resonator is as wrong."""
+"""Relative rate at which an offset of a source's clock below that is corrected: no resonator is as wrong."""
 WINDOW_S = 600.0
 """Window of the smallest delay [s]: a sample comes late and never early, so that the smallest delay shows a clock's
 lag."""

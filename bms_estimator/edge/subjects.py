@@ -71,7 +71,7 @@ def partition_of(pack: str, partitions: int) -> int:
 
 
 class BlockRequest(BaseModel):
-    """To an edge: all blocks of ``store`` before ``number`` are safe and may be forgotten."""
+    """Message to an edge: all blocks of ``store`` before ``number`` are safe and may be deleted."""
 
     model_config = ConfigDict(frozen=True)
 

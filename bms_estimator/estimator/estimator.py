@@ -24,7 +24,7 @@ from bms_estimator.settings.sampling import BOARD, Sampling
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
 SAMPLE_OUTCOMES = tuple(SampleOutcome)
-"""By value: ``SampleOutcome(value)`` takes nearly as long as the kernel."""
+"""Outcomes by value: ``SampleOutcome(value)`` takes nearly as long as the kernel."""
 IDENTIFIER = IdentifierSettings()
 """Default settings of the identifier."""
 

@@ -1,4 +1,4 @@
-"""From cell file and settings to the filter's record."""
+"""Settings record of the filter from cell file and settings."""
 
 from dataclasses import fields, replace
 

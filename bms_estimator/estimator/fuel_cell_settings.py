@@ -1,4 +1,4 @@
-"""From a fuel cell's file to the record of the law that learns it."""
+"""Settings record of the adaptive law from a fuel cell's file."""
 
 import math
 

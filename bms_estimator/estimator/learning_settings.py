@@ -1,4 +1,4 @@
-"""From typed settings to the records of the learning law."""
+"""Settings records of the adaptive law from typed settings."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -14,7 +14,7 @@ from bms_estimator.settings.pack import Settings
 LARGEST_AH = 2000.0
 """The largest Li-ion cells on sale hold some 1300 Ah [Ah]."""
 CELL_V = 1.5, 4.5
-"""Between these lies the nominal voltage of any Li-ion cell: titanate 2.3 V, NMC 3.7 V [V]."""
+"""Range of the nominal voltage of Li-ion cells [V]: titanate 2.3 V, NMC 3.7 V."""
 SMALL_AH, MANY = 5.5, 8
 """Maximum capacity of a 18650 or 21700 cell [Ah], and number in series beyond which a single row of such cells is
 rare."""

@@ -1,4 +1,4 @@
-"""From typed settings to the kernels' records."""
+"""Settings records of the kernels from typed settings."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -3,7 +3,7 @@
 from pydantic import BaseModel, ConfigDict, Field
 
 HEARTBEAT_S = 1.0
-"""Between two [s]."""
+"""Interval of heartbeats [s]."""
 DEAD_S = 3.0
 """Time without a heartbeat after which a worker counts as dead [s]."""
 
@@ -17,18 +17,18 @@ class Heartbeat(BaseModel):
     started_s: float
     """Wall clock [s since 1970]."""
     leaving: bool = False
-    """It gives its partitions back and ends."""
+    """True while it releases its partitions and ends."""
     partitions: tuple[int, ...] = ()
-    """That it has claimed."""
+    """Claimed partitions."""
     packs: int = 0
-    """In those partitions."""
+    """Number of packs in those partitions."""
     blocks: int = 0
     samples: int = 0
     faults: int = 0
     """Blocks left out for a fault of ours, beside those that ``counters`` has as failed: the log has its traceback."""
     lag_s: float | None = None
-    """From the arrival of a block's last sample at the edge to when the block was taken: the worst since the heartbeat before;
-    None: no block was taken [s]."""
+    """Largest time from the arrival of a block's last sample at the edge to its processing since the last heartbeat
+    [s]; None without a block."""
     counters: dict[str, int] = Field(default_factory=dict)
     """Counters of the partitions by name: resends, gaps, lost blocks, damaged blocks and others."""
     unknown_count: int = 0

@@ -1,4 +1,4 @@
-"""Who hears what is being compiled: a first start takes a minute or two, later ones load it from the cache."""
+"""Callbacks on compilation: a first start takes a minute or two, later ones load kernels from the cache."""
 
 import sys
 from collections.abc import Callable, Iterator

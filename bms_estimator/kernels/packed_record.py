@@ -25,7 +25,7 @@ _WORDS = "f8", "i8", "u8"
 
 @lru_cache(maxsize=64)
 def symmetry_map(dtype: np.dtype[Any]) -> Mirror:
-    """Which words of a record are likely the same: those below the diagonal of a square matrix, as those above.
+    """Return which words of a record are likely equal: those below and above the diagonal of a square matrix.
 
     Raises:
         ValueError: Not all of its fields have whole words, without padding.

@@ -65,7 +65,7 @@ def _bounds(values: dict[str, dict[str, object]]) -> tomlkit.items.Table:
 
 
 def _value(value: object) -> object:
-    """As TOML shows it: rounded; a long list over several lines."""
+    """Format a value as TOML: rounded; a long list over several lines."""
     if isinstance(value, list):
         array = tomlkit.array()
         if value and isinstance(value[0], list):  # a table: one row, one line

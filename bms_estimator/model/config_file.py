@@ -57,7 +57,7 @@ class Strict(BaseModel):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """As pydantic has it, but a number is one: it would take ``true`` for 1 and the text "3_9" for 39."""
+        """Return pydantic's schema with strict numbers: it would accept ``true`` as 1 and the text "3_9" as 39."""
         schema = handler(source)
         _make_strict(schema)
         return schema
@@ -72,7 +72,7 @@ MESSAGES = {
     "model_type": "must be a table, {key = value}",
     "string_pattern_mismatch": "is not of the form that it must have",
 }
-"""By pydantic's kind of error, where its own words are those of a programmer."""
+"""Messages by pydantic's error type, where its own ones are for programmers."""
 
 
 def read_toml(path: Path, model: type[T]) -> T:
@@ -149,7 +149,7 @@ def _discriminator(detail: Any) -> str:
 
 
 def _meant(model: type[BaseModel], keys: list[str]) -> str:
-    """Which key an unknown one may be, or which there are where these are few; empty else."""
+    """Suggest the key that an unknown one may be, or list the keys if they are few; empty otherwise."""
     models = _within(model, keys[:-1])
     known = list(dict.fromkeys(field.alias or name for m in models for name, field in m.model_fields.items()))
     if close := get_close_matches(keys[-1], known, n=1):

@@ -27,7 +27,7 @@ def number(text: str) -> float:
 
 
 def measured(text: str) -> float:
-    """As ``number``; NaN where ``text`` is a word for there being none.
+    """Parse a number as ``number`` does; NaN for a word that stands for a missing one.
 
     Raises:
         ValueError: It is neither.

@@ -131,7 +131,7 @@ class FuelCellModel(Strict):
 
 
 PackModel = CellModel | FuelCellModel
-"""Whatever a pack may be made of."""
+"""Model of a pack."""
 
 
 def load_fuel_cell(name_or_path: str | Path) -> FuelCellModel:

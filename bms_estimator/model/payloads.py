@@ -265,7 +265,7 @@ class Snapshot(NamedTuple):
     """All that a sink may want at one publish time."""
 
     estimate: Estimate | None
-    """None when no sample came in this window."""
+    """Estimate of the window; None without a sample."""
     parameters: ParameterReport
     health: Health
     info: Info

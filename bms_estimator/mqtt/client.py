@@ -109,7 +109,7 @@ class Client(aiomqtt.Client):
         self._why = "the connection broke"
 
     async def publish(self, message: Message) -> PublishRejection | None:  # type: ignore[override]
-        """As ``Connection`` has it."""
+        """Publish as ``Connection`` specifies."""
         if self._most_bytes is not None and HEAD_BYTES + len(message.topic) + len(message.payload) > self._most_bytes:
             # it would end the connection
             return PublishRejection(
@@ -132,7 +132,7 @@ class Client(aiomqtt.Client):
                 self._answers.pop(info.mid, None)
 
     async def subscribe(self, requests: str | None, others: Sequence[str]) -> dict[str, str]:  # type: ignore[override]
-        """As ``Connection`` has it."""
+        """Subscribe as ``Connection`` specifies."""
         topics = [*([requests] if requests else []), *others]
         if self._is_5:
             wanted: Any = [(topic, SubscribeOptions(qos=0, retainAsPublished=topic == requests)) for topic in topics]
@@ -149,7 +149,7 @@ class Client(aiomqtt.Client):
         }
 
     async def receive(self) -> ReceivedMessage:
-        """As ``Connection`` has it."""
+        """Receive as ``Connection`` specifies."""
         try:
             message = await anext(self.messages)
         except aiomqtt.MqttError:
@@ -221,7 +221,7 @@ class Client(aiomqtt.Client):
             super()._on_socket_open(client, userdata, sock)
 
     def _on_socket_register_write(self, client: Any, userdata: Any, sock: socket.socket) -> None:  # noqa: ARG002
-        """As the base has it, which may watch a socket that was closed meanwhile, or another of its number."""
+        """Register the socket as the base class does, unless it was closed meanwhile or its number was reused."""
 
         def watch() -> None:
             if sock.fileno() >= 0:

@@ -26,7 +26,7 @@ class PublishRejection(NamedTuple):
 
     why: str
     is_retryable: bool
-    """It may take the same message later."""
+    """True if the message may be accepted later."""
 
 
 class ConnectOptions(NamedTuple):
@@ -36,7 +36,7 @@ class ConnectOptions(NamedTuple):
     """Client identifier, equal for all connections, so that the broker ends an older one first and publishes its will
     before."""
     will: Message | None
-    """None of who only reads."""
+    """Last will; None for a reader."""
     on_message_lost: Callable[[str, str], None]
     """Hears kind (``too_long``, ``overflow``) and topic of each message that came and was thrown away."""
     most_waiting: int = MOST_WAITING
@@ -49,7 +49,7 @@ class Connection(Protocol):
     """A connection while it lasts; every method raises BrokerConnectionError when it is lost."""
 
     protocol: str
-    """For people: which MQTT is spoken."""
+    """Name of the MQTT version."""
 
     async def subscribe(self, requests: str | None, others: Sequence[str]) -> dict[str, str]:
         """Ask for messages at QoS 0.

@@ -24,4 +24,4 @@ class DeliveryStats:
     corrections: int = 0
     """Availability messages of other clients that were corrected."""
     requests: Counter[str] = field(default_factory=Counter)
-    """By what became of them."""
+    """Number of requests by result."""

@@ -74,7 +74,7 @@ class DeniedTopics:
         self._say_again()
 
     def _say(self, event: str, topic: str, why: str) -> None:
-        """In log and health."""
+        """Report denied topics in log and health."""
         self._show()
         if topic not in self._said:
             self._said.add(topic)

@@ -29,7 +29,7 @@ class BrokerConnector:
 
     @contextlib.asynccontextmanager
     async def __call__(self, broker: Broker, hello: ConnectOptions) -> AsyncIterator[Client]:
-        """As ``Connect`` has it.
+        """Connect as ``Connect`` specifies.
 
         Raises:
             BrokerConnectionError: The broker cannot be reached, or refuses.
@@ -62,7 +62,7 @@ class BrokerConnector:
             raise BrokerConnectionError(f"no answer within {self._patience.connected_s:g} s") from None
 
     def _arguments(self, broker: Broker) -> dict[str, Any]:
-        """For aiomqtt; reads files.
+        """Return the arguments for aiomqtt; reads files.
 
         Raises:
             UserError: One of them cannot be used.

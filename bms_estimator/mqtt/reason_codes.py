@@ -20,7 +20,7 @@ HINTS = {
     151: "the broker allows no more",
     159: "too many connections in a short time",
 }
-"""By code: what it comes from, or what to do."""
+"""Causes and remedies by code."""
 
 FINAL = {
     135,  # not authorised

@@ -71,7 +71,7 @@ class Subscriber:
         self._task: asyncio.Task[None] | None = None
         self._loss_logged_s: float | None = None
         self.lost_messages = 0
-        """That were too long, or came faster than they were read."""
+        """Number of messages that were too long or came faster than they were read."""
 
     @property
     def devices(self) -> Mapping[str, DeviceTopics]:

@@ -33,7 +33,7 @@ class DeviceMessage(NamedTuple):
 
     device: str
     topic: str
-    """Below the device's, such as ``state`` or ``alarm/soc_low``."""
+    """Topic below the device's, such as ``state`` or ``alarm/soc_low``."""
     payload: Any
     """Parsed JSON; text if it is not JSON; None if the topic was cleared."""
 
@@ -45,7 +45,7 @@ class DeviceTopics:
     topics: dict[str, Any] = field(default_factory=dict)
     """Payloads by topic, parsed JSON or text."""
     heard_s: dict[str, float] = field(default_factory=dict)
-    """By topic when that came, seconds since 1970."""
+    """Time of the last message by topic, seconds since 1970."""
     sizes: dict[str, int] = field(default_factory=dict)
     """Sizes of the payloads [bytes]."""
     alarms: set[str] = field(default_factory=set)
@@ -70,7 +70,7 @@ class TopicCache:
     def __init__(self, base_topic: str, left_out: Callable[[str], object] = str) -> None:
         self._root, self._left_out = f"{base_topic}/", left_out
         self.devices: dict[str, DeviceTopics] = {}
-        """By name, in the order in which they were heard first."""
+        """Devices by name, in the order of their first message."""
         self._hidden: set[str] = set()
 
     @property

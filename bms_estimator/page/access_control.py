@@ -1,4 +1,4 @@
-"""Who may see the page: names under which it is asked for, and the token. Pure.
+"""Access control of the page by host name and token. Pure.
 
 A page that others open in the same browser may send it here under a name of theirs (DNS rebinding): so the name must be ours.
 """
@@ -91,7 +91,7 @@ def _token(settings: PageSettings) -> str | None:
 
 
 def _bytes(shown: str) -> bytes:
-    """As they came: what is no UTF-8 in a header, aiohttp hands on as surrogates."""
+    """Return a header as received: aiohttp passes invalid UTF-8 as surrogates."""
     return shown.encode(errors="surrogateescape")
 
 

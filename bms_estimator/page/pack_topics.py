@@ -19,7 +19,7 @@ ALARM = "alarm/"
 ELEMENTS_OVER_SOC = frozenset({"r_s_ohm", "r_ts_ohm", "c_ts_farad", "r_tl_ohm", "c_tl_farad"})
 RECENT_STATES = 600
 RECENT_STEP_S = 1.0
-"""Between the states that are kept for the curves of whoever opens the page later [s]."""
+"""Interval of the states that are kept for the curves of later visitors [s]."""
 MAX_AHEAD_S = 86_400.0
 """Maximum lead of a state's time over the wall clock [s]."""
 SET_BACK_S = 60.0
@@ -153,7 +153,7 @@ class PackTopics(LatestValues):
 
 
 def _columns(rows: Iterable[_Row]) -> dict[str, list[float | None]]:
-    """By name."""
+    """Return the columns by name."""
     found: dict[str, list[float | None]] = {"time_s": [time_s for time_s, _ in rows]}
     return found | {field: [values[i] for _, values in rows] for i, field in enumerate(RECENT_FIELDS)}
 

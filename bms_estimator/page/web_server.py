@@ -24,7 +24,7 @@ WRITE_S = 30.0
 MAX_STREAMS = 32
 """Streams at a time, of all packs together."""
 AGAIN_S = 10.0
-"""Before an address that is taken is tried again [s]."""
+"""Retry interval of an address that is in use [s]."""
 CLOSING_S = 1.0
 
 ASK = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
@@ -42,7 +42,7 @@ class File(NamedTuple):
 
     path: Path
     kind: str
-    """Its media type."""
+    """Media type."""
 
 
 class _Read(NamedTuple):

@@ -3,7 +3,7 @@
 import random
 
 FIRST_RETRY_S = 0.5
-"""Before a missing or lost port is tried again; doubles with each attempt [s]."""
+"""First retry delay of a missing or lost port; it doubles with each attempt [s]."""
 
 LONGEST_RETRY_S = 10.0
 

@@ -11,7 +11,7 @@ from bms_estimator.model.clock import since_boot
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 TIMESYNCD = Path("/run/systemd/timesync/synchronized")
-"""There once systemd-timesyncd has set the clock since the machine was started."""
+"""File that exists once systemd-timesyncd has set the clock since boot."""
 TIME_ERROR = 5
 """Return value of adjtimex(2) while nothing sets the wall clock."""
 TIMEX_BYTES = 512
@@ -20,7 +20,7 @@ TIMEX_BYTES = 512
 
 @dataclass(frozen=True)
 class BootTimestamp:
-    """When something was left that outlives the process, and maybe the machine's being on.
+    """Timestamp that outlives the process, and maybe a reboot.
 
     Attributes:
         wall_s: Wall clock [s since 1970]. Without a battery it stands still while the machine is off.

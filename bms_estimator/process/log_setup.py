@@ -13,7 +13,7 @@ from bms_estimator.settings.pack import LogLevel
 
 LEVELS: tuple[LogLevel, ...] = get_args(LogLevel)
 _levels: dict[str, LogLevel] = {}
-"""By pack."""
+"""Log levels by pack."""
 
 
 def configure_logs(lines: MutableSequence[str] | None = None) -> None:
@@ -43,7 +43,7 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
 
 @contextlib.contextmanager
 def flush_logs() -> Iterator[None]:
-    """In the end the log is written before what the command line says of an error."""
+    """Write the log before the command line prints an error."""
     try:
         yield
     finally:

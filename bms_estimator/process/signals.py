@@ -42,7 +42,7 @@ def startup_signals() -> Iterator[None]:
 
 
 def _end(*_: object) -> None:
-    """Not by an exception, which the compiler would lose; in a thread, as the log may be held by what was interrupted."""
+    """End the process without an exception, which the compiler would lose; in a thread, because the interrupted code may hold the log's lock."""
 
     def end() -> None:
         log.info("asked to end before samples were taken")

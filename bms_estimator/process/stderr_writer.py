@@ -54,4 +54,4 @@ class Stderr:
 
 
 stderr = Stderr()
-"""That of this process."""
+"""Writer of this process."""

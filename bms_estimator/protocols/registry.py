@@ -37,7 +37,7 @@ class Sensor(Protocol):
 
     @property
     def protocol(self) -> str:
-        """One of ``PROTOCOLS``."""
+        """Name of the protocol, one of ``PROTOCOLS``."""
 
     @property
     def current_sign(self) -> CurrentSign:

@@ -44,7 +44,7 @@ def errata(s: Simulation) -> list[Erratum]:
 
 
 def table(s: Simulation) -> Table:
-    """As a table of the report."""
+    """Return a table of the report."""
     rows = tuple((f"E{n}", e.where, e.says, e.holds) for n, e in enumerate(errata(s), 1))
     return Table(
         "Errata",

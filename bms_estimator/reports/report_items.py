@@ -21,7 +21,7 @@ class Reproduction(Enum):
     GIVEN = "given"
     """Input data, a diagram or a photograph: there is nothing to compute."""
     ADDED = "added"
-    """Not in the thesis."""
+    """Label of an item that is not in the thesis."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from bms_estimator.reports.procedure import Capture, Kind
 VOLTAGE_RANGE_V = 30.0
 """Range of the divider [V]. The thesis's 0-25 V sensor would saturate: the curve of Table 8 begins at 25.40 V."""
 CURRENT_RANGE_A = 20.0
-"""From -10 to +10 A."""
+"""Range of the current sensor, -10 to +10 A [A]."""
 MEAN_VOLTAGE_V = 23.0
 """Mean voltage of the pack over a discharge [V], which converts the bulb's mean current to a resistance."""
 QUARTER_HOUR_S = 900.0

@@ -34,7 +34,7 @@ CURRENT_A = 0.275
 SMALL_CURRENT_A = 0.0275
 """C/10, for step 2: Algorithm 1 asks for a very small current; the thesis does not print the one it used."""
 R_S_CURRENTS_A = (0.1, 0.275, 0.55)
-"""For (4.2); the thesis's own are not printed."""
+"""Currents for (4.2) [A]; the thesis does not print its own."""
 LOWEST_SOC = 0.05
 """Errors over SOC are taken from here to 1: below, the elements run off (E14)."""
 SOC_GRID = np.linspace(LOWEST_SOC, 1.0, 951)
@@ -107,7 +107,7 @@ def discharge(cell: CellModel, current_a: float, step_s: float, first_s: Floats 
 
 
 def observer_settings(law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> ObserverSettings:
-    """As the thesis prints it: no dead zone, no fresh start of k; the sign of N is E1's."""
+    """Return the settings as printed: no dead zone, no restart of k; the sign of N by erratum 1."""
     printed_law = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "epsilon_v": ROUNDED_EPSILON_V}
     return ObserverSettings.model_validate(printed_law | {"lambda": lambda_, "alpha": alpha})
 

@@ -24,7 +24,7 @@ from bms_estimator.reports.simulation import (
 C_RATES = (1.0, 0.1, 0.01)
 """The smallest is a hundred hours from full to empty."""
 SAMPLES = 100_000
-"""In each run, from full to empty."""
+"""Samples of each run, from full to empty."""
 SETTLED_FROM_S = 60.0
 """Tracking is judged from here on [s]."""
 

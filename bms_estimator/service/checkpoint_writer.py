@@ -1,4 +1,4 @@
-"""When the state is saved: with the first sample, as the SOC moves, once in a while, and at the end."""
+"""Writer of checkpoints: with the first sample, as the SOC moves, at intervals, and at the end."""
 
 import asyncio
 import math
@@ -110,7 +110,7 @@ class CheckpointWriter:
         return RunCounters(self._restarts, self._tally.total, clean, self._publisher.watch.alarms.kept)
 
     async def _write_with(self, ledger: RunCounters, write: Callable[[], None]) -> bool:
-        """As ``_write``; then the disk has the alarms, too."""
+        """Write as ``_write`` does; then the alarms are on disk, too."""
         written = await self._write(write)
         if written:
             self._alarms = ledger.alarms

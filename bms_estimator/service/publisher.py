@@ -130,7 +130,7 @@ class Publisher:
 
     @property
     def wait_s(self) -> float:
-        """Until a snapshot is overdue, which tells that no samples come [s]."""
+        """Return the time until a snapshot is overdue, which shows that no samples come [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
     def add(self, block: SampleBlock, trace: TraceBlock) -> None:

@@ -1,4 +1,7 @@
-"""From ``[alarms]`` and the cell to what is watched: each alarm with its limit, and where it ends. docs/alarms.md has the sources."""
+"""Monitored alarms from ``[alarms]`` and the cell: each with its limit and the level at which it ends.
+
+Sources are in docs/alarms.md.
+"""
 
 import math
 from collections.abc import Iterator
@@ -46,7 +49,7 @@ class AlarmDefinition(NamedTuple):
     """Raised from ``limit`` on upwards, and else downwards."""
     limit: float
     clear: float
-    """It ends beyond; where this is ``limit`` there is no hysteresis."""
+    """Level at which it ends; equal to ``limit`` without hysteresis."""
     delay_s: float
     clear_delay_s: float
     latch: bool
@@ -115,7 +118,7 @@ def _silent_s(settings: Settings) -> float:
 
 
 def charging_a(cell: PackModel) -> float:
-    """From this current into the pack on it is charged [A]."""
+    """Minimum charge current [A]."""
     of = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
     return LEAST_CHARGE * of
 
@@ -147,7 +150,7 @@ def _out_of_range(alarms: tuple[AlarmDefinition, ...], cell: PackModel) -> Itera
 
 
 def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDefinition | None:
-    """None: it is switched off, or has no limit."""
+    """Return the monitored alarm; None if it is switched off or has no limit."""
     told = rule.model_dump(exclude_none=True)
     key = next((key for key in type(rule).model_fields if key.startswith("limit")), "limit")
     limit = told.get(key, default.limit)
@@ -170,7 +173,7 @@ def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDefini
 
 
 def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
-    """By alarm; a fuel cell has no SOC, no chemistry, and stands no charge."""
+    """Return the defaults by alarm; a fuel cell has no SOC and no chemistry, and must not be charged."""
     n = cell.cell.series_count
     common: dict[AlarmName, _Default] = {
         "over_temperature": _Default(60.0, 55.0, "°C"),

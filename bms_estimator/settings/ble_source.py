@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from bms_estimator.settings.polled_source import PolledSource
 
 STEP_V, STEP_A = 0.01, 0.01
-"""As JBD has them [V, A]; JK is finer, the current of Daly has steps of 0.1 A."""
+"""Resolution of JBD [V, A]; JK is finer, the current of Daly has steps of 0.1 A."""
 
 
 class BleSource(PolledSource):
@@ -33,12 +33,12 @@ class BleSource(PolledSource):
 
     @property
     def period_s(self) -> float:
-        """Between two samples, as expected [s]."""
+        """Expected time between two samples [s]."""
         return self.poll_s
 
     @property
     def described(self) -> str:
-        """For people, in a few words."""
+        """Description in a few words."""
         return f"BMS {self.address or self.name} over Bluetooth"
 
     @property

@@ -132,12 +132,12 @@ class CanSource(PolledSource):
 
     @property
     def period_s(self) -> float:
-        """Between two samples, as expected [s]."""
+        """Expected time between two samples [s]."""
         return self.interval_s
 
     @property
     def described(self) -> str:
-        """For people, in a few words."""
+        """Description in a few words."""
         return f"CAN {self.interface} {self.channel}"
 
     @property

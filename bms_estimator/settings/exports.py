@@ -50,7 +50,7 @@ class PrometheusSettings(Strict):
 
     @property
     def host(self) -> str:
-        """Without brackets."""
+        """Host without brackets."""
         return self.listen.rpartition(":")[0].strip("[]")
 
     @property

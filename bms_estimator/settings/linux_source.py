@@ -44,12 +44,12 @@ class LinuxSource(PolledSource):
 
     @property
     def period_s(self) -> float:
-        """Between two samples, as expected [s]."""
+        """Expected time between two samples [s]."""
         return self.interval_s or 1.0
 
     @property
     def described(self) -> str:
-        """For people, in a few words."""
+        """Description in a few words."""
         return f"{self.chip} of this machine"
 
     @property

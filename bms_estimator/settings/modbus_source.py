@@ -125,12 +125,12 @@ class ModbusSource(PolledSource):
 
     @property
     def period_s(self) -> float:
-        """Between two samples, as expected [s]."""
+        """Expected time between two samples [s]."""
         return self.poll_s
 
     @property
     def described(self) -> str:
-        """For people, in a few words."""
+        """Description in a few words."""
         where = f"{self.host}:{self.tcp_port}" if self.port is None else self.port
         return f"Modbus unit {self.unit} at {where}"
 

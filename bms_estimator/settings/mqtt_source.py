@@ -19,7 +19,7 @@ UNITS: Mapping[str, tuple[Unit, ...]] = {
     "cells": ("V", "mV"),
     "time": ("s", "ms", "iso"),
 }
-"""By quantity: what it may come in; the first is meant where nothing is said."""
+"""Units by quantity; the first one is the default."""
 LINEAR: Mapping[Unit, tuple[float, float]] = {
     "mV": (1e-3, 0.0),
     "mA": (1e-3, 0.0),
@@ -155,12 +155,12 @@ class MqttSource(PolledSource):
 
     @property
     def period_s(self) -> float:
-        """Between two samples, as expected [s]."""
+        """Expected time between two samples [s]."""
         return self.interval_s
 
     @property
     def described(self) -> str:
-        """For people, in a few words."""
+        """Description in a few words."""
         who = self.profile or (self.topics(self.voltage)[0] if self.voltage else "")
         return f"{who} {self.prefix or ''}".strip() + " by MQTT"
 

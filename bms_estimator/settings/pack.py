@@ -33,7 +33,7 @@ DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
 
 
 class PackSettings(Strict):
-    """Which cells, how many, and where to begin."""
+    """Cells of the pack, their number, and the initial SOC."""
 
     name: DeviceName = Field(default="pack", description="device in topic names: letters, digits, _ and -")
     cell: Annotated[str, Field(min_length=1)] = Field(
@@ -114,7 +114,7 @@ class Settings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _law_that_learns(cls, tables: object) -> object:
-        """Without the identifier the printed law has its bounds alone: there the one that learns is the default (docs/comparison.md)."""
+        """Select the default law: without the identifier it is the adaptive law that learns, because the printed law has only its bounds (docs/comparison.md)."""
         if not isinstance(tables, dict):
             return tables
         identifier, observer = tables.get("identifier"), tables.get("observer", {})

@@ -15,12 +15,12 @@ class PolledSource(Strict):
 
     @property
     def period_s(self) -> float:
-        """Between two samples, as expected [s]: values are fresh for three of them."""
+        """Expected time between two samples [s]; values are fresh for three of them."""
         raise NotImplementedError
 
     @property
     def described(self) -> str:
-        """For people, in a few words."""
+        """Description in a few words."""
         raise NotImplementedError
 
     @property

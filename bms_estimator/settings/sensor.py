@@ -83,5 +83,5 @@ class SensorSettings(Strict):
 
     @property
     def sample_period_s(self) -> float:
-        """Between two samples [s]."""
+        """Time between two samples [s]."""
         return self.period_s or 1.0 / self.sample_rate_hz

@@ -25,7 +25,7 @@ class Measured:
 
 
 Answers = Mapping[bytes, Callable[[Measured], bytes]]
-"""By the question."""
+"""Responses by query."""
 
 
 def _steps(value: float, per_unit: float, least: int, most: int) -> int:
@@ -132,6 +132,6 @@ BMS_ANSWERS: Mapping[str, Answers] = {
     "jk": {jk.OLD_QUESTION: _jk_old},
     "jk-pb": {jk.question(PACK): _jk_newer},
 }
-"""By protocol; ``jk`` and ``jk-pb`` are the two families of JK."""
+"""Responses by protocol; ``jk`` and ``jk-pb`` are the two families of JK."""
 MOST_CELLS = 32
 """No protocol has room for more in all its frames."""

@@ -15,7 +15,7 @@ HEARD_BYTES = 64
 MISSING_BYTES = 5
 """Length of a truncated response [bytes]."""
 SPREAD_V = 0.004
-"""Its cells differ by up to this from their mean [V]."""
+"""Maximum deviation of a cell from the mean [V]."""
 
 
 class BmsFault(Enum):

@@ -157,7 +157,7 @@ class SimulatedJunctek(SimulatedMeter):
         return b":r50=1,%d,%s,\r\n" % (sum(values) % 255 + 1, ",".join(map(str, values)).encode())
 
     def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:
-        """To ``:R50=1,``."""
+        """Respond to ``:R50=1,``."""
         *lines, rest = heard.split(b"\n")
         asked = sum(line.startswith(b":R50=1,") for line in lines)
         return asked * self.message(reading), len(heard) - len(rest)
@@ -188,7 +188,7 @@ class SimulatedPylontech(SimulatedMeter):
         return _table("pwr", [head, row + "   Normal   Normal   50%      2026-01-01 00:00:00", *absent])
 
     def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:
-        """To ``pwr`` and ``bat 1``."""
+        """Respond to ``pwr`` and ``bat 1``."""
         *lines, rest = heard.replace(b"\r", b"\n").split(b"\n")
         said = b"".join(self._command(line.decode("ascii", "replace").strip(), reading) for line in lines)
         return said, len(heard) - len(rest)
@@ -226,4 +226,4 @@ METERS: Mapping[str, Callable[[Signal, float], SimulatedMeter]] = {
     "junctek": lambda signal, speed: SimulatedJunctek(signal, speed=speed),
     "pylontech": lambda signal, speed: SimulatedPylontech(signal, speed=speed),
 }
-"""By ``sensor.protocol``."""
+"""Simulated meters by ``sensor.protocol``."""

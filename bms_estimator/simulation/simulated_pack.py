@@ -58,7 +58,7 @@ LOADS: dict[LoadName, Callable[[float, int], Load]] = {
     LoadName.PULSE: pulses,
     LoadName.RANDOM: random_steps,
 }
-"""By name: from the current [A] and a seed."""
+"""Loads by name, made from the current [A] and a seed."""
 
 
 class SimulatedPack:

@@ -208,7 +208,7 @@ class VirtualBoard:
         await self.run()
 
     async def _drain(self) -> None:
-        """Until the line has taken all."""
+        """Wait until the line has taken all bytes."""
         while self._line:
             self._drained.clear()
             await self._drained.wait()

@@ -147,7 +147,7 @@ def _lines(trace: NDArray[np.void]) -> bytes:
 
 
 def _lines_by_arrow(trace: NDArray[np.void]) -> bytes:
-    """As ``_lines``."""
+    """Write lines as ``_lines`` does."""
     import pyarrow as pa  # noqa: PLC0415 - optional
     from pyarrow import csv  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""Which source ``[source]`` asks for. A kind is one file here and a row in ``KINDS``; it is imported when it is asked for."""
+"""Factory of sources. A kind is one file here and a row in ``KINDS``; it is imported when it is needed."""
 
 import importlib
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ KINDS: Mapping[str, str] = {
     "can": "fieldbus.can",
     "ble": "bluetooth.source",
 }
-"""By ``source.kind``: a module of this package whose ``bringer(settings)`` makes what brings the values."""
+"""Modules by ``source.kind``, whose ``bringer(settings)`` makes the line producer."""
 
 
 def make_line_producer(settings: Settings) -> LineProducer | None:

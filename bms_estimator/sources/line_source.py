@@ -134,7 +134,7 @@ class LineSource:
         return self._decoder.clock_ppm
 
     current_zero: None = None
-    """There is no zero to be set."""
+    """Function that sets the zero of the current; None: lines have no such command."""
     relay: None = None
     """Nor is there a relay."""
 

@@ -21,7 +21,7 @@ WAITING_MINUTES = 2 * MINUTES_A_DAY
 """Maximum number of rows in memory while the disk cannot be written."""
 WAITING_EVENTS = 1000
 MOST_EVENTS = 50_000
-"""In the database: a line that comes and goes each second must not fill the disk."""
+"""Maximum number of events in the database, so that a flapping line does not fill the disk."""
 
 Row = TypeVar("Row")
 

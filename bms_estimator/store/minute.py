@@ -9,7 +9,7 @@ from bms_estimator.model.payloads import Estimate
 
 MINUTE_S = 60
 LONGEST_S = 30.0
-"""Between two publications; longer may be a gap, over which no charge is counted [s]."""
+"""Longest interval between two publications that is not a gap; over a gap no charge is counted [s]."""
 GAP_RATIO = 3.0
 """An interval counts as a gap if it is this many times as long as the one before, so that a slow source has none."""
 
@@ -18,7 +18,7 @@ class Minute(NamedTuple):
     """One row of history; None for missing values. Means and extremes are over published values."""
 
     time_s: int
-    """Its begin [s since 1970]."""
+    """Beginning of the minute [s since 1970]."""
     voltage_v: float
     voltage_min_v: float
     voltage_max_v: float

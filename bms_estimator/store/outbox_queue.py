@@ -19,7 +19,7 @@ PAGE = 1000
 
 
 LOWEST = -(1 << 62)
-"""Below all numbers, here and on disk."""
+"""Number below all others, here and on disk."""
 
 
 @dataclass
@@ -106,7 +106,7 @@ class Queue:
         ]
 
     def writing(self, rows: Iterable[QueuedMessage]) -> None:
-        """From now on these may be on disk."""
+        """Record that these messages may be on disk from now on."""
         self._written.update(waiting.number for waiting in rows)
 
     def wrote(self) -> None:

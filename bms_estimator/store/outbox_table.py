@@ -65,7 +65,7 @@ class OutboxTransaction:
     gaps: list[tuple[int, int]]
     """Ranges to remove: from each number up to but excluding the second one."""
     rows: list[QueuedMessage]
-    """To be written; what is there already is replaced."""
+    """Rows to write; existing ones are replaced."""
     page: int
     """Maximum number of the oldest messages that are read from disk."""
     recount: bool

@@ -37,7 +37,7 @@ class Steps:
     _longest_s: float = 0.0
     """Longest recent step [s]."""
     _longest_at_s: float = -math.inf
-    """When a step of about this length was last seen [s]."""
+    """Time at which a step of about this length was last seen [s]."""
 
     def of(self, times_s: Floats) -> tuple[Floats, Floats]:
         """Shape (n,) each: the time before each sample [s], 0 where the clock was set back; and 0 in gaps, too."""

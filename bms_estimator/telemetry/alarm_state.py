@@ -11,7 +11,7 @@ from bms_estimator.settings.alarm_limits import AlarmDefinition
 
 
 class RaisedAlarm(NamedTuple):
-    """When an alarm was raised, and at what."""
+    """Time and value at which an alarm was raised."""
 
     since_s: float
     """Wall clock [s since 1970]."""
@@ -19,12 +19,12 @@ class RaisedAlarm(NamedTuple):
 
 
 class AlarmTransition(NamedTuple):
-    """That an alarm was raised, or ended."""
+    """Start or end of an alarm."""
 
     at_s: float
     """On the samples' clock [s]."""
     raising: RaisedAlarm | None
-    """None: it has ended."""
+    """Raised alarm; None: it has ended."""
 
 
 @dataclass
@@ -49,7 +49,7 @@ class AlarmState:
     _missing_s: float = 0.0
     """Time without values since the last value [s]."""
     _held_s: float | None = None
-    """For how long what leads to the next state has held [s]; None: it does not."""
+    """Time for which the condition of the next state has held [s]; None: it does not hold."""
 
     def take(self, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float) -> list[AlarmTransition]:
         """Take values as they came.

@@ -29,7 +29,7 @@ SENSOR_SUSPECTS = (
 )
 MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
 ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
-"""These are watched before anything was measured."""
+"""Alarms that are monitored before anything was measured."""
 INPUTS = "inputs"
 """Key of the saved state of measured quantities, beside the alarms' names."""
 SILENCE = "silence"

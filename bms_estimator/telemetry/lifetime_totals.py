@@ -53,7 +53,7 @@ class LifetimeTotals:
         return self._meter.flow
 
     def run(self, block: SampleBlock) -> TraceBlock:
-        """As ``Estimator.run``."""
+        """Run the estimator as ``Estimator.run`` does."""
         s = self.estimator.state
         before_s, step_s, gaps = float(s["time_s"][0]), float(s["step_s"][0]), int(s["gaps"][0])
         trace = self.estimator.run(block)

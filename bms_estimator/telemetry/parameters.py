@@ -167,7 +167,7 @@ def _bias(learned: IdentifiedValue, limit: float, setting: str, now_s: float) ->
 
 
 def _is_data_driven(estimator: Estimator) -> np.ndarray:
-    """Which of a1..a15 data have led away from the configured: the learning law, else the fit that (3.18) follows."""
+    """Return which of a1..a15 data have moved from the configured values: by the adaptive law, else by the fit that (3.18) follows."""
     state, settings = estimator.state[0], estimator.settings_record[0]
     if settings["learning"]["enabled"]:
         return np.asarray(state["a"] != settings["learning"]["file"])

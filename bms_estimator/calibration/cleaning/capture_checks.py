@@ -17,7 +17,7 @@ STEP_S = 3.0
 LEAST_STEPS = 5
 """Fewer steps do not tell the sign."""
 LONG_REST_S = 300.0
-"""After such a rest the voltage is near the OCV [s]."""
+"""Length of a rest after which the voltage is near the OCV [s]."""
 SOC_OFF, VOLTAGE_OFF_V = 0.1, 0.1
 """A rested voltage this far off the OCV at the counted SOC, in SOC and per cell in volts, cannot be the model's error."""
 GAP_STEPS, GAP_CHARGE = 10.0, 0.01

@@ -14,7 +14,7 @@ MOST_BACK = 0.1
 LEAST_GOOD = 0.5
 """Minimum fraction of good voltages; below it the faulty ones cannot be recognized."""
 REST_CURRENT_C = 0.01
-"""Below this C-rate a cell rests [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
+"""Maximum current of a rest [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
 NOISE_STDS, NOISE_STEP_C = 6.0, 0.1
 """A current within this many standard deviations of its noise is zero. Changes from sample to sample below this
 C-rate are noise [1/h]."""
@@ -73,7 +73,7 @@ def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float
 
 
 def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
-    """Which samples belong to a rest; blips of the current sensor do not end one."""
+    """Return which samples belong to a rest; short glitches of the current sensor do not end one."""
     resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
     time_s = good["time_s"]
     for first, last in true_runs(~resting):
@@ -85,7 +85,7 @@ def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
 
 
 def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
-    """Below this a cell rests: a small C-rate, or what the sensor's noise reaches, but never half a load [A]."""
+    """Return the maximum current of a rest [A]: a small C-rate, or the sensor's noise, but never half a load."""
     change_a = np.diff(current_a)
     small_a = change_a[np.abs(change_a) < NOISE_STEP_C * capacity_ah]
     noise_a = float(np.sqrt(np.mean(small_a**2) / 2.0)) if small_a.size else 0.0

@@ -43,7 +43,7 @@ def curve(cell: CellModel, column: str) -> tuple[Floats, Floats]:
 def scaled_generic_ladder(
     generic: CellModel, rests: InitialElements | None, temperature_c: float = REFERENCE_C
 ) -> Ladder:
-    """Its resistances over SOC, each as large as rests say; their growth in the cold and towards empty is no rest's to tell.
+    """Return the generic resistances over SOC, scaled to those of the rests. Rests do not show growth in the cold and near empty.
 
     Args:
         generic: Of ``nearest_generic_cell``.

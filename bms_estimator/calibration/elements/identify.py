@@ -139,7 +139,7 @@ class Run:
     soc: Floats
     temperature_c: Floats
     miscount: float = 0.0
-    """By how much more charge was moved than the capture says, relative; ``soc`` counts it."""
+    """Additional charge moved beyond the capture's, relative; ``soc`` includes it."""
 
     def recounted(self, more: float) -> "Run":
         """Return a copy whose miscount is larger by ``more``."""
@@ -347,7 +347,7 @@ def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: 
 
 
 def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
-    """With the charge that each capture's knees tell it has moved."""
+    """Return the captures with the charge that their knees show."""
     for _ in range(COUNT_PASSES):
         miscounts = _Candidate(runs, cell, refine_ocv=refine_ocv).miscounts()
         runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
@@ -368,7 +368,7 @@ def _temperature_range(runs: list[Run]) -> tuple[float, float]:
 
 
 def _at_nodes(ladder: Ladder) -> Floats:
-    """Its weak and strong part at ``SOC_NODES``, shape (2, RESISTANCES, SOC_NODES.size) [ohm]."""
+    """Return the weak and strong part at ``SOC_NODES``, shape (2, RESISTANCES, SOC_NODES.size) [ohm]."""
     parts = ladder.weak_ohm, ladder.strong_ohm
     return np.array([[np.interp(SOC_NODES, ladder.soc, ohm) for ohm in part] for part in parts])
 

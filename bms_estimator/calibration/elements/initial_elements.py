@@ -47,7 +47,7 @@ class InitialElements:
 
     @property
     def sections(self) -> dict[str, Resistance | Capacitance]:
-        """As the sections of a cell file."""
+        """Return the sections of a cell file."""
         return {
             "r_ts": _resistance(self.r_ts_ohm),
             "r_tl": _resistance(self.r_tl_ohm),

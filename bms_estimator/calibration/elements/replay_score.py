@@ -15,13 +15,13 @@ from bms_estimator.model.sample import SAMPLE
 CUTS = (0.2, 0.5)
 """Parts of the charge moved after which a replay begins."""
 WRONG_SOC = (-0.2, 0.2)
-"""By how much its first SOC is wrong."""
+"""Errors of the initial SOC."""
 SETTLED_S = 900.0
 """Time after the start from which on a replay is scored [s]."""
 LEAST_S = 900.0
 """Minimum scored time [s]."""
 LOWEST_SOC = 0.05
-"""Below it nothing is judged."""
+"""Minimum scored SOC."""
 OUTSIDE = 40.0
 """Weight of what lies outside a band of 95 %."""
 

@@ -47,7 +47,7 @@ class ChenMoraFit:
 
     @property
     def ocv(self) -> ChenMoraOcv:
-        """As the ``[ocv]`` section of a cell file."""
+        """Return the ``[ocv]`` section of a cell file."""
         a16, a17, a18, a19, a20, a21 = (float(a) for a in self.a)
         return ChenMoraOcv(amplitude_v=a16, exponent=a17, constant_v=a18, linear_v=a19, quadratic_v=a20, cubic_v=a21)
 

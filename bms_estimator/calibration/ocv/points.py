@@ -20,7 +20,7 @@ long for each ``DOUBLING_K``."""
 COLD_OWN = 0.3
 """Part of it that is not alike in all sources."""
 LONG_REST_S = 3600.0
-"""From this length of rest on the cold part falls with it [s]."""
+"""Length of rest beyond which its cold error decreases with the length [s]."""
 AFTER_CHARGE_V = 0.005
 """Standard deviation that hysteresis gives a rest after charge when its size is not known, per cell in series [V]."""
 LEAST_SPAN = 0.3

@@ -44,7 +44,7 @@ LEAST_STD_V = 5e-4
 NEAR_FULL, NEAR_EMPTY = 0.995, 0.02
 """SOC from which a first sample counts as full, below which a last one counts as empty."""
 LEAST_POINTS = 6
-"""As many as (2.10) has parameters."""
+"""Minimum number of points: the number of parameters of (2.10)."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ POINT_V, POINT_SOC = 1e-3, 0.002
 PAIR_V, PAIR_PART = 1.5e-3, 0.1
 """Systematic error of the mean of a paired curve per cell in series [V], and as a fraction of the half difference."""
 ALONE_PART = 0.5
-"""That fraction for an unpaired curve, whose difference is known in the middle only."""
+"""Fraction for an unpaired curve, whose difference is known in the middle only."""
 TURN = 0.03
 """SOC within which a charge that ends early, at its highest voltage, is not the mean's other half."""
 LONE_V = 0.01
@@ -84,7 +84,7 @@ class SlowBranch:
     whole: bool
 
     def label(self, capacity_ah: float) -> str:
-        """Such as C/20 discharge."""
+        """Return a description such as C/20 discharge."""
         return f"C/{capacity_ah / self.current_a:.0f} {'charge' if self.charge else 'discharge'}"
 
 

@@ -93,7 +93,7 @@ class TableFit:
         return np.asarray(np.interp(soc, self.soc, self.error_v))
 
     def table(self, hysteresis_v: Floats | None = None, hysteresis_std_v: Floats | float = 0.0) -> TableOcv:
-        """As the ``[ocv]`` section of a cell file.
+        """Return the ``[ocv]`` section of a cell file.
 
         Args:
             hysteresis_v: At the nodes [V]; None: not known.

@@ -19,7 +19,7 @@ KNEE_SLOPE = 5.0
 
 @dataclass(frozen=True)
 class AveragingWindow:
-    """From when to when (3.19) averages, and why there.
+    """Interval over which (3.19) averages, and its reasons.
 
     Attributes:
         t_int_s: From here the error stays small [s].
@@ -102,7 +102,7 @@ def _settled_from(a: Floats) -> int:
 
 
 def _unstable_from(time_s: Floats, voltage_v: Floats, margin: Floats) -> tuple[float, str]:
-    """When the battery becomes unstable [s], and what says so."""
+    """Return the time at which the battery becomes unstable [s], and the reason."""
     candidates = [(float(time_s[-1]), "end of the run")]
     if (margin <= 0.0).any():
         candidates.append((float(time_s[int(np.argmax(margin <= 0.0))]), "SOC reached max(delta1, delta2)"))

@@ -56,7 +56,7 @@ class Prediction:
 
     @property
     def mean_percent(self) -> float:
-        """As in Table 11 [%]."""
+        """Mean error as in Table 11 [%]."""
         return float(self.error_percent.mean())
 
     @property

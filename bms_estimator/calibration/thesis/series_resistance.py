@@ -66,7 +66,7 @@ class SeriesResistanceFit:
 
     @property
     def element(self) -> Resistance:
-        """As the ``[r_s]`` section of a cell file, whose values must be above 0."""
+        """Return the ``[r_s]`` section of a cell file, whose values must be above 0."""
         a13, a14, a15 = (max(float(a), 1e-9) for a in self.a)
         return Resistance(amplitude_ohm=a13, exponent=a14, offset_ohm=a15)
 

@@ -42,7 +42,7 @@ class Raised:
     severity: str
     raised_s: float
     ended_s: float | None
-    """None: it is active at the end."""
+    """Time of its end; None: active at the end."""
     latched: bool
     """True if its cause has ended but it waits for acknowledgment."""
     value: float | None

@@ -134,7 +134,7 @@ async def _replay(settings: Settings, cell: PackModel, source: Replay, table: Ta
 async def _publisher(
     stack: AsyncExitStack, settings: Settings, cell: PackModel, estimator: Estimator, source: Replay
 ) -> Publisher | None:
-    """Who publishes, when there is a broker."""
+    """Return the publisher, if there is a broker."""
     if settings.mqtt is None:
         return None
     delivery = DeliveryStats()

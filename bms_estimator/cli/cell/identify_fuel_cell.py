@@ -108,7 +108,7 @@ def _source(
 
 
 def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floats) -> NDArray[np.bool_]:
-    """Which points such a stack can give, shape (n,).
+    """Return which points such a stack can give, shape (n,).
 
     Raises:
         UserError: Most have another sign, or too few are left.

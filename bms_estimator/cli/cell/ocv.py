@@ -286,7 +286,7 @@ def _elements(generic: CellModel, found: OcvSources, recordings: list[Recording]
 def _cell(
     name: str, series_count: int, fit: ChenMoraFit | TableFit, found: OcvSources, recordings: list[Recording]
 ) -> dict[str, object]:
-    """Its section with limits of what a good sample is, and that of its open-circuit voltage."""
+    """Return the cell's section with limits of a good sample, and its OCV section."""
     middle_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
     lowest_v = float(fit(np.array([0.0]))[0])
     largest_a = max((float(np.nanmax(np.abs(one.samples["current_a"]))) for one in recordings), default=0.0)

@@ -164,7 +164,7 @@ def _write_results(path: Path, found: Sequence["ReidentificationResult"]) -> Non
 
 
 def _table(found: Sequence["ReidentificationResult"]) -> Table:
-    """Before and after, for people."""
+    """Return a table of the values before and after."""
     table = Table(box=box.SIMPLE_HEAD)
     for column in ("pack", "hours", "Ah", "R_s [mohm]", "RMS [mV]", "", "why not"):
         table.add_column(column, justify="left" if column in ("pack", "", "why not") else "right")

@@ -77,7 +77,7 @@ def user(
 
 
 def _settings(path: Path | None, **given: str | None) -> FleetSettings:
-    """With what the command line says of the server.
+    """Return the settings with the server's options of the command line.
 
     Raises:
         UserError: It cannot be.
@@ -129,7 +129,7 @@ def _has_port(host: str) -> bool:
 
 
 def _accounts(settings: FleetSettings, place: NodeLocation) -> Accounts | None:
-    """Who may connect; keys are made on the first node alone.
+    """Return the accounts; keys are made on the first node only.
 
     Raises:
         UserError: Another node has no claims yet.

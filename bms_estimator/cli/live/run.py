@@ -59,7 +59,7 @@ def run(
 
 
 def _told(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
-    """With what the command line says."""
+    """Return the settings with the command line's options."""
     if mqtt:
         settings = with_broker(settings, mqtt)
     return with_sensor(settings, port=port)

@@ -90,7 +90,7 @@ def simulate(
 
 
 def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int) -> SimulatedBms:
-    """With a cell for each in series.
+    """Make a simulated BMS with one cell for each in series.
 
     Raises:
         UserError: Not enough room for them.
@@ -110,7 +110,7 @@ def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int
 
 
 async def _serve(board: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: float) -> None:
-    """Until ``seconds`` are over, or SIGINT or SIGTERM."""
+    """Serve until ``seconds`` are over, or SIGINT or SIGTERM."""
     stop = stop_on_signal()
     with board:
         typer.echo(board.path)

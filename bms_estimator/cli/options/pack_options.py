@@ -1,4 +1,4 @@
-"""From a pack's file and what the command line says on top of it to settings and cell."""
+"""Settings and cell from a pack's file and the command line."""
 
 from pathlib import Path
 

@@ -15,7 +15,7 @@ DESKTOP = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
 def page_settings(settings: PageSettings, **given: Any) -> PageSettings:
-    """With what the command line says.
+    """Return the settings with the page's options of the command line.
 
     Raises:
         UserError: It cannot be.

@@ -21,7 +21,7 @@ _SIGNS = {Gt: ("gt", "above"), Ge: ("ge", "at least"), Lt: ("lt", "below"), Le: 
 
 
 Given = Mapping[str, Mapping[str, object]]
-"""By section and key."""
+"""Values by section and key."""
 
 
 def settings_file(model: type[BaseModel], given: Given = MappingProxyType({})) -> str:
@@ -99,7 +99,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _sentence(text: str | None) -> str:
-    """With a full stop."""
+    """Append a full stop."""
     return f"{(text or '').rstrip('.')}."
 
 

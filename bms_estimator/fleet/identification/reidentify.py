@@ -300,5 +300,5 @@ def _in_a_line(error: Exception) -> str:
 
 
 def _r_s(cell: CellModel) -> float:
-    """At SOC 0.5 [ohm]."""
+    """Return R_s at SOC 0.5 [ohm]."""
     return float(r_s(0.5, cell.a))

@@ -42,7 +42,7 @@ LET_IN_S = 10
 is 2."""
 
 RETRY_S = 1
-"""Between two attempts to connect [s]."""
+"""Delay between two connection attempts [s]."""
 PING_S = 10
 """Ping interval [s]; a connection without two responses is reconnected."""
 FLUSH_S = 5.0

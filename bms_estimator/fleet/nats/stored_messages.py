@@ -8,7 +8,7 @@ from nats.aio.client import Client
 from bms_estimator.fleet.nats.stream_reader import ANSWER_S, Stored, StreamError, read_stream
 
 BEHIND_S = 0.1
-"""Between two looks at a node that does not have yet what another has [s]."""
+"""Poll interval while a node lacks data that another one has [s]."""
 
 
 async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -> AsyncGenerator[Stored, None]:

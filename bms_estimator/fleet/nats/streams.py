@@ -39,7 +39,7 @@ GROUP = "w"
 PIN_S = 2.0
 """Time without a request after which a worker loses a partition [s]."""
 PARTITIONS_KEY = "bms.partitions"
-"""In the metadata of ``RAW``."""
+"""Key in the metadata of ``RAW``."""
 ANSWER_S, ATTEMPTS = 5.0, 12
 """Timeout of a request [s] and number of attempts: a cluster drops requests while it elects a leader."""
 NO_SUCH_STREAM = 10059

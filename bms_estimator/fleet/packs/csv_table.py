@@ -30,7 +30,7 @@ class Line(NamedTuple):
     number: int
     kind: PackSpec
     data: bytes
-    """As ``stored`` makes it of the kind."""
+    """Encoded kind, as by ``stored``."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class _Reader:
         self._files = dict[str, Path]()
 
     def table(self) -> PackTable:
-        """As ``read_table``."""
+        """Return the table as ``read_table`` does."""
         rows = csv.reader(io.StringIO(text := self._text(), newline=""), delimiter=_separator(text), strict=True)
         packs, errors = dict[str, Line](), list[str]()
         try:

@@ -15,7 +15,7 @@ from bms_estimator.fleet.nats.stream_reader import ANSWER_S, Stored, StreamError
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 
 POLL_S = 1.0
-"""Between two looks for what has changed."""
+"""Poll interval for changes [s]."""
 AT_ONCE = 2000
 """Maximum number of written rows waiting for the server's acknowledgment."""
 _GONE = frozenset({"DEL", "PURGE"})
@@ -30,7 +30,7 @@ class Written:
     same: int
     removed: int
     left: int
-    """In the bucket, and not among the values."""
+    """Number of rows in the bucket that are not among the values."""
 
 
 class PackBucket:

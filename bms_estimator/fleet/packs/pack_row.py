@@ -124,7 +124,7 @@ def model_key(kind: PackSpec) -> tuple[object, ...]:
 
 
 def cell_of(kind: PackSpec, cell_file: str | None) -> PackModel:
-    """One of the objects that the pack is made of; as ``model_of``."""
+    """Return one of the objects that the pack consists of; as ``model_of``."""
     name = kind.cell
     if name in known_cells():
         return load_any(name, kind.capacity_ah)

@@ -19,9 +19,9 @@ from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.settings.page import PageSettings
 
 STEP_S = 2.0
-"""Between two pictures of the fleet [s]."""
+"""Interval between two pictures of the fleet [s]."""
 ASK_S = 600.0
-"""Between two times that the hours are asked [s]."""
+"""Interval between two queries of the hours [s]."""
 FLEET, ANSWERS = "fleet", "answers"
 """Keys of what is streamed."""
 STATIC = Path(__file__).with_name("static")

@@ -23,7 +23,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.tasks import end
 
 TABLE_S = 2.0
-"""Between two looks for what has changed in the table of packs, or before it is tried again [s]."""
+"""Poll interval for changes of the table of packs, and retry interval [s]."""
 HOURS_S = 3900.0
 """Summaries of an hour come once in that, and somewhat late [s]."""
 MOST_BYTES = 1 << 16

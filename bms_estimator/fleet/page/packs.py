@@ -52,7 +52,7 @@ class Concern(NamedTuple):
     falls: bool
     """The smallest first."""
     limit: float
-    """Beyond it a pack is counted."""
+    """Limit beyond which a pack is counted."""
 
 
 CONCERNS = {
@@ -203,7 +203,7 @@ class FleetPacks:
 
 
 def _named(suspects: int) -> str:
-    """In a word or two each."""
+    """Describe each in a word or two."""
     return ", ".join((suspect.name or "").replace("_", " ").lower() for suspect in InputFault(suspects))
 
 
@@ -246,7 +246,7 @@ def _ago(heard_s: float, now_s: float) -> float | None:
 
 
 def _number(value: Any) -> float:
-    """As it is; nan where it is no number."""
+    """Return a number unchanged; NaN if it is not a number."""
     real = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if real and math.isfinite(value) else math.nan
 

@@ -28,12 +28,12 @@ class FleetView:
         self._since_s = now_s
         self._counted = deque([(now_s, 0)])
         self.listening = False
-        """There is a server; else what is known is what was."""
+        """True while connected to the server; otherwise the values are old."""
         self.damaged = 0
         """Heartbeats that were none."""
 
     def begin(self, now_s: float) -> None:
-        """From now on all is heard, after a time when it was not."""
+        """Begin to receive, after a time without a connection."""
         self._since_s, self.listening = now_s, True
         self.workers.forget()
 
@@ -86,7 +86,7 @@ class FleetView:
         return (self.packs.states - states) / (now_s - before_s) if now_s > before_s else None
 
     def _named_unknown(self, now_s: float) -> dict[str, Any]:
-        """Those that the workers count; who was named once is named as long as there are any."""
+        """Return the unknown packs that workers count; a name is kept as long as there are any."""
         count, named = self.workers.unknown(now_s)
         if not count:
             self._unknown.clear()

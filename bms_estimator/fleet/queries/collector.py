@@ -1,4 +1,4 @@
-"""From the stream ``HOURS`` to Parquet: a row is acknowledged when its file is on the disk, and comes again until then."""
+"""Collector of the stream ``HOURS`` into Parquet: a row is acknowledged when its file is on disk, and redelivered until then."""
 
 import asyncio
 import contextlib
@@ -35,9 +35,9 @@ AT_ONCE = 1000
 FETCH_S = 0.5
 """Poll interval without rows [s]."""
 COMPACT_S = 600.0
-"""Between two looks for days whose files should be one [s]."""
+"""Interval between two searches for days whose files should be merged [s]."""
 RETRY_S = 10.0
-"""After a disk, or a server, that did not take it [s]."""
+"""Retry interval after an error of disk or server [s]."""
 
 log = structlog.get_logger(__name__)
 

@@ -23,7 +23,7 @@ from bms_estimator.model.input_faults import InputFault
 
 SQL = resources.files("bms_estimator.fleet.queries") / "sql"
 AGED_SOC, CHARGE_ERROR = 1000.0, 0.002
-"""As in ``kernels.kalman_filter.records.Noise``: what the filter takes for granted between two estimates."""
+"""Assumptions of the filter between two estimates, as in ``kernels.kalman_filter.records.Noise``."""
 READING = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 BY_CHANCE = 0.1
 """Expected number of packs of a whole fleet that are reported by chance, for each quantity."""
@@ -225,7 +225,7 @@ def _sql(name: str) -> str:
 
 
 def _run(base: duckdb.DuckDBPyConnection, query: str, given: Mapping[str, Any]) -> duckdb.DuckDBPyConnection:
-    """With those of ``given`` that the query names."""
+    """Run the query with those of ``given`` that it names."""
     return base.execute(query, {name: given[name] for name in set(re.findall(r"\$(\w+)", query))})
 
 

@@ -56,7 +56,7 @@ def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
 
 
 def write_table(folder: Path, table: pa.Table) -> list[Path]:
-    """As ``write``, of columns as ``SCHEMA`` has them."""
+    """Write columns of ``SCHEMA``, as ``write`` does."""
     days = pc.divide(table["hour"], 24)
     return [_write_day(folder, int(day.as_py()), table.filter(pc.equal(days, day))) for day in pc.unique(days)]
 

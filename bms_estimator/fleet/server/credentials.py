@@ -93,7 +93,7 @@ def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: dat
 
 
 def credentials_file(folder: Path, tenant: str, role: Role) -> Path:
-    """With which a program connects; a token where the role bears one."""
+    """Write the credentials file of a program; a token for a role that has one."""
     return folder / tenant / f"{role.value}.{'token' if role in BEARERS else 'creds'}"
 
 

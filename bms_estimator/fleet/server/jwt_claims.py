@@ -1,4 +1,4 @@
-"""Who may do what, as claims that a server checks by signature alone: an operator, its tenants' accounts, their users.
+"""Claims that a server checks by signature alone: an operator, its tenants' accounts, their users.
 
 A claim is a JSON Web Token whose parts are those of https://github.com/nats-io/jwt, version 2, signed with an ed25519
 key in the writing of https://github.com/nats-io/nkeys. What a user may do stands in the account's claims, beside the
@@ -23,7 +23,7 @@ ACCOUNT, OPERATOR, USER = nkeys.PREFIX_BYTE_ACCOUNT, nkeys.PREFIX_BYTE_OPERATOR,
 """Kinds of key."""
 _VERSION = 2
 _NONE = -1
-"""As a limit."""
+"""Value of an absent limit."""
 
 
 class Role(Enum):
@@ -229,7 +229,7 @@ def _scope(role: Role, public: str) -> dict[str, Any]:
 
 
 def _permission(allow: tuple[str, ...], deny: tuple[str, ...]) -> dict[str, list[str]]:
-    """To allow nothing is to deny all: an empty list would allow all."""
+    """Return the permission; allowing nothing must deny all, because an empty list would allow all."""
     return {"allow": list(allow), "deny": list(deny)} if allow else {"deny": [">"]}
 
 

@@ -50,7 +50,7 @@ class Tls:
 
 @dataclass(frozen=True)
 class Accounts:
-    """Who may connect, as signed claims; these are public.
+    """Public signed claims of the accounts.
 
     Attributes:
         operator: The operator's claims.
@@ -152,5 +152,5 @@ def _tls(tls: Tls, *, mutual: bool = False) -> str:
 
 
 def _text(value: str) -> str:
-    """As the server reads a text: in quotation marks, as JSON has it."""
+    """Quote a text as the server reads it, as in JSON."""
     return json.dumps(value, ensure_ascii=False)

@@ -189,7 +189,7 @@ async def _reload_on_signal(
     made: asyncio.Task[None],
     say: Callable[[str], None],
 ) -> None:
-    """At SIGHUP let the server know what has changed. Settings that cannot be are said, and nothing changes."""
+    """Reload the server's configuration at SIGHUP. Invalid settings are logged and change nothing."""
     asked = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, asked.set)
     await made

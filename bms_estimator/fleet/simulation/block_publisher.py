@@ -23,13 +23,13 @@ from bms_estimator.mqtt.broker_config import brokers, password, tls_context
 from bms_estimator.settings.mqtt import MqttSettings
 
 ROUND_S = 0.1
-"""From one look at what is due to the next [s]."""
+"""Interval between two checks for due blocks [s]."""
 MOST_IN_FLIGHT = 2000
 """Blocks that a connection may have sent without an acknowledgement."""
 QUIET_S = 3.0
 """Time after the last block in which a worker may request a missing one [s]."""
 SAID_S = 5.0
-"""From one line about it to the next [s]."""
+"""Interval between two progress lines [s]."""
 KEEPALIVE_S = 20
 LEAST_WAIT_S, MOST_WAIT_S = 1, 4
 """Minimum and maximum delay before a reconnect [s]."""
@@ -98,7 +98,7 @@ class _Connection:
         self._client.loop_stop()
 
     def _turn(self, *_: object) -> None:
-        """To the next broker, at the next attempt."""
+        """Go to the next broker at the next attempt."""
         broker = next(self._brokers)
         self._client.connect_async(broker.host, broker.port, KEEPALIVE_S)
 

@@ -36,15 +36,16 @@ SEED = 7
 LISTENED = 100
 """Packs whose estimates are compared with the truth."""
 SAID_S = 5.0
-"""From one line about it to the next [s]."""
+"""Interval between two progress lines [s]."""
 KILL_AFTER = 0.4
 """Part of the time after which a worker is killed."""
 PATIENCE_S = 120.0
-"""For what ought to come within seconds: a server, a worker, the last blocks [s]."""
+"""Timeout of events that should take seconds: a server, a worker, the last blocks [s]."""
 _WORKERS = ("ada", "bob")
 _KILLED = _WORKERS[0]
 _PORTS = range(20_000, 32_768)
-"""Below those that the kernel gives to connections, which may take one before a server listens there."""
+"""Ports below the range that the kernel gives to outgoing connections, which could occupy one before a server
+listens."""
 _numbers = itertools.count(random.randrange(len(_PORTS)))
 
 Say = Callable[[str], object]
@@ -321,13 +322,13 @@ class Processes:
                 raise self._ended(name)
 
     async def kill(self, name: str) -> None:
-        """By SIGKILL."""
+        """Kill by SIGKILL."""
         process = self._running.pop(name)
         process.kill()
         await process.wait()
 
     async def stop(self, name: str) -> None:
-        """By SIGTERM; SIGKILL where that does not help."""
+        """Stop by SIGTERM, then by SIGKILL."""
         process = self._running.pop(name)
         with contextlib.suppress(ProcessLookupError):
             process.terminate()

@@ -27,11 +27,11 @@ class BlockOrder(Enum):
 
     NEXT = "next"
     RESENT = "resends"
-    """It was taken."""
+    """Block was already taken."""
     AHEAD = "gaps"
     """One before it is missing."""
     FORMER_STORE = "former_store"
-    """Its store is earlier than the present one."""
+    """Block of an earlier store than the present one."""
 
 
 def classify_block(d: np.void, block: Block) -> BlockOrder:

@@ -48,7 +48,7 @@ class CheckpointInfo(BaseModel):
     sequence: int
     """Sequence number of the last message of the stream in it."""
     object: str
-    """Its name in the bucket of states."""
+    """Name in the bucket of states."""
     bytes: int
     made_s: float
     """Wall clock [s since 1970]."""
@@ -60,7 +60,7 @@ class Pointer(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     worker: str
-    """Who has it."""
+    """Name of the owning worker."""
     next: str
     """The object that this worker writes next, maybe in part."""
     kept: tuple[CheckpointInfo, ...] = ()
@@ -69,7 +69,7 @@ class Pointer(BaseModel):
 
 @dataclass(frozen=True)
 class Claim:
-    """That a partition is ours: the pointer as we wrote it."""
+    """Claim of a partition: the pointer as this worker wrote it."""
 
     partition: int
     revision: int

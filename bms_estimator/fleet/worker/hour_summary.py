@@ -1,4 +1,4 @@
-"""From the blocks of an hour to its row.
+"""Summary of an hour's blocks as one row.
 
 The row follows from the stream alone: whoever works a pack's blocks off once more makes the same one.
 """

@@ -53,7 +53,7 @@ class Membership:
         return new and worker != self.me
 
     def extend_all(self, now_s: float) -> None:
-        """None could be heard until now: their silence says nothing."""
+        """Extend the deadline of all workers after a time in which none could be received."""
         self._heard = dict.fromkeys(self._heard, now_s)
 
     def alive(self, now_s: float) -> list[str]:

@@ -32,12 +32,12 @@ from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedC
 from bms_estimator.process.tasks import until_first_ends
 
 RETRY_S = 0.5
-"""Between two attempts at what the server does not do now [s]."""
+"""Retry interval of server requests [s]."""
 SILENCE_S = 3.0
 """Time without a message after which the stream is checked for another one [s]: a worker that releases a partition
 has finished by then."""
 LATER_S = 5.0 * SILENCE_S
-"""After it had no other [s]."""
+"""Time of silence after which a stream without a further message is checked again [s]."""
 HOURS_AT_ONCE = 128
 """Summaries that wait for the server's answer at a time."""
 TROUBLES = (NatsError, TimeoutError, StreamError)

@@ -17,7 +17,7 @@ from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import ANSWER_S, GROUP, PIN_S, consumer
 
 RENEW_S = PIN_S / 4.0
-"""Between two requests [s]: the loop may be three times as late without losing a pin."""
+"""Interval of requests [s]: the loop may be late by three of them without losing a pin."""
 EXPIRES_S = 2.5 * RENEW_S
 """Expiry of a request [s]."""
 BATCH = 32
@@ -34,11 +34,11 @@ class DeliveredMessage(NamedTuple):
     pack: str
     data: bytes
     sequence: int
-    """In the stream."""
+    """Sequence number in the stream."""
     pin: int
     """Number of times that this consumer has been pinned to this worker."""
     follows: bool
-    """It comes right after the one given before: no other message of the partition is between."""
+    """True if it follows the last delivered one directly: no other message of the partition lies between."""
 
 
 class PinnedConsumer:

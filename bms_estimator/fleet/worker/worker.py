@@ -31,7 +31,7 @@ CHECKPOINT_S = 300.0
 LISTEN_S = 0.5
 """Time of listening to other workers before partitions are claimed [s]: they answer a new worker at once."""
 LOOK_S = 0.5
-"""Between two looks for a checkpoint that is due, or summaries that wait [s]."""
+"""Interval between two checks for a due checkpoint or waiting summaries [s]."""
 MOST_UNKNOWN = 20
 """Packs that a heartbeat names."""
 AT_ONCE = 8
@@ -152,7 +152,7 @@ class Worker:
         self._told: set[str] = set()
 
     async def run(self) -> None:
-        """Until it is cancelled.
+        """Run until it is cancelled.
 
         Raises:
             UserError: The server has closed the connection for good.

@@ -3,7 +3,7 @@
 from bms_estimator.numba_cache import njit
 
 SLOW_S = 2.0
-"""Between samples further apart the current is more than their straight line [s]."""
+"""Distance of samples beyond which the current deviates from a straight line [s]."""
 
 GAP_RATIO = 3.0
 """A step is a gap only if it is at least this many times as long as the one before, so that slow sampling does not

@@ -67,7 +67,7 @@ def load_constants(given: Floats, p: Record, soc: float, temperature_c: float) -
 
 @njit(cache=True)
 def load_file_constants(given: Floats, file: Floats, temperature_c: float) -> None:
-    """As ``load_constants``, of what the file gives, shape (16,); without a temperature (NaN) at the file's."""
+    """Load the constants of the file, shape (16,), as ``load_constants`` does; without a temperature (NaN) at the file's."""
     for j in range(len(NAMES)):
         given[j] = file[1 + j]
     of_file = 273.15 + file[TEMPERATURE]

@@ -33,7 +33,7 @@ LEAST_SLOPE_V = 0.02
 HUBER = 2.0
 """Limit of an innovation in std; a larger one counts as this much (Huber)."""
 MINUTE_S, TEN_MINUTES_S = 60.0, 600.0
-"""Over which a mean innovation shows an error that stays."""
+"""Averaging times over which a mean innovation shows a persistent error [s]."""
 INFLATION_OVER = 5.0, 3.0
 """Averaging time of the inflation, in multiples of its own time constant."""
 NEAR, MOST_TIMES = 0.01, 8

@@ -15,7 +15,7 @@ from bms_estimator.numba_cache import njit
 BINS = 25
 """Bins of equal width over SOC 0..1."""
 ELEMENT_NAMES = ("r_ts_ohm", "r_tl_ohm", "c_ts_farad", "c_tl_farad", "r_s_ohm")
-"""In the order of their parameters: a1..a3, a4..a6, a7..a9, a10..a12, a13..a15."""
+"""Names in the order of their parameters: a1..a3, a4..a6, a7..a9, a10..a12, a13..a15."""
 ELEMENTS = len(ELEMENT_NAMES)
 CAPACITANCES = (2, 3)
 """C_ts, C_tl among the elements."""

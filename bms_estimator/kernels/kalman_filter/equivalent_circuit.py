@@ -28,7 +28,7 @@ from bms_estimator.numba_cache import njit
 R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
 """Indices into ``value`` and ``ln_variance``."""
 SHORT_S = 60.0
-"""Between the time constants of the ladder that are published as R_ts C_ts and as R_tl C_tl [s]."""
+"""Limit between the time constants published as R_ts C_ts and as R_tl C_tl [s]."""
 SHORT = sum(tau_s < SHORT_S for tau_s in TAU_S)
 SHAPE_STD = 0.03
 """Relative std of the file's series resistance, scaled to the cell, at one SOC and temperature."""

@@ -24,7 +24,7 @@ IDLE_C = 0.1
 
 @njit(cache=True)
 def initialize_load_statistics(s: Record, p: Record, current_a: float) -> None:
-    """Before a load is seen: what ``initial_branch_currents`` takes one to be.
+    """Initialize the load statistics before a load is seen, as ``initial_branch_currents`` assumes.
 
     The first sample tells more of a load that is small than of one that is large: that may be a peak.
     """
@@ -79,7 +79,7 @@ def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
 
 @njit(cache=True)
 def rounding_charge_variance(s: Record, p: Record, dt_s: float, current_a: float) -> float:
-    """By how much the steps of the current raise the variance of the charge within ``dt_s`` [A^2 s^2].
+    """Return the additional variance of the charge within ``dt_s`` by the steps of the current [A^2 s^2].
 
     While the same current is shown the error stays the same: its charge has the variance (error x time)^2, whatever the time.
     """

@@ -223,7 +223,7 @@ def reinitialize_if_biased(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
-    """By how many std a hypothesis holds the model for wrong, squared.
+    """Return the squared number of std by which a hypothesis considers the model wrong.
 
     The biases take what is wrong with OCV and hysteresis, too: on a plateau that is most of it.
     """

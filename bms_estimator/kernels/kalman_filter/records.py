@@ -40,7 +40,7 @@ class Noise:
     model_v: float = 0.05
     """R: error of the ladder in the mean of one second, std at 25 C [V]."""
     model_j: float = 27e3
-    """It grows in the cold with this activation energy [J/mol]."""
+    """Activation energy with which it grows in the cold [J/mol]."""
     bias_relative: float = 0.03
     """B: error of the model that stays, relative to the sum of the resistances times the RMS current of 10 min."""
     bias_grown: float = 0.11
@@ -84,7 +84,7 @@ class Noise:
     half_likelihood_exponent: float = 0.17
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
     min_innovation_scale: float = 0.25
-    """For weights S shrinks to this part of what R and B, which allow for the worst, make of it."""
+    """Minimum fraction to which S shrinks for weights, because R and B allow for the worst case."""
     inconsistency_penalty: float = 0.1
     """A hypothesis that holds the model for wrong by more than two std loses this part of their square from its ln weight, with each
     update."""

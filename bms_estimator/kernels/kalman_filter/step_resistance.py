@@ -26,7 +26,7 @@ STEP_STD = 0.05
 FAST_STD = 0.5
 """Relative std of what the branches change by within the step."""
 SHAPE_STD = 0.3
-"""By how much ln(R_s / R_0 of the file) changes over the whole range of SOC, std of a random walk."""
+"""Std of a random walk of ln(R_s / R_0 of the file) over the whole range of SOC."""
 
 
 @njit(cache=True)

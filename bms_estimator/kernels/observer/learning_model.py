@@ -13,7 +13,7 @@ from bms_estimator.numba_cache import njit
 
 
 class Model(IntEnum):
-    """Which model is learned."""
+    """Model that is identified."""
 
     CHEN_MORA = 0
     FUEL_CELL = 1

@@ -9,7 +9,7 @@ from bms_estimator.numba_cache import njit
 
 
 class Nussbaum(IntEnum):
-    """Which N(k) drives the observer."""
+    """Choice of N(k), which drives the observer."""
 
     MITTAG_LEFFLER = 0  # E_a(-lambda k^a), (3.10) with the sign of E1 of docs/thesis.md
     K2_COS = 1  # N1 = k^2 cos k

@@ -46,7 +46,7 @@ class DeviceProtocol(ABC):
     @property
     @abstractmethod
     def description(self) -> str | None:
-        """Who is there, for people; None until that is known."""
+        """Description of the device; None until it is known."""
 
     @property
     def board(self) -> Mapping[str, str]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from bms_estimator.model.decimal_text import NUMBER, measured, number
 
 CONNECTED = b""
-"""In place of a line: what is measured can be reached now."""
+"""Empty line that reports that the device can be reached now."""
 
 
 class Reading(NamedTuple):
@@ -18,11 +18,11 @@ class Reading(NamedTuple):
 
     voltage_v: float
     current_a: float
-    """As the board counts it."""
+    """Current with the board's sign."""
     temperature_c: float = nan
     cells_v: tuple[float, ...] = ()
     time_s: float = nan
-    """By a clock of its own, whatever that counts from."""
+    """Timestamp by a clock of its own, with any origin."""
 
 
 _VOLT: Mapping[str, float] = {"": 1.0, "v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3}

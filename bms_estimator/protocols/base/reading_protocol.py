@@ -100,9 +100,9 @@ class RecentCellVoltages:
         self._arrival_s, self._cells_v = -math.inf, tuple[float, ...]()
 
     def keep(self, arrival_s: float, cells_v: Sequence[float]) -> None:
-        """Those that came now."""
+        """Store the values that came now."""
         self._arrival_s, self._cells_v = arrival_s, tuple(cells_v)
 
     def at(self, arrival_s: float) -> tuple[float, ...]:
-        """For a sample of this time; none where their answer has not come of late."""
+        """Return the values for a sample of this time; empty without a recent response."""
         return self._cells_v if arrival_s - self._arrival_s < self._fresh_s else ()

@@ -30,7 +30,7 @@ CELLS_A_FRAME, PROBES_A_FRAME, MOST_FRAMES = 3, 7, 16
 
 
 def sealed(frame: bytes) -> bytes:
-    """With its checksum."""
+    """Append the checksum."""
     return frame + bytes((sum(frame) & 0xFF,))
 
 
@@ -63,7 +63,7 @@ class DalyProtocol(PolledProtocol):
         return f"Daly BMS, {self._cells} cells" if self._told and self._cells is not None else None
 
     def on_port_opened(self) -> None:
-        """As all; it may be another pack's, with more cells."""
+        """Reset; the pack may be another one, with more cells."""
         super().on_port_opened()
         self._known = False
 

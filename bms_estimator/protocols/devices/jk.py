@@ -97,7 +97,7 @@ class JkProtocol(PolledProtocol):
 
     @property
     def _asked_packs(self) -> Sequence[int]:
-        """Those that are asked in the newer way, in turns."""
+        """Return the packs that are polled in the newer way, in turn."""
         return (1, 0) if self._address is None else (self._address,)
 
     def _query_variants(self) -> Sequence[Sequence[bytes]]:
@@ -105,7 +105,7 @@ class JkProtocol(PolledProtocol):
         return [[OLD_QUESTION], *newer]
 
     def on_port_opened(self) -> None:
-        """As all; who else asks is not known any more."""
+        """Reset, and forget other masters."""
         super().on_port_opened()
         self._overheard_s = -math.inf
 

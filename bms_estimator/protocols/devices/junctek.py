@@ -16,7 +16,7 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
 ADDRESS = 1
-"""As it is delivered."""
+"""Factory default address."""
 ASK = b":R50=%d,2,1,\r\n" % ADDRESS
 ASK_S = 1.0
 """Poll interval [s]."""

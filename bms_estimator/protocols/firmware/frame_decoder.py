@@ -49,7 +49,7 @@ class FrameCounters:
     frames_received: int = 0
     """Samples handed on."""
     frames_lost: int = 0
-    """By gaps in the sequence, whatever became of them."""
+    """Frames lost by gaps in the sequence, for any reason."""
     crc_errors: int = 0
     cobs_errors: int = 0
     length_errors: int = 0
@@ -70,7 +70,7 @@ class FrameCounters:
     timestamp advanced by more than arrival, sequence numbers or a gap explain."""
 
     def as_dict(self) -> dict[str, int]:
-        """By name."""
+        """Return the counters by name."""
         return dict(vars(self))
 
 

@@ -1,4 +1,4 @@
-"""From serial bytes to samples: COBS, CRC, sequence and clock (firmware/PROTOCOL.md).
+"""Decoder from serial bytes to samples: COBS, CRC, sequence and clock (firmware/PROTOCOL.md).
 
 One decoder serves the live line and the replay. All it knows between calls stands in its state, and nothing it does
 depends on how the bytes were cut into calls, except for the arrival time of the byte that ends a frame.

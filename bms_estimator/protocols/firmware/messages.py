@@ -167,7 +167,7 @@ def set_relay_command(relay: Relay) -> bytes:
 
 
 def relay_word(relay: Relay) -> int:
-    """As it travels: bit 0 the level, bits 8 and 9 what becomes of it in silence, the upper half after how long [s]."""
+    """Encode the relay command: bit 0 the level, bits 8 and 9 the fallback, the upper half its delay [s]."""
     then = RELAY_KEEP if relay.high_when_silent is None else RELAY_HIGH if relay.high_when_silent else RELAY_LOW
     return relay.high | then << 8 | relay.silent_s << 16
 
@@ -207,7 +207,7 @@ class Hello:
 
     @classmethod
     def decode(cls, packet: bytes) -> Self:
-        """From a packet without its CRC.
+        """Decode a packet without its CRC.
 
         Raises:
             ProtocolError: Another message.
@@ -244,7 +244,7 @@ class Ack:
 
     @classmethod
     def decode(cls, packet: bytes) -> Self:
-        """From a packet without its CRC.
+        """Decode a packet without its CRC.
 
         Raises:
             ProtocolError: Another message.
@@ -284,7 +284,7 @@ class SampleMessage:
 
     @classmethod
     def decode(cls, packet: bytes) -> Self:
-        """From a packet without its CRC.
+        """Decode a packet without its CRC.
 
         Raises:
             ProtocolError: Another message.

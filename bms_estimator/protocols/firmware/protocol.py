@@ -96,7 +96,7 @@ class BoardProtocol(DeviceProtocol):
         return self._decoder.serial_number_in(data)
 
     def on_port_opened(self) -> None:
-        """There is no hello until the next comes, nor is a command given again; samples keep the scaling of the last."""
+        """Reset: there is no hello until the next one, and no command is repeated; samples keep the last scaling."""
         self._decoder.forget_hello()
         self._unheard_at = self._decoder.heard_at
         if self._told is not None and not self._told.done:

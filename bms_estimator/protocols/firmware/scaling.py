@@ -1,4 +1,4 @@
-"""From the board's sums to volts, amperes and degrees Celsius (firmware/PROTOCOL.md)."""
+"""Scaling of the board's sums to volts, amperes and degrees Celsius (firmware/PROTOCOL.md)."""
 
 import math
 
@@ -97,7 +97,7 @@ def temperature(s: Record) -> float:
 
 @njit(cache=True)
 def voltage(s: Record, total: float, count: float, reference_v: float) -> float:
-    """At the pack's terminals [V]; NaN without a conversion."""
+    """Return the voltage at the pack's terminals [V]; NaN without a conversion."""
     if count == 0.0:
         return math.nan
     return total / count / s.full_scale * reference_v * s.divider

@@ -37,7 +37,7 @@ class DiscoveryInputs(NamedTuple):
     """Number of measured cells."""
     alarms: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
-    """That are allowed."""
+    """Allowed commands."""
     unwatched: tuple[str, ...] = ()
     """Alarms that are not, whatever comes: other settings may have had them."""
 

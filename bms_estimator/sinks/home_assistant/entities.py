@@ -19,22 +19,22 @@ class Entity(NamedTuple):
     """A number that Home Assistant shows."""
 
     name: str | None
-    """None: Home Assistant names it by its device class, in its user's language."""
+    """Name; None: Home Assistant names it by its device class, in the user's language."""
     unit: str | None
     decimals: int
-    """To which it is rounded."""
+    """Decimals to which it is rounded."""
     step: float
     """Minimum change of a published value, in its unit, above its noise."""
     device_class: str | None = None
     min_interval_s: float = SLOW_S
     """Nor more often than this [s]."""
     is_primary: bool = False
-    """Else Home Assistant lists it among the diagnostics."""
+    """True for a primary entity; others are listed as diagnostics."""
     enabled: bool = True
-    """Else the user enables it."""
+    """True if enabled by default."""
     state_class: str | None = "measurement"
     signed: bool = False
-    """Its sign is that of the current."""
+    """True if its sign is that of the current."""
     immediate_step: float = math.inf
     """Change that is published at once, because a user has set the value."""
 

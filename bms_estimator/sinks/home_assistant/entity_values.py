@@ -15,7 +15,7 @@ MOST_ROWS = 18
 """Maximum number of default-enabled values published in a minute; two more are reserved for alarms."""
 MINUTE_S = 60.0
 PAUSE_S = 5.0
-"""Between two messages with values [s]."""
+"""Interval between two messages with values [s]."""
 HEARTBEAT_S = 10.0
 """Values that have not changed are said again, so that they do not expire [s]."""
 

@@ -14,7 +14,7 @@ from bms_estimator.version import __version__
 Document = dict[str, Any]
 
 ADDRESSES = {"alarm": "alarm/{alarm}"}
-"""Below the device's topic, where it is not the name."""
+"""Addresses below the device's topic that differ from the name."""
 PARAMETERS = {
     "device": f"pack.name of the pack file, as {DEVICE_NAME}",
     "alarm": "as in [alarms] of the pack file",

@@ -30,7 +30,7 @@ class PublishedState(NamedTuple):
     snapshot: Snapshot | None = None
     shown: EntityStates = EntityStates()
     described: DiscoveryInputs | None = None
-    """To Home Assistant."""
+    """Discovery data that Home Assistant has."""
 
 
 class MessageBuilder:

@@ -106,7 +106,7 @@ class RequestDispatcher:
             log.warning("request not granted", kind=kind, request=name, so_far=self._counts[kind], **why)
 
     def _handler(self, name: str) -> Handler:
-        """Who answers.
+        """Return the handler of a request.
 
         Raises:
             UserError: It is not allowed, or not offered here.

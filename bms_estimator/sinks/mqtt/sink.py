@@ -34,7 +34,7 @@ from bms_estimator.store.outbox import Outbox
 BIRTH_DELAY_S = 2.0
 """Home Assistant says it is online some time before it listens [s]."""
 HANDOVER_S = 2.0
-"""At the end: how long what still waits in the outbox may take [s]."""
+"""Time that waiting messages of the outbox may take at the end [s]."""
 CLOSING_S = 3.0
 """Timeout of the last messages together [s]."""
 

@@ -28,7 +28,7 @@ TOPICS = {
     "info": Topic(Info, 1, retain=True, when="on change"),
     "alarm": Topic(Alarm, 1, retain=True, when="on change"),
 }
-"""By name; alarms stand below ``alarm/``, each on its own."""
+"""Payload models by topic; each alarm has a topic below ``alarm/``."""
 
 
 def schema() -> dict[str, Any]:

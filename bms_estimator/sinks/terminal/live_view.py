@@ -27,7 +27,7 @@ HISTORY = 256
 WAITING_LINES = 1000
 """Maximum number of lines waiting for a pipe that is not read; then the oldest is dropped."""
 END_LINES = 4
-"""Below the view that stays there is room for what is said in the end, and for the prompt."""
+"""Lines kept free below the last view for final messages and the prompt."""
 CLOSE_S = 2.0
 """Time that the last view waits for a terminal that does not read [s]."""
 

@@ -116,7 +116,7 @@ def _blocks(scene: ScreenState, width: int, *, wide: bool) -> list[LayoutBlock]:
 
 
 def _shown(blocks: Sequence[LayoutBlock]) -> list[LayoutBlock]:
-    """Without those that have nothing to say."""
+    """Return the parts that are not empty."""
     return [block for block in blocks if not (isinstance(block.content, FlowLayout) and block.content.is_empty())]
 
 

@@ -16,7 +16,7 @@ ALARM = "alarm/"
 
 
 class BrokerOutage(NamedTuple):
-    """There is no broker."""
+    """Outage of the broker."""
 
     since_s: float
     """Seconds since 1970."""
@@ -32,7 +32,7 @@ class PackView:
     topics: Mapping[str, object] = field(default_factory=dict)
     """Payloads by topic below the device's."""
     heard_s: float = 0.0
-    """When the last of them came, seconds since 1970."""
+    """Time of the last message, seconds since 1970."""
     now_s: float = 0.0
     """Now."""
     lost: BrokerOutage | None = None
@@ -64,7 +64,7 @@ class PackView:
 
     @cached_property
     def alarms(self) -> list[JsonFields]:
-        """Those that are raised, and while samples come those that cannot be watched."""
+        """Return raised alarms and, while samples come, those that cannot be monitored."""
         told = [JsonFields(payload) for topic, payload in self.topics.items() if topic.startswith(ALARM)]
         online = JsonFields(self.topics.get("health")).flag("sensor_online")
         return [alarm for alarm in told if alarm.flag("active") or (online and alarm.text("unwatched_reason"))]
@@ -108,5 +108,5 @@ def _clock(epoch_s: float) -> str:
 
 
 def _since(iso: str) -> str:
-    """When that was, where it is known."""
+    """Return the time as text, if known."""
     return f" since {iso[11:19]}Z" if iso else ""

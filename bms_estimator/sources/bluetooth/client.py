@@ -43,7 +43,7 @@ class BleBringer(LineProducer):
 
     @property
     def name(self) -> str:
-        """Which BMS."""
+        """Name of the BMS."""
         return self._settings.described
 
     @property
@@ -53,7 +53,7 @@ class BleBringer(LineProducer):
 
     @property
     def fault(self) -> str | None:
-        """That it answers, but measures nothing."""
+        """Fault of a BMS that responds without values."""
         return self._fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:

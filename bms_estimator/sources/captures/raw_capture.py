@@ -109,7 +109,7 @@ class CaptureBatch:
     damaged: bool
     """The file has no readable record behind these although it has not ended."""
     unread_bytes: int = 0
-    """At the end of the file: what is no whole record."""
+    """Number of bytes at the end of the file without a whole record."""
 
     def __iter__(self) -> Iterator[tuple[float, bytes]]:
         """Each read: arrival [s], bytes."""

@@ -82,7 +82,7 @@ class RawCapture:
 
     @property
     def implausible(self) -> int:
-        """As the decoder counts them."""
+        """Number of implausible values counted by the decoder."""
         return self.decoder.counters["implausible"]
 
     def __iter__(self) -> Iterator[SampleBlock]:
@@ -108,7 +108,7 @@ class Replay:
     """
 
     message: str | None = None
-    """There is always a sample."""
+    """Fault message; None, because there is always a sample."""
 
     def __init__(
         self,

@@ -46,7 +46,7 @@ class Sign(NamedTuple):
     """Direction that a table's current calls positive."""
 
     given: CurrentSign | None = None
-    """Said of this very table: holds whatever its columns are called."""
+    """Direction given for this very table; it takes precedence over column names."""
     otherwise: CurrentSign = "discharge_positive"
     """Direction if neither ``given`` nor the column names define it."""
 
@@ -201,7 +201,7 @@ class ParquetTable:
             raise UserError(f"{self._path}: cannot be read: {error.strerror or error}") from None
 
     def _numbers(self, column: "pa.Array", name: str) -> NDArray[np.float64]:  # type: ignore[name-defined]  # noqa: F821
-        """As floats, NaN where null."""
+        """Convert to floats, NaN for null."""
         import pyarrow as pa  # noqa: PLC0415
 
         try:
@@ -221,7 +221,7 @@ READERS: dict[str, type[CsvTable | ParquetTable]] = {
 
 
 def table_reader(path: Path, sign: Sign) -> CsvTable | ParquetTable | None:
-    """Who reads ``path`` by the end of its name; None when it is no table."""
+    """Return the reader of ``path`` by its file name extension; None if it is not a table."""
     name = path.name.lower()
     return next((reader(path, sign) for suffix, reader in READERS.items() if name.endswith(suffix)), None)
 

@@ -49,7 +49,7 @@ class CanBringer(LineProducer):
 
     @property
     def name(self) -> str:
-        """Which bus."""
+        """Name of the bus."""
         return self._settings.described
 
     @property

@@ -26,7 +26,7 @@ SHOWN = 20
 
 
 class FrameId(NamedTuple):
-    """Which frame holds a value."""
+    """Identifier of the frame that holds a value."""
 
     id: int
     extended: bool
@@ -63,7 +63,7 @@ class _Frame:
     """Message of the DBC file, if one of the signals is named."""
 
     def values(self, data: bytes) -> Iterator[tuple[Key, float | None]]:
-        """In V, A or degC; NaN where one is absent, None where ``data`` is too short; not those of another multiplexer value."""
+        """Return values in V, A or C; NaN if absent, None if ``data`` is too short; none of another multiplexer value."""
         named = _named(self.message, data) if self.message is not None else {}
         in_turns = bool(named) and self.message is not None and self.message.is_multiplexed()
         for key, signal in self.signals:

@@ -73,7 +73,7 @@ class ModbusBringer(LineProducer):
 
     @property
     def fault(self) -> str | None:
-        """That the device answers, but measures nothing."""
+        """Fault of a device that responds without values."""
         return self._fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
@@ -177,7 +177,7 @@ class ModbusBringer(LineProducer):
 
 
 def _client(settings: ModbusSource) -> Client:
-    """Not connected yet. It neither asks nor connects again by itself."""
+    """Make an unconnected client without its own retries and reconnects."""
     if settings.port is None:
         return AsyncModbusTcpClient(
             settings.host or "",

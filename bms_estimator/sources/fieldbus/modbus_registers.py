@@ -45,7 +45,7 @@ class Request(NamedTuple):
 
     @property
     def described(self) -> str:
-        """For people: ``source.voltage, source.current (holding registers 259 to 261)``."""
+        """Describe the request: ``source.voltage, source.current (holding registers 259 to 261)``."""
         quantities = ", ".join(dict.fromkeys(f"source.{value.quantity}" for value in self.values))
         last = f" to {self.address + self.words - 1}" if self.words > 1 else ""
         return f"{quantities} ({self.table} register{'s' if last else ''} {self.address}{last})"

@@ -30,7 +30,7 @@ class _Chip(NamedTuple):
     current: Channel
     temperature: Channel | None
     amperes: float
-    """For one unit of the current's channel [A/A or A/V]."""
+    """Amperes for one unit of the current's channel [A/A or A/V]."""
     interval_s: float
 
 
@@ -103,7 +103,7 @@ class LinuxSensor(LineProducer):
             raise SourceUnavailableError(f"the bus has not answered for {self._hung_s:g} s")
 
     def _find(self) -> _Chip:
-        """In the thread."""
+        """Find the chip, in the thread."""
         told = self._settings
         voltage, current = (find_channel(name, told.chip, self._root) for name in (told.voltage, told.current))
         temperature = find_channel(told.temperature, told.chip, self._root) if told.temperature else None
@@ -149,7 +149,7 @@ class LinuxSensor(LineProducer):
         return max(own_s, LEAST_INTERVAL_S)
 
     def _sample(self, chip: _Chip) -> bytes:
-        """In the thread: a line; nothing where voltage or current cannot be read now.
+        """Read a line in the thread; empty if voltage or current cannot be read now.
 
         Raises:
             OSError: The chip is gone.
@@ -166,7 +166,7 @@ class LinuxSensor(LineProducer):
         )
 
     def _value(self, channel: Channel) -> float | None:
-        """None where it cannot be read now, which is counted.
+        """Read a value; None if it cannot be read now, which is counted.
 
         Raises:
             OSError: The chip is gone.

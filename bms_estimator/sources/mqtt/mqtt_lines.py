@@ -72,7 +72,7 @@ class MqttReports(LineProducer):
 
     @property
     def fault(self) -> str | None:
-        """As the assembly has it."""
+        """Fault of the assembler."""
         return self._assembly.fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:

@@ -25,7 +25,7 @@ class InvalidValueError(Exception):
 
 
 class MissingError(InvalidValueError):
-    """It is JSON, but has not what the path leads to."""
+    """The payload is JSON without the path."""
 
     kind = "missing"
 

@@ -62,7 +62,7 @@ class SampleAssembler:
 
     @property
     def topics(self) -> list[str]:
-        """To subscribe to; none that another one covers, or some brokers would send twice what comes there."""
+        """Return the topics to subscribe to without those that another one covers, which some brokers would deliver twice."""
         topics = [way.topic for way in self._ways] + ([self._availability] if self._availability else [])
         filters = list(dict.fromkeys(_filter(topic) for topic in topics))
         return [topic for topic in filters if not any(_covers(other, topic) for other in filters if other != topic)]

@@ -69,7 +69,7 @@ class BoardCheck:
             Thread(target=self._look, args=(self._memory,), daemon=True).start()
 
     def _look(self, memory: KnownBoardFile) -> None:
-        """In a thread of its own: a disk that hangs holds up nothing."""
+        """Check for another board in a thread of its own, so that a hung disk blocks nothing."""
         try:
             if memory.load() == NO_BOARD:
                 self._known = self._kept = NO_BOARD
@@ -137,7 +137,7 @@ class BoardCheck:
         Thread(target=self._keep, args=(self._memory, self._known), daemon=True).start()
 
     def _keep(self, memory: KnownBoardFile, board: Mapping[str, str]) -> None:
-        """In a thread of its own."""
+        """Store the board in a thread of its own."""
         try:
             if board != self._kept or memory.is_gone():
                 memory.save(board)

@@ -24,7 +24,7 @@ BOOT_TIMEOUT_S = 3.0
 PROTOCOL_TIMEOUT_S = 1.5
 """Time added to a baud rate for each protocol that is tried at it in turn [s]."""
 QUERY_INTERVAL_S = 0.3
-"""For an answer before another protocol's question goes out [s]."""
+"""Time for a response before the next protocol's query [s]."""
 READ_S = 0.1
 """Timeout of a read [s]."""
 READ_BYTES = 4096
@@ -40,12 +40,12 @@ Answer = TypeVar("Answer")
 
 @dataclass(frozen=True)
 class DetectedDevice:
-    """Who answers on a port."""
+    """Device that responds on a port."""
 
     protocol: str
     baud: int
     described: str
-    """For people."""
+    """Description as text."""
     cells: int | None = None
     """Cells in series, if reported."""
 

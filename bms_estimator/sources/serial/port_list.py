@@ -1,4 +1,4 @@
-"""Which serial ports there are, which of them is the board's, how one is opened, and who holds one."""
+"""Serial ports: list, choice of the board's, opening, and the process that holds one."""
 
 import errno
 import os

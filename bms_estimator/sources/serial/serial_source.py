@@ -184,7 +184,7 @@ class SerialSource:
 
     @property
     def _listener(self) -> DeviceProtocol:
-        """Who hears the device that has been heard last."""
+        """Return the decoder of the device that was received last."""
         return self._door.pending_protocol or self._decoder
 
     def _send_due(self) -> None:
