@@ -1,6 +1,7 @@
 """Attacks with the token of one edge on the real server: they cost nothing but that edge's own blocks."""
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -38,10 +39,19 @@ def fleet(tmp_path: Path) -> Iterator[Tenant]:
         yield tenant
 
 
-async def stored(nc: Client) -> dict[str, int]:
-    """Number of messages of each subject in ``RAW``."""
-    info = await nc.jetstream().stream_info(subjects.RAW_STREAM, subjects_filter=">")
-    return dict(info.state.subjects or {})
+async def stored(nc: Client, last: bytes) -> dict[str, int]:
+    """Return the number of messages of each subject in ``RAW``, once the last that was sent is in it.
+
+    The server acknowledges an MQTT publish before the message is in the stream.
+    """
+    js = nc.jetstream()
+    deadline = time.monotonic() + LONG_S
+    while time.monotonic() < deadline:
+        info = await js.stream_info(subjects.RAW_STREAM, subjects_filter=">")
+        if info.state.messages and (await js.get_msg(subjects.RAW_STREAM, info.state.last_seq)).data == last:
+            return dict(info.state.subjects or {})
+        await asyncio.sleep(0.02)
+    raise AssertionError(info.state)
 
 
 def subject(pack: str) -> str:
@@ -58,7 +68,7 @@ async def test_invented_subjects_and_foreign_partitions_are_refused(fleet: Tenan
             await edge.publish(f"raw/invented{i}", b"evil", qos=1)
         codes = [(await edge.subscribe(f"edge/attacker/{i}", qos=1))[0].value for i in range(20)]
         await edge.publish("raw/attacker", b"own", qos=1)
-    assert await stored(reader) == {subject("attacker"): 1}
+    assert await stored(reader, b"own") == {subject("attacker"): 1}
     assert set(codes) == {0x80}
     await reader.close()
 
@@ -73,7 +83,8 @@ async def test_junk_evicts_no_block_of_another_pack(fleet: Tenant) -> None:
     async with fleet.edge("attacker") as edge:
         for _ in range(2 * RAW_BYTES // len(junk)):
             await edge.publish("raw/attacker", junk, qos=1)
-    kept = await stored(reader)
+        await edge.publish("raw/attacker", b"last", qos=1)
+    kept = await stored(reader, b"last")
     assert kept == {subject("honest"): 5, subject("attacker"): pack_blocks(RAW_BYTES)}
     await reader.close()
 
@@ -83,7 +94,7 @@ async def test_a_message_larger_than_a_block_is_not_stored(fleet: Tenant) -> Non
     async with fleet.edge("attacker") as edge:
         await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES + 1), qos=1)
         await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES - 1024), qos=1)
-    assert await stored(reader) == {subject("attacker"): 1}
+    assert await stored(reader, bytes(MAX_BLOCK_BYTES - 1024)) == {subject("attacker"): 1}
     await reader.close()
 
 
@@ -111,7 +122,7 @@ async def test_a_stream_of_the_version_before_takes_the_limits_and_keeps_its_blo
         await nc.jetstream().publish(subject("p1"), b"before")
         await make_streams(nc, partitions=PARTITIONS, raw_bytes=RAW_BYTES)
         await nc.jetstream().publish(subjects.raw("p1"), b"after")
-        assert await stored(nc) == {subject("p1"): 2}
+        assert await stored(nc, b"after") == {subject("p1"): 2}
         await nc.close()
 
 
