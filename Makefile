@@ -16,7 +16,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere resolution unseen nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check docs test demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere resolution unseen nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -92,7 +92,7 @@ unseen: venv ## the SOC through kills, restarts and gaps, on real captures: minu
 ablation: venv ## what each part of the filter is worth, on real captures, e.g. make ablation ARGS=LFP: minutes
 	@$(BIN)/python -m tests.benchmarks.ablation $(ARGS)
 
-fuelcell: venv ## figures of the fuel cell, docs/fuel-cell.md: half a minute
+fuelcell: venv ## figures of the fuel cell, docs/theory/fuel-cell.md: half a minute
 	@$(BIN)/python -m tests.benchmarks.fuel_cell
 
 learning: venv ## what the learning law and each of its parts are worth, simulated
@@ -130,6 +130,9 @@ integrations: apt venv ## what the real Node-RED, AsyncAPI's parser, InfluxDB an
 	@[ -d $(NODE)/node_modules/node-red ] || npm install --prefix $(NODE) --no-audit --no-fund --ignore-scripts node-red@4.1.15 @asyncapi/parser@3.6.3
 	$(BIN)/python -m pytest tests/deploy/test_node_red.py tests/deploy/test_asyncapi.py tests/deploy/test_grafana.py \
 		tests/deploy/test_telegraf.py tests/sinks/exports/test_influx.py tests/sinks/exports/test_prometheus.py $(ARGS)
+
+docs: venv ## the documentation as a site in build/site, with checked links
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 payloads: venv ## remember what is published now; refuses what readers would miss in the same version
 	@$(BIN)/python -m tests.sinks.mqtt.payload_record

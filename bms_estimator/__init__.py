@@ -1,6 +1,6 @@
 """Real-time Li-ion battery estimator: adaptive observer, parameters, SOC and stability margins.
 
-What others may build on is here, see docs/api.md; all else may change from one version to the next.
+What others may build on is here, see docs/reference/python.md; all else may change from one version to the next.
 """
 
 from importlib import import_module

@@ -16,9 +16,9 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_the_examples_of_the_document_are_true(monkeypatch):
-    pytest.importorskip("pandas", reason="pandas is not installed: docs/api.md makes a DataFrame")
+    pytest.importorskip("pandas", reason="pandas is not installed: docs/reference/python.md makes a DataFrame")
     monkeypatch.chdir(ROOT)
-    failed, tried = doctest.testfile(str(ROOT / "docs" / "api.md"), module_relative=False)
+    failed, tried = doctest.testfile(str(ROOT / "docs" / "reference" / "python.md"), module_relative=False)
     assert (failed, tried > 20) == (0, True)
 
 

@@ -36,7 +36,7 @@ DIAGRAMS = {
 FUEL_CELL = dict.fromkeys(
     ("45", "46"),
     "The recording is not published, nor are the equations of its model. The project's own model of a fuel cell, after section "
-    "7.3, is in docs/fuel-cell.md.",
+    "7.3, is in docs/theory/fuel-cell.md.",
 )
 
 CHAPTERS: dict[str, tuple[str, ...]] = {

@@ -1,6 +1,6 @@
 """Monitored alarms from ``[alarms]`` and the cell: each with its limit and the level at which it ends.
 
-Sources are in docs/alarms.md.
+Sources are in docs/pack/alarms.md.
 """
 
 import math

@@ -130,7 +130,7 @@ PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value
 
 
 class AlarmSettings(Strict):
-    """Limits of alarms; a table for each, as in pack_over_voltage = {limit_v = 29.2, delay_s = 5}. docs/alarms.md."""
+    """Limits of alarms; a table for each, as in pack_over_voltage = {limit_v = 29.2, delay_s = 5}. docs/pack/alarms.md."""
 
     pack_over_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=2.0, clear_delay_s=10.0, latch=True)
     pack_under_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=5.0, clear_delay_s=30.0)

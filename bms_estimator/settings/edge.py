@@ -10,7 +10,7 @@ from bms_estimator.settings.mqtt import of_brokers
 
 
 class EdgeSettings(Strict):
-    """Destination of raw samples, and number of blocks stored while it is away: see docs/fleet-edge.md."""
+    """Destination of raw samples, and number of blocks stored while it is away: see docs/fleet/edge.md."""
 
     model_config = ConfigDict(hide_input_in_errors=True)
 

@@ -11,7 +11,7 @@ Topic = Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")]
 
 
 class HomeAssistantSettings(Strict):
-    """Home Assistant discovery over the broker, docs/home-assistant.md."""
+    """Home Assistant discovery over the broker, docs/pack/home-assistant.md."""
 
     enabled: bool = Field(default=True, description="false: it is told nothing, and a device that it has goes")
     discovery_prefix: Topic = Field(default="homeassistant", description="as in its MQTT integration")

@@ -62,7 +62,7 @@ class ValueLocation(Strict):
 
 
 class MqttSource(PolledSource):
-    """Battery readings that another program publishes over MQTT: see docs/sources-mqtt.md."""
+    """Battery readings that another program publishes over MQTT: see docs/pack/mqtt-source.md."""
 
     kind: Literal["mqtt"]
     profile: ProfileName | None = Field(default=None, description="who publishes; tells all that is not set here")

@@ -13,7 +13,7 @@ class ObserverSettings(Strict):
     law: Literal["improved", "scheme-1", "scheme-2", "scheme-3", "learning"] = Field(
         default="improved",
         description="improved: (3.18) with output (4.1); scheme-1..3: (3.16)..(3.18) with (3.14); "
-        "learning: sensitivity times e, docs/observer.md, the default where identifier.enabled = false",
+        "learning: sensitivity times e, docs/theory/observer.md, the default where identifier.enabled = false",
     )
     nussbaum: Literal["mittag-leffler", "k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"] = "mittag-leffler"
     alpha: Annotated[float, Field(gt=2, le=3)] = Field(default=2.5, description="a of (3.10), in (2, 3]")

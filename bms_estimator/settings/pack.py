@@ -114,7 +114,7 @@ class Settings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _law_that_learns(cls, tables: object) -> object:
-        """Select the default law: without the identifier it is the adaptive law that learns, because the printed law has only its bounds (docs/comparison.md)."""
+        """Select the default law: without the identifier it is the adaptive law that learns, because the printed law has only its bounds (docs/theory/comparison.md)."""
         if not isinstance(tables, dict):
             return tables
         identifier, observer = tables.get("identifier"), tables.get("observer", {})

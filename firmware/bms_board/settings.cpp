@@ -16,7 +16,7 @@ static const allowed ranges[SETTINGS] = {
     {BANDGAP_MIN_UV, BANDGAP_MAX_UV, 1100000},
     {CURRENT_ZERO_MIN_PPM, CURRENT_ZERO_MAX_PPM, 500000},
     {0, 0xFFFFFFFF, 0},
-    {DIVIDER_MIN_PPM, DIVIDER_MAX_PPM, 6100000},           // 51 kohm over 10 kohm, docs/wiring.md
+    {DIVIDER_MIN_PPM, DIVIDER_MAX_PPM, 6100000},           // 51 kohm over 10 kohm, docs/pack/board.md
     {CURRENT_MIN_UV_PER_A, CURRENT_MAX_UV_PER_A, 100000},  // ACS724LLCTR-20AB
     {0, 1, 1},                                             // it is proportional to its supply
 };

@@ -14,7 +14,7 @@ EKF_VOLTAGE_SIGMA_V = 0.005
 """Measurement noise of the textbook filter [V]."""
 ELEMENT_STD, ELEMENT_WALK = 0.7, 1e-6
 """Joint filter: std of ln of each element at the start, a factor of two, and the variance of its random walk [1/s]. Of 1e-8, 1e-7
-and 1e-6 the last has the smallest voltage error on the captures that are learned from (docs/comparison.md)."""
+and 1e-6 the last has the smallest voltage error on the captures that are learned from (docs/theory/comparison.md)."""
 NOISE_WINDOW_S = 60.0
 """Joint filter: time constant with which the noise of the voltage follows the innovations [s]."""
 LN_SPAN = math.log(4.0)

@@ -1,4 +1,4 @@
-"""Figures of the fuel cell (docs/fuel-cell.md): ``make fuelcell``, half a minute.
+"""Figures of the fuel cell (docs/theory/fuel-cell.md): ``make fuelcell``, half a minute.
 
 Truth is the stack of ``tests.mann_stack``, which does more than the model, and two measured curves in tests/data/fuel_cell.
 """
@@ -25,7 +25,7 @@ from tests.mann_stack import CURVE_A
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 LEAST_A = 0.1
-"""Of the measured curves: see docs/fuel-cell.md [A/cm2]."""
+"""Of the measured curves: see docs/theory/fuel-cell.md [A/cm2]."""
 WRONG = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])
 """Parameters of the file that a search begins at, over those of ``pem_30w``."""
 WATCHED = "r_ohm", "tafel_slope_v", "exchange_current_a", "c_dl_farad"

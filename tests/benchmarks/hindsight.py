@@ -1,4 +1,4 @@
-"""How often the SOC is within 2 std by hindsight (`fleet ask honest`) and in truth, on real captures: docs/fleet-questions.md.
+"""How often the SOC is within 2 std by hindsight (`fleet ask honest`) and in truth, on real captures: docs/fleet/questions.md.
 
 Captures last hours, so six minutes stand for an hour. Each is entered as `make anywhere` does; each run is a pack.
 

@@ -1,4 +1,4 @@
-"""What the learning law is worth, simulated: ``make learning``. The tables of docs/observer.md.
+"""What the learning law is worth, simulated: ``make learning``. The tables of docs/theory/observer.md.
 
 The thesis's cell under steps of random height and length, a sample each second, bounds a quarter to four times the
 file's; the file is off by a factor 2 in R_s, R_ts, tau_ts, R_tl, tau_tl: sixteen of the 32 combinations, in which every
@@ -271,7 +271,7 @@ def ended(rows: SampleBlock, observer: Mapping[str, Any]) -> tuple[Estimator, Sa
 
 
 def guarantees() -> Iterator[tuple[str, str]]:
-    """A row for each promise of docs/observer.md that is not one of convergence."""
+    """A row for each promise of docs/theory/observer.md that is not one of convergence."""
     noisy = learner(TRUTH)
     q, theta = noisy.settings_record[0]["learning"], noisy.record[0]["learning"]["theta"]
     inside, estimate_v = True, []

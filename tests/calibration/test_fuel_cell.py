@@ -95,7 +95,7 @@ def test_a_stack_that_is_more_than_the_model_is_explained_to_some_millivolts() -
     assert after_v < 0.016
     assert after_v < before_v
     assert fit.model.fuel_cell.r_ohm > 1.1 * r.r_ohm.mean(), (
-        "what docs/fuel-cell.md says of it: more than the membrane's"
+        "what docs/theory/fuel-cell.md says of it: more than the membrane's"
     )
     assert fit.model.fuel_cell.r_ohm < 1.35 * r.r_ohm.mean()
 

@@ -84,9 +84,9 @@ STANDINS = {
 """Programs of the page that do nothing here."""
 
 
-def by_the_page(section: str, block: int = 0) -> str:
-    """The commands of docs/deploy.md: a block of indented lines in a section."""
-    text = (PROJECT / "docs/deploy.md").read_text()
+def by_the_page(section: str, block: int = 0, page: str = "service") -> str:
+    """Return the commands of a page of docs/pack: a block of indented lines in a section."""
+    text = (PROJECT / f"docs/pack/{page}.md").read_text()
     inside = re.split(rf"(?m)^##+ {section}\n", text)[1].split("\n##")[0]
     return [found for found in re.findall(r"(?:(?:^    .*)?\n)+", inside, re.MULTILINE) if found.strip()][block]
 

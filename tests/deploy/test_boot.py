@@ -1,4 +1,4 @@
-"""The units under a real systemd: installed by the commands of docs/deploy.md, hardened, killed, starved, uninstalled."""
+"""The units under a real systemd: installed by the commands of docs/pack/service.md, hardened, killed, starved, uninstalled."""
 
 import os
 import re

@@ -43,7 +43,7 @@ def broker(program, deploy, tmp_path) -> Iterator[int]:
 
 
 def write_users(folder: Path, deploy: Path, passwd: str) -> None:
-    """Passwords, and what each may do: a part for each pack, as the commands of docs/deploy.md put it together."""
+    """Passwords, and what each may do: a part for each pack, as the commands of docs/pack/service.md put it together."""
     passwords = folder / "bms.passwd"
     passwords.touch(mode=0o600)
     for user, password in PASSWORDS.items():
@@ -140,11 +140,11 @@ async def test_a_pack_hears_nothing_of_another(broker):
 
 @pytest.fixture
 def certified(program, deploy, tmp_path) -> Iterator[int]:
-    """Port of the listener for other machines, with certificates made by the commands of docs/deploy.md."""
+    """Port of the listener for other machines, with certificates made by the commands of docs/pack/service.md."""
     port = free_port()
     mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
     program("openssl", "openssl")
-    commands = by_the_page("Certificates").replace("broker.lan", "localhost").replace("house", "pack")
+    commands = by_the_page("Certificates", page="mosquitto").replace("broker.lan", "localhost").replace("house", "pack")
     commands += "openssl req -x509 $new -subj /CN=pack -keyout stranger.key -out stranger.crt\n"
     subprocess.run(["bash", "-ec", commands], cwd=tmp_path, check=True, capture_output=True)
     write_users(tmp_path, deploy, passwd)

@@ -10,8 +10,8 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import FULL_SCALE, BoardParts
 from tests.simavr_board import FIRMWARE, ROOT
 
-TABLE = (ROOT / "docs" / "wiring.md").read_text(encoding="utf-8")
-DRAWING = " ".join(ET.parse(ROOT / "docs" / "wiring.svg").getroot().itertext())
+TABLE = (ROOT / "docs" / "pack" / "board.md").read_text(encoding="utf-8")
+DRAWING = " ".join(ET.parse(ROOT / "docs" / "images" / "wiring.svg").getroot().itertext())
 LEAST_AVCC_V = 4.5
 FULL_PACK_V = 6 * 4.2
 TOLERANCE = 0.01

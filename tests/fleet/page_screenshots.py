@@ -1,4 +1,4 @@
-"""The pictures of docs/fleet-page.md: a made-up fleet on the real nats-server, in a real Chromium; ``make screenshots``."""
+"""The pictures of docs/fleet/page.md: a made-up fleet on the real nats-server, in a real Chromium; ``make screenshots``."""
 
 import asyncio
 import json
@@ -22,7 +22,7 @@ from tests.fleet.many_packs import Pack, beat, load, many, publish
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.sinks.snapshots import ONE
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "images"
 PACKS, AWAY, DAYS = 5000, 12, 90
 SUSPECTED = {
     7: InputFault.CAPACITY,
@@ -76,7 +76,7 @@ async def shoot(opened: Tab, name: str, part: str = "", height: int = 0) -> None
         size = page.viewport_size
         assert size
         await page.screenshot(path=path, clip={"x": 0, "y": 0, "width": size["width"], "height": height})
-    sys.stdout.write(f"{path.relative_to(DOCS.parent)}: {path.stat().st_size / 1e3:.0f} kB\n")
+    sys.stdout.write(f"{path.relative_to(DOCS.parents[1])}: {path.stat().st_size / 1e3:.0f} kB\n")
 
 
 async def shoot_all(url: str, kill: asyncio.Event) -> None:

@@ -25,7 +25,7 @@ from tests.page.house import SERIES, Service, simulated
 from tests.sinks.snapshots import ONE
 from tests.store.test_history import keep
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "images"
 LEARN_S = 60.0
 TOP = 500
 """So much of the page shows what an alarm, or stale values, look like [px]."""
@@ -74,7 +74,7 @@ async def shoot(opened: Tab, name: str, part: str = "", *, top: bool = False) ->
         await opened.page.locator(part).screenshot(path=path)
     else:
         await opened.page.screenshot(path=path, clip={"x": 0, "y": 0, "width": 1280, "height": TOP} if top else None)
-    sys.stdout.write(f"{path.relative_to(DOCS.parent)}: {path.stat().st_size / 1e3:.0f} kB\n")
+    sys.stdout.write(f"{path.relative_to(DOCS.parents[1])}: {path.stat().st_size / 1e3:.0f} kB\n")
 
 
 @contextlib.asynccontextmanager

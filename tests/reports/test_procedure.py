@@ -20,7 +20,7 @@ from tests.calibration.simulated_relaxation import relaxation
 
 CAPACITY_AH = TRUTH.cell.capacity_ah
 SERVES = {"relaxation": Kind.RELAXATION, "slow": Kind.CONSTANT, "constant": Kind.CONSTANT, "steps": Kind.STEPS}
-DOCUMENT = Path(__file__).parents[2] / "docs" / "chapter5.md"
+DOCUMENT = Path(__file__).parents[1] / "benchmarks" / "chapter5_results.md"
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_a_figure_of_a_load_that_is_missing_is_empty_and_says_so(samples, kept, 
 
 
 def test_leaf_figures(leaf):
-    """As in docs/chapter5.md."""
+    """As in docs/theory/chapter5.md."""
     run, (soc, _) = leaf.dynamic["cc"], leaf.interpolated("cc")
     assert (run.mean_percent, run.max_percent) == pytest.approx((0.543, 2.37), abs=0.005)
     assert leaf.static["cc"].mean_percent == pytest.approx(0.517, abs=0.005)

@@ -10,10 +10,10 @@ from bms_estimator.settings.mqtt_profiles import PROFILES
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.factory import make_line_producer
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "pack"
 EXAMPLES = [
     (document.name, text)
-    for document in sorted(DOCS.glob("sources-*.md"))
+    for document in sorted(DOCS.glob("*.md"))
     for text in re.findall(r"```toml\n(.*?)```", document.read_text(encoding="utf-8"), flags=re.DOTALL)
 ]
 
@@ -28,5 +28,5 @@ def test_an_example_is_accepted(document: str, text: str) -> None:
 
 
 def test_every_profile_stands_in_the_document() -> None:
-    text = (DOCS / "sources-mqtt.md").read_text(encoding="utf-8")
+    text = (DOCS / "mqtt-source.md").read_text(encoding="utf-8")
     assert [name for name in PROFILES if f"| `{name}` |" not in text] == []

@@ -13,7 +13,7 @@ SEEDS = range(3)
 WORLD_S = 1000.0
 """The last seven minutes of them are calm."""
 SILENCE_S = 21.0
-"""So long silence is borne, as docs/mqtt.md has it."""
+"""So long silence is borne, as docs/reference/mqtt.md has it."""
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -55,7 +55,7 @@ def identify_command(
     Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole range of SOC tell most;
     the OCV is better found by `ocv` before. Written is only what makes replays cut in mid-load no worse, give or take 5 %.
 
-    Of a fuel cell: polarisation curves (columns current_a, voltage_v) and records, docs/fuel-cell.md.
+    Of a fuel cell: polarisation curves (columns current_a, voltage_v) and records, docs/theory/fuel-cell.md.
     """
     check_out(out, captures, force=force)
     check_once(captures)

@@ -20,7 +20,7 @@ def edge(
 ) -> None:
     """Send a pack's raw samples to a fleet's server, until SIGINT or SIGTERM. Estimates nothing.
 
-    What the server has not got is kept on disk, and sent when it can be: see docs/fleet-edge.md.
+    What the server has not got is kept on disk, and sent when it can be: see docs/fleet/edge.md.
     """
     settings = with_sensor(load_settings(pack), port=port)
     configure_logs()

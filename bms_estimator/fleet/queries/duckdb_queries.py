@@ -1,6 +1,6 @@
 """Questions to the hours of all packs: SQL on Parquet files, by DuckDB. Reads while a collector writes.
 
-What each means, how it is computed and where it misleads: docs/fleet-questions.md.
+What each means, how it is computed and where it misleads: docs/fleet/questions.md.
 """
 
 import contextlib

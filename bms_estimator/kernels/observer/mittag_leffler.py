@@ -16,6 +16,7 @@ power series (3.11) serves.
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -38,8 +39,11 @@ def series_coefficients(alpha: float) -> Floats:
     return np.array([(-1.0) ** j * math.exp(-math.lgamma(alpha * j + 1.0)) for j in k])
 
 
+@lru_cache(maxsize=8)  # 5 million exponentials; an alpha seldom changes
 def decay_table(alpha: float) -> tuple[Floats, Floats]:
     """G_alpha and its derivative by w at ``TABLE_POINTS`` nodes of w = 1/(1 + r) in [0, 1/3].
+
+    The arrays are shared by all callers and read only.
 
     Raises:
         ValueError: When ``alpha`` is not in (2, 3]: E_a(-lambda k^a) is a Nussbaum function only there.
@@ -55,6 +59,7 @@ def decay_table(alpha: float) -> tuple[Floats, Floats]:
         terms = weight * np.exp(-r * s)
         value[i] = terms.sum()
         slope[i] = (terms * s).sum() / w[i] ** 2  # dG/dw = dG/dr * dr/dw, dr/dw = -1/w^2
+    value.flags.writeable = slope.flags.writeable = False
     return value, slope
 
 

@@ -11,7 +11,7 @@ from bms_estimator.numba_cache import njit
 class Nussbaum(IntEnum):
     """Choice of N(k), which drives the observer."""
 
-    MITTAG_LEFFLER = 0  # E_a(-lambda k^a), (3.10) with the sign of E1 of docs/thesis.md
+    MITTAG_LEFFLER = 0  # E_a(-lambda k^a), (3.10) with the sign of E1 of docs/theory/thesis.md
     K2_COS = 1  # N1 = k^2 cos k
     K_COS_SQRT = 2  # N2 = k cos sqrt|k|
     LN_COS_SQRT_LN = 3  # N3 = ln k cos sqrt(ln k), k > 1

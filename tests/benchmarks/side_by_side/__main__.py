@@ -1,7 +1,7 @@
 """Methods side by side on real captures: what each learns from one profile, tried on others that it never saw.
 
 ``make compare``, or some of the trials: ``make compare ARGS="NCR PF"``; with ``--json`` the figures one by one. What is
-measured and how is in docs/comparison.md.
+measured and how is in docs/theory/comparison.md.
 """
 
 import json

@@ -310,7 +310,7 @@ def test_certificates_that_cannot_be_used_are_named(
 
 
 def test_every_setting_is_in_the_document() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "fleet-server.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "fleet" / "server.md").read_text()
     named = [name for model in (ServerSettings, TlsSettings, TenantSettings) for name in model.model_fields]
     assert [name for name in named if f"{name}`" not in text] == []
 

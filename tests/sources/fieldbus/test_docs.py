@@ -1,4 +1,4 @@
-"""The examples of docs/sources-fieldbus.md are settings."""
+"""The examples of docs/pack/fieldbus.md are settings."""
 
 import re
 import tomllib
@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.settings.pack import Settings
 
-TEXT = (Path(__file__).parents[3] / "docs" / "sources-fieldbus.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).parents[3] / "docs" / "pack" / "fieldbus.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("example", re.findall(r"^```toml\n(.*?)^```", TEXT, flags=re.MULTILINE | re.DOTALL))
