@@ -16,7 +16,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check docs test demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere resolution unseen nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere resolution unseen nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -36,9 +36,14 @@ check: venv ## style, import order of the layers, and types, in seconds
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/mypy
 
-test: apt venv ## all there is to check: packages, style, types, firmware, pytest
+test: prepared ## style, types, firmware, and the tests of every promise
+	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile -m "not thorough" $(ARGS)
+
+test-all: prepared ## also the tests that repeat a promise in another way or for longer
+	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile $(ARGS)
+
+prepared: apt venv
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant
-	$(BIN)/python -m pytest --numprocesses=2 --dist=loadfile $(ARGS)
 
 demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory --silent firmware || echo "the firmware does not build here: the Python board serves"; fi

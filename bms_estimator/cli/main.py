@@ -14,39 +14,43 @@ from bms_estimator.version import __version__
 
 COMMANDS = {
     "run": Entry("bms_estimator.cli.live.run:run", "Estimate live from a board and publish."),
-    "top": Entry("bms_estimator.cli.live.top:top", "All packs of a broker at a glance."),
+    "top": Entry("bms_estimator.cli.live.top:top", "Show all packs of a broker."),
     "edge": Entry(
-        "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet's server, and estimate nothing."
+        "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet's server, without estimating."
     ),
-    "replay": Entry("bms_estimator.cli.captures.replay:replay", "Estimate from a recorded capture or a table."),
-    "alarms": Entry("bms_estimator.cli.captures.alarms:alarms", "Which alarms a recorded capture would have raised."),
+    "replay": Entry("bms_estimator.cli.captures.replay:replay", "Estimate from a capture or a table."),
+    "alarms": Entry("bms_estimator.cli.captures.alarms:alarms", "List the alarms that a capture would have raised."),
     "record": Entry("bms_estimator.cli.live.record:record", "Record a board's raw bytes with their arrival times."),
     "simulate": Entry("bms_estimator.cli.live.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
-    "ports": Entry("bms_estimator.cli.live.ports:ports", "List serial ports, and ask them for a board."),
+    "ports": Entry("bms_estimator.cli.live.ports:ports", "List serial ports, and identify devices on them."),
     "board": Entry("bms_estimator.cli.live.board:board", "Show a board, set its bandgap, gains and serial number."),
-    "dashboard": Entry("bms_estimator.cli.live.dashboard:dashboard", "The live page of all packs of a broker."),
-    "demo": Entry("bms_estimator.cli.live.demo:demo", "Broker, board and service in one terminal."),
+    "dashboard": Entry("bms_estimator.cli.live.dashboard:dashboard", "Serve the live page of all packs of a broker."),
+    "demo": Entry("bms_estimator.cli.live.demo:demo", "Run broker, board and service in one terminal."),
     "ocv": Entry(
         "bms_estimator.cli.cell.ocv:ocv",
-        "Open-circuit voltage from rests, slow curves or given curves, into a cell file.",
+        "Write a cell file with the OCV from rests, slow curves or given curves.",
     ),
     "identify": Entry(
-        "bms_estimator.cli.cell.identify:identify_command", "A cell's elements from captures, into a cell file."
+        "bms_estimator.cli.cell.identify:identify_command", "Write a cell file with resistances from captures."
     ),
-    "adapt": Entry("bms_estimator.cli.cell.adapt:adapt_command", "a1..a15 by the thesis's observer, into a cell file."),
-    "capacity": Entry("bms_estimator.cli.cell.capacity:capacity", "Capacity from rests and the charge between them."),
-    "cell": Entry("bms_estimator.cli.cell.export:app", "What a pack's service has learned, as a cell file."),
-    "history": Entry(
-        "bms_estimator.cli.live.history:history", "What the service kept of a pack, by the minute, as CSV."
+    "adapt": Entry(
+        "bms_estimator.cli.cell.adapt:adapt_command", "Write a cell file with a1..a15 by the thesis's steps."
     ),
+    "capacity": Entry(
+        "bms_estimator.cli.cell.capacity:capacity", "Measure the capacity from rests and the charge between them."
+    ),
+    "cell": Entry("bms_estimator.cli.cell.export:app", "Write a cell file with what a pack's service has learned."),
+    "history": Entry("bms_estimator.cli.live.history:history", "Print the history of a pack as CSV."),
     "validate": Entry(
-        "bms_estimator.cli.captures.validate:validate_command", "A cell's model against a capture, open loop."
+        "bms_estimator.cli.captures.validate:validate_command", "Compare a cell's model with a capture, open loop."
     ),
     "thesis": Entry(
         "bms_estimator.cli.captures.thesis:thesis", "Recompute the thesis's tables and figures as a report."
     ),
-    "asyncapi": Entry("bms_estimator.cli.settings.asyncapi:asyncapi", "What is published, as an AsyncAPI document."),
-    "fleet": Entry("bms_estimator.cli.fleet.commands:app", "Many packs: a server, workers, questions to all of them."),
+    "asyncapi": Entry(
+        "bms_estimator.cli.settings.asyncapi:asyncapi", "Print the topics and payloads as an AsyncAPI document."
+    ),
+    "fleet": Entry("bms_estimator.cli.fleet.commands:app", "Estimate many packs: server, workers, queries."),
     "config": Entry("bms_estimator.cli.settings.config:app", "Write, check and show a pack's settings."),
 }
 

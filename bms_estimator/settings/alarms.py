@@ -145,28 +145,28 @@ class AlarmSettings(Strict):
     stability_margin_low: ShareRule = ShareRule()
     cell_imbalance: VoltageRule = VoltageRule(delay_s=60.0)
     sensor_fault: ShareRule = Field(
-        default=ShareRule(clear_delay_s=30.0), description="limit: share of samples that are lost or unusable"
+        default=ShareRule(clear_delay_s=30.0), description="limit: fraction of samples that are lost or unusable"
     )
     model_mismatch: VoltageRule = Field(
-        default=VoltageRule(delay_s=60.0), description="limit_v: of the pack's innovation, measured less predicted"
+        default=VoltageRule(delay_s=60.0),
+        description="limit_v: innovation of the pack, measured minus predicted voltage",
     )
     link_lost: LinkRule = Field(
         default=LinkRule(delay_s=0.0, clear_delay_s=5.0),
-        description="limit_s: without a sample; 10 s, or 3 periods where that is longer",
+        description="limit_s: time without a sample; default: 10 s or 3 periods, whichever is longer",
     )
 
     hook_failed: AlarmRule = Field(
         default=AlarmRule(clear_delay_s=10.0),
-        description="a hook could not be started or has failed, until it works",
+        description="raised while the last run of a hook failed",
     )
 
     lost_s: NotNegative = Field(
         default=10.0,
-        description="a quantity that was measured before counts as lost after this time without a value, "
-        "and as measured again after the same time with values",
+        description="time without a value after which a quantity counts as lost, and time with values after which it counts as restored",
     )
     hook: tuple[AlarmHook, ...] = Field(
-        default=(), description="what is done of it, as in [[alarms.hook]]; nothing when left out"
+        default=(), description="actions when an alarm is raised or cleared, as [[alarms.hook]]; default: none"
     )
 
     @model_validator(mode="after")

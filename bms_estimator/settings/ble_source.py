@@ -12,18 +12,18 @@ STEP_V, STEP_A = 0.01, 0.01
 
 
 class BleSource(PolledSource):
-    """A BMS over Bluetooth Low Energy; needs Python 3.12."""
+    """BMS over Bluetooth Low Energy; needs Python 3.12."""
 
     kind: Literal["ble"]
     address: Annotated[str, Field(pattern=r"^[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}$")] | None = Field(
-        default=None, description='of the BMS, such as "A4:C1:38:00:11:22"; this or name'
+        default=None, description='address of the BMS, such as "A4:C1:38:00:11:22"; required without name'
     )
-    name: Annotated[str, Field(min_length=1)] | None = Field(default=None, description="that the BMS advertises")
+    name: Annotated[str, Field(min_length=1)] | None = Field(default=None, description="name that the BMS advertises")
     bms: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")] | None = Field(
         default=None,
-        description='what it is, as aiobmsble calls it: "jbd", "jikong", "daly", ...; found by its advertisement when left out',
+        description='device type of aiobmsble: "jbd", "jikong", "daly", ...; default: from its advertisement',
     )
-    poll_s: Annotated[float, Field(ge=0.5, le=600)] = Field(default=2.0, description="between two readings")
+    poll_s: Annotated[float, Field(ge=0.5, le=600)] = Field(default=2.0, description="interval between two readings")
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:

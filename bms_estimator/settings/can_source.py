@@ -89,32 +89,32 @@ class CellSignals(Signal):
 
 
 class CanSource(PolledSource):
-    """A bus that is listened to; nothing is ever sent."""
+    """CAN bus, receive only."""
 
     kind: Literal["can"]
     profile: str | None = Field(default=None, description=f"a bus whose signals are known: {', '.join(PROFILES)}")
     interface: Annotated[str, Field(min_length=1)] = Field(
-        default="socketcan", description="of python-can: socketcan, slcan, pcan, gs_usb, ..."
+        default="socketcan", description="interface of python-can: socketcan, slcan, pcan, gs_usb, ..."
     )
     channel: Annotated[str, Field(min_length=1)] = Field(
-        default="can0", description="interface of the system, or path of the adapter's serial port"
+        default="can0", description="network interface, or path of the adapter's serial port"
     )
     bitrate: Annotated[int, Field(ge=10_000, le=8_000_000)] | None = Field(
-        default=None, description="for adapters that set it; of socketcan the system does"
+        default=None, description="bit rate for adapters that need it; socketcan uses the system's"
     )
     options: dict[str, str | int | float | bool] = Field(
-        default_factory=dict, description="further arguments of python-can's bus"
+        default_factory=dict, description="further arguments of python-can's Bus"
     )
-    dbc: Path | None = Field(default=None, description="DBC file (or KCD, ARXML, SYM) that names the signals")
+    dbc: Path | None = Field(default=None, description="DBC file (or KCD, ARXML, SYM) with the signals")
     interval_s: Annotated[float, Field(ge=0.001, le=600)] = Field(
-        default=1.0, description="between two samples, as the bus brings them"
+        default=1.0, description="expected sample period on the bus"
     )
     voltage: Signal = Field(
-        description='of the pack: { signal = "PackVoltage" }, or { id = 0x356, start_bit = 0, bits = 16, scale = 0.01 }'
+        description='pack voltage: { signal = "PackVoltage" }, or { id = 0x356, start_bit = 0, bits = 16, scale = 0.01 }'
     )
-    current: Signal = Field(description="as voltage; sensor.current_sign says what is positive")
+    current: Signal = Field(description="as voltage; sensor.current_sign gives the sign")
     temperature: Signal | None = Field(default=None, description="as voltage")
-    cells: tuple[CellSignals, ...] = Field(default=(), description="a list of such, each with its count")
+    cells: tuple[CellSignals, ...] = Field(default=(), description="list of such signals, each with its count")
 
     @model_validator(mode="before")
     @classmethod

@@ -10,24 +10,24 @@ from bms_estimator.settings.mqtt import of_brokers
 
 
 class EdgeSettings(Strict):
-    """Destination of raw samples, and number of blocks stored while it is away: see docs/fleet/edge.md."""
+    """Edge of a fleet: destination and storage of raw samples, see docs/fleet/edge.md."""
 
     model_config = ConfigDict(hide_input_in_errors=True)
 
     url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] = Field(
-        default="mqtt://localhost:1883", description="MQTT port of the fleet's server, or a list, as mqtt.url"
+        default="mqtt://localhost:1883", description="URL of the fleet's server, or a list, as mqtt.url"
     )
     username: str | None = Field(default=None, description="as mqtt.username")
     password_file: Path | None = Field(
-        default=None, description="file that holds the password, or the edge's token; as mqtt.password_file"
+        default=None, description="file with the password or the edge's token; as mqtt.password_file"
     )
     ca_file: Path | None = Field(default=None, description="as mqtt.ca_file")
     cert_file: Path | None = Field(default=None, description="as mqtt.cert_file")
     key_file: Path | None = Field(default=None, description="as mqtt.key_file")
     block_s: Annotated[float, Field(ge=1.0, le=3600.0)] = Field(
-        default=60.0, description="so long samples are gathered; a kill costs at most these"
+        default=60.0, description="duration of a block; a kill loses at most one"
     )
     store_mib: Annotated[float, Field(ge=0.1, le=100_000.0)] = Field(
         default=100.0,
-        description="of blocks that wait on the disk, 100 days at a sample a second; then the oldest goes",
+        description="size limit of stored blocks, 100 days at 1 Hz; beyond it the oldest is dropped",
     )

@@ -11,25 +11,21 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class InfluxSettings(Strict):
-    """InfluxDB, or what takes its line protocol over HTTP: each state, and alarms when they change."""
+    """InfluxDB, or another server for its line protocol over HTTP: each state, and each change of an alarm."""
 
     url: Annotated[str, Field(pattern=r"^https?://[^/@\s?#]+(/[^@\s?#]*)?$")] = Field(
-        default="http://localhost:8086", description="http://host:port or https://host:port; name and password not here"
+        default="http://localhost:8086", description="http://host:port or https://host:port, without user and password"
     )
-    database: Name = Field(default="bms", description="of InfluxDB 1; of no use with bucket")
-    username: str | None = Field(default=None, description="of InfluxDB 1, where it asks for one")
+    database: Name = Field(default="bms", description="database of InfluxDB 1; ignored with bucket")
+    username: str | None = Field(default=None, description="user of InfluxDB 1, if required")
     password_file: Path | None = Field(
-        default=None, description="file that holds its password; a name alone: systemd's credential of this name"
+        default=None, description="file with the password; a name without folder: a systemd credential"
     )
-    bucket: Name | None = Field(default=None, description="of InfluxDB 2, in place of database")
-    org: Name | None = Field(default=None, description="organisation, of InfluxDB 2")
-    token_file: Path | None = Field(
-        default=None, description="file that holds a token which may write, of InfluxDB 2; as password_file"
-    )
-    ca_file: Path | None = Field(default=None, description="certificate authority for https, else the system's")
-    every_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
-        default=10.0, description="what came meanwhile is sent in one request"
-    )
+    bucket: Name | None = Field(default=None, description="bucket of InfluxDB 2, in place of database")
+    org: Name | None = Field(default=None, description="organization of InfluxDB 2")
+    token_file: Path | None = Field(default=None, description="file with a write token of InfluxDB 2; as password_file")
+    ca_file: Path | None = Field(default=None, description="certificate authority for https; default: the system's")
+    every_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(default=10.0, description="interval between requests")
 
     @model_validator(mode="after")
     def _one_of_two(self) -> Self:
@@ -41,11 +37,11 @@ class InfluxSettings(Strict):
 
 
 class PrometheusSettings(Strict):
-    """Prometheus: an address where it fetches the values."""
+    """Prometheus: address of the metrics endpoint."""
 
     listen: Annotated[str, Field(pattern=r"^([^:\s/@]+|\[[0-9A-Fa-f:]+\]):\d{1,5}$")] = Field(
         default="127.0.0.1:9108",
-        description="host:port of this pack alone; anybody who reaches it may read, so the loopback unless told",
+        description="host:port for this pack, readable by anyone who reaches it",
     )
 
     @property

@@ -13,15 +13,17 @@ Topic = Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")]
 class HomeAssistantSettings(Strict):
     """Home Assistant discovery over the broker, docs/pack/home-assistant.md."""
 
-    enabled: bool = Field(default=True, description="false: it is told nothing, and a device that it has goes")
-    discovery_prefix: Topic = Field(default="homeassistant", description="as in its MQTT integration")
-    status_topic: Topic = Field(default="homeassistant/status", description="where it says that it has started")
+    enabled: bool = Field(default=True, description="false: no discovery; an existing device is removed")
+    discovery_prefix: Topic = Field(
+        default="homeassistant", description="discovery prefix of Home Assistant's MQTT integration"
+    )
+    status_topic: Topic = Field(default="homeassistant/status", description="topic of Home Assistant's birth message")
     name: Annotated[str, Field(min_length=1)] | None = Field(
-        default=None, description="of the device; pack.name when left out"
+        default=None, description="name of the device; default: pack.name"
     )
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
-        default="discharge_positive", description="what it shows of current and power as positive"
+        default="discharge_positive", description="direction of positive current and power in Home Assistant"
     )
     names: dict[str, Annotated[str, Field(min_length=1)]] = Field(
-        default={}, description='of entities in your language, such as energy_in_kwh = "Energie geladen"'
+        default={}, description='names of entities, such as energy_in_kwh = "Energie geladen"'
     )

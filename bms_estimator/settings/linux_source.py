@@ -15,31 +15,32 @@ FINE_V = 1.25e-3
 
 
 class LinuxSource(PolledSource):
-    """A current sensor whose driver is in the kernel: INA2xx by hwmon, ADS1x15 by iio."""
+    """Current sensor with a kernel driver: INA2xx by hwmon, ADS1x15 by iio."""
 
     kind: Literal["linux"]
     chip: Name = Field(
-        default="ina226", description="name of the chip, its place on the bus such as 1-0040, or a folder of sysfs"
+        default="ina226", description="name of the chip, its bus address such as 1-0040, or a folder of sysfs"
     )
     voltage: Name = Field(
         default="in1_input",
-        description="file of the chip; of an iio chip the channel, such as in_voltage0; chip/file: of another chip",
+        description="file of the chip, or the channel of an iio chip, such as in_voltage0; chip/file for another chip",
     )
     current: Name = Field(
-        default="curr1_input", description="as voltage; a channel in volts is taken over shunt_ohm, which it needs then"
+        default="curr1_input",
+        description="as voltage; a channel in volts is divided by shunt_ohm, which is then required",
     )
     temperature: Name | None = Field(
-        default=None, description="as voltage, such as temp1_input; of the pack, not of the chip"
+        default=None, description="as voltage, such as temp1_input; temperature of the pack, not of the chip"
     )
-    voltage_scale: Positive = Field(default=1.0, description="of the divider: volts at the pack for one at the chip")
-    voltage_offset_v: float = Field(default=0.0, description="added to the pack's voltage")
-    current_scale: Positive = Field(default=1.0, description="correction of the shunt's tolerance")
-    current_offset_a: float = Field(default=0.0, description="added to the current")
+    voltage_scale: Positive = Field(default=1.0, description="ratio of the divider: pack voltage / chip voltage")
+    voltage_offset_v: float = Field(default=0.0, description="offset added to the pack voltage")
+    current_scale: Positive = Field(default=1.0, description="factor that corrects the shunt's tolerance")
+    current_offset_a: float = Field(default=0.0, description="offset added to the current")
     shunt_ohm: Positive | None = Field(
-        default=None, description="the shunt that is fitted; what the driver takes it for, when left out"
+        default=None, description="resistance of the shunt; default: the driver's assumption"
     )
     interval_s: Annotated[float, Field(ge=0.01, le=3600)] | None = Field(
-        default=None, description="between two samples; the chip's own, 0.1 s at least, when left out, 1 s without one"
+        default=None, description="sample period; default: the chip's, at least 0.1 s, or 1 s if it has none"
     )
 
     @property

@@ -85,29 +85,29 @@ class CellRegisters(Register):
 
 
 class ModbusSource(PolledSource):
-    """A device that is asked for its registers, over the network or over a serial line."""
+    """Modbus device, on the network or on a serial line."""
 
     kind: Literal["modbus"]
     profile: str | None = Field(default=None, description=f"a device whose registers are known: {', '.join(PROFILES)}")
-    host: str | None = Field(default=None, description="Modbus TCP: name or address of the device or the gateway")
+    host: str | None = Field(default=None, description="Modbus TCP: host name or address of the device or gateway")
     tcp_port: Annotated[int, Field(ge=1, le=65535)] = 502
     port: str | None = Field(
-        default=None, description="Modbus RTU: path of the serial port, best under /dev/serial/by-id"
+        default=None, description="Modbus RTU: path of the serial port, preferably below /dev/serial/by-id"
     )
     baud: Annotated[int, Field(ge=300, le=4_000_000)] = 9600
     parity: Literal["none", "even", "odd"] = "none"
     stop_bits: Literal[1, 2] = 1
     framing: Literal["tcp", "rtu"] | None = Field(
-        default=None, description='"rtu" with a host: a gateway that hands serial frames on as they are'
+        default=None, description='"rtu" with a host: a gateway that forwards serial frames unchanged'
     )
-    unit: Annotated[int, Field(ge=0, le=255)] = Field(default=1, description="number of the device on the line")
-    poll_s: Annotated[float, Field(ge=0.02, le=600)] = Field(default=1.0, description="between two readings")
-    timeout_s: Annotated[float, Field(ge=0.05, le=60)] = Field(default=1.0, description="for one answer")
-    voltage: Register = Field(description='of the pack, such as { address = 259, type = "uint16", scale = 0.01 }')
-    current: Register = Field(description="as voltage; sensor.current_sign says what is positive")
+    unit: Annotated[int, Field(ge=0, le=255)] = Field(default=1, description="unit number of the device")
+    poll_s: Annotated[float, Field(ge=0.02, le=600)] = Field(default=1.0, description="interval between two readings")
+    timeout_s: Annotated[float, Field(ge=0.05, le=60)] = Field(default=1.0, description="timeout of one response")
+    voltage: Register = Field(description='pack voltage, such as { address = 259, type = "uint16", scale = 0.01 }')
+    current: Register = Field(description="as voltage; sensor.current_sign gives the sign")
     temperature: Register | None = Field(default=None, description="as voltage")
     cells: CellRegisters | None = Field(
-        default=None, description="the first cell as voltage, how many, and step where they do not follow each other"
+        default=None, description="as voltage for the first cell, with count, and step if registers are not consecutive"
     )
 
     @model_validator(mode="before")

@@ -30,31 +30,31 @@ def of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 class MqttSettings(Strict):
-    """The broker, and what others may have done over it."""
+    """MQTT broker, and the requests that it may pass on."""
 
     model_config = ConfigDict(hide_input_in_errors=True)
 
     url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] = Field(
         default="mqtt://localhost:1883",
-        description="mqtt://host:port or mqtts://host:port for TLS; or a list of them, tried in turn",
+        description="mqtt://host:port, or mqtts://host:port for TLS; or a list to try in turn",
     )
     username: str | None = None
     password_file: Path | None = Field(
         default=None,
-        description="file that holds the password, read at start; a name alone: systemd's credential of this name",
+        description="file with the password; a name without folder: a systemd credential",
     )
-    ca_file: Path | None = Field(default=None, description="certificate authority for mqtts, else the system's")
+    ca_file: Path | None = Field(default=None, description="certificate authority for mqtts; default: the system's")
     cert_file: Path | None = Field(
-        default=None, description="our own certificate for mqtts, PEM, where the broker asks for one; as password_file"
+        default=None, description="client certificate for mqtts, PEM, if the broker requires one; as password_file"
     )
     key_file: Path | None = Field(
-        default=None, description="its key, PEM, not encrypted; in cert_file when left out; as password_file"
+        default=None, description="key of cert_file, PEM, not encrypted; default: in cert_file; as password_file"
     )
     base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
-        default="bms", description="first part of all topics: no +, # or spaces, no / at either end"
+        default="bms", description="first level of all topics: no +, # or spaces, no / at either end"
     )
     commands: tuple[Command, ...] = Field(
-        default=(), description="requests that change something and may be made by whoever may publish; none by default"
+        default=(), description="requests with an effect that clients may send; default: none"
     )
 
     @property

@@ -62,41 +62,41 @@ class ValueLocation(Strict):
 
 
 class MqttSource(PolledSource):
-    """Battery readings that another program publishes over MQTT: see docs/pack/mqtt-source.md."""
+    """Battery values that another program publishes over MQTT: see docs/pack/mqtt-source.md."""
 
     kind: Literal["mqtt"]
-    profile: ProfileName | None = Field(default=None, description="who publishes; tells all that is not set here")
-    prefix: Name | None = Field(default=None, description="name of the publisher in its topics, {prefix} in those here")
-    instance: str = Field(default="", description="which of its batteries, {instance} in topics and paths")
-    topic: Name | None = Field(default=None, description="of all quantities that have none of their own")
+    profile: ProfileName | None = Field(default=None, description="publisher, which sets the defaults of this section")
+    prefix: Name | None = Field(default=None, description="name of the publisher in its topics; replaces {prefix}")
+    instance: str = Field(default="", description="battery of the publisher; replaces {instance} in topics and paths")
+    topic: Name | None = Field(default=None, description="topic of all quantities without their own")
     voltage: ValueLocation | None = Field(
-        default=None, description='of the pack: a path, or {topic = "...", path = "..."}'
+        default=None, description='pack voltage: a path, or {topic = "...", path = "..."}'
     )
-    current: ValueLocation | None = Field(
-        default=None, description="as voltage; sensor.current_sign says what is positive"
-    )
+    current: ValueLocation | None = Field(default=None, description="as voltage; sensor.current_sign gives the sign")
     temperature: ValueLocation | None = Field(default=None, description="as voltage")
     cells: ValueLocation | None = Field(
-        default=None, description="as voltage, {cell} for the number of a cell, or a list"
+        default=None, description="as voltage, with {cell} for the cell number, or a list"
     )
     time: ValueLocation | None = Field(
-        default=None, description="as voltage: when it was measured, by the publisher's clock"
+        default=None, description="as voltage: time of measurement on the publisher's clock"
     )
     settle_s: Annotated[float, Field(ge=0, le=60)] = Field(
-        default=0.5, description="of voltage and current the one that does not come again in so long is as it was"
+        default=0.5, description="time after a new voltage or current, after which the other one counts as unchanged"
     )
-    max_age_s: Positive = Field(default=30.0, description="but no older than this")
-    slow_max_age_s: Positive = Field(default=300.0, description="and temperature and cells no older than this")
-    interval_s: Positive = Field(default=10.0, description="between two samples, as expected; fresh for three of them")
+    max_age_s: Positive = Field(default=30.0, description="maximum age of voltage and current")
+    slow_max_age_s: Positive = Field(default=300.0, description="maximum age of temperature and cells")
+    interval_s: Positive = Field(default=10.0, description="expected sample period; samples are stale after three")
     availability_topic: str | None = Field(
-        default=None, description="where the publisher, or its will, says offline; only a reason is made of it"
+        default=None, description="topic on which the publisher or its last will reports offline; used only as a reason"
     )
-    ask: Mapping[str, str] = Field(default={}, description="payloads by the topic on which they make it publish")
-    ask_s: Positive = Field(default=10.0, description="they are sent so often")
+    ask: Mapping[str, str] = Field(
+        default={}, description="requests: payload by topic, for publishers that only answer"
+    )
+    ask_s: Positive = Field(default=10.0, description="interval of the requests")
     url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] | None = Field(
-        default=None, description="of the broker, or a list of them, tried in turn; that of [mqtt] when left out"
+        default=None, description="URL of the broker, or a list to try in turn; default: that of [mqtt]"
     )
-    username: str | None = Field(default=None, description="of the broker at url")
+    username: str | None = Field(default=None, description="user at the broker in url")
     password_file: Path | None = Field(default=None, description="as mqtt.password_file, for the broker at url")
     ca_file: Path | None = Field(default=None, description="as mqtt.ca_file, for the broker at url")
 

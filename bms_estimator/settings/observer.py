@@ -12,8 +12,7 @@ class ObserverSettings(Strict):
 
     law: Literal["improved", "scheme-1", "scheme-2", "scheme-3", "learning"] = Field(
         default="improved",
-        description="improved: (3.18) with output (4.1); scheme-1..3: (3.16)..(3.18) with (3.14); "
-        "learning: sensitivity times e, docs/theory/observer.md, the default where identifier.enabled = false",
+        description="adaptation law. improved: (3.18) with output (4.1); scheme-1..3: (3.16)..(3.18) with (3.14); learning: identifies parameters, the default with identifier.enabled = false",
     )
     nussbaum: Literal["mittag-leffler", "k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"] = "mittag-leffler"
     alpha: Annotated[float, Field(gt=2, le=3)] = Field(default=2.5, description="a of (3.10), in (2, 3]")
@@ -21,26 +20,26 @@ class ObserverSettings(Strict):
     k0: NotNegative = Field(default=0.0, description="k(t0) of (3.13)")
     dead_zone_v: NotNegative | None = Field(
         default=None,
-        description="errors below do not raise k; from the sensor's resolution when left out; 0: (3.13) as printed",
+        description="errors below it do not raise k; default: from the sensor's resolution; 0: (3.13) as printed",
     )
     epsilon_v: Positive | None = Field(
-        default=None, description="eps2 of Algorithm 1: below it the error has converged"
+        default=None, description="eps2 of Algorithm 1: an error below it counts as converged"
     )
-    gain_limit: Positive = Field(default=1e3, description="clamp of |N|")
+    gain_limit: Positive = Field(default=1e3, description="limit of |N|")
     rearm_gain: float | None = Field(
         default=0.5,
-        description='below this N, in lock, k starts again; "never": the printed law',
+        description='in lock, k is reset if N falls below it; "never": the printed law',
     )
     lock_error_v: Positive | None = Field(
-        default=None, description="an error beyond it for lock_time_s is a loss of lock"
+        default=None, description="an error above it for lock_time_s is a loss of lock"
     )
     lock_time_s: Positive = 10.0
     margin_guard: Annotated[float, Field(ge=1e-6, le=1)] = Field(
         default=0.005,
-        description="adaptation stops this far above max(delta1, delta2); at these a capacitance is 0",
+        description="distance above max(delta1, delta2), where a capacitance is 0, at which adaptation stops",
     )
     scheme_2_lambda: Positive = Field(default=100.0, description="lambda_i of (3.17)")
-    scheme_2_epsilon: Positive = Field(default=0.35, description="parameters up to this value are penalised, (3.17)")
+    scheme_2_epsilon: Positive = Field(default=0.35, description="parameters up to this value are penalized, (3.17)")
 
     @model_validator(mode="before")
     @classmethod
@@ -54,25 +53,22 @@ class ObserverSettings(Strict):
 class IdentifierSettings(Strict):
     """The identifier: SOC with its error, the cell's own parameters."""
 
-    enabled: bool = Field(
-        default=True, description="false: SOC by coulomb counting, parameters as the observer's law has them"
-    )
+    enabled: bool = Field(default=True, description="false: SOC by coulomb counting, parameters by the observer's law")
     map_memory_h: Annotated[float, Field(ge=1)] = Field(
-        default=336.0, description="time constant with which learned elements are forgotten"
+        default=336.0, description="time constant of forgetting learned elements"
     )
     current_offset_std_a: NotNegative | None = Field(
         default=None,
-        description="how wrong the current sensor's zero may be; from the capacity when left out; 0: it is taken as right",
+        description="standard deviation of the current sensor's offset; default: from the capacity; 0: no offset",
     )
     capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
         default=None,
-        description="how wrong the declared capacity may be, relative; the cell file's when left out; "
-        "0: it is taken as right",
+        description="relative standard deviation of the capacity; default: that of the cell file; 0: capacity is exact",
     )
     soc_std: Annotated[float, Field(ge=0.005, le=0.5)] | None = Field(
-        default=None, description="how wrong the SOC at start may be; a fifth when left out"
+        default=None, description="standard deviation of the initial SOC; default: 0.2"
     )
     hysteresis_v: NotNegative | None = Field(
         default=None,
-        description="OCV after charge less that after discharge, of one cell; that of the cell file when left out",
+        description="OCV of one cell after charge minus that after discharge; default: that of the cell file",
     )

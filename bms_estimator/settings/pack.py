@@ -35,24 +35,28 @@ DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
 class PackSettings(Strict):
     """Cells of the pack, their number, and the initial SOC."""
 
-    name: DeviceName = Field(default="pack", description="device in topic names: letters, digits, _ and -")
+    name: DeviceName = Field(default="pack", description="name of the pack in topics: letters, digits, _ and -")
     cell: Annotated[str, Field(min_length=1)] = Field(
         default="ncr18650",
-        description="lfp, nmc, nca, lco, lmo, lto: generic, give capacity_ah; else a shipped cell's name or a cell file's path",
+        description="generic cell (lfp, nmc, nca, lco, lmo, lto; needs capacity_ah), a shipped cell's name, or the path of a cell file",
     )
     capacity_ah: Positive | None = Field(
-        default=None, description="what one cell-file object holds; that of the cell file when left out"
+        default=None, description="capacity of one cell-file object; default: that of the cell file"
     )
-    series: Annotated[int, Field(ge=1, le=10_000)] = Field(default=1, description="cell-file objects in series")
-    parallel: Annotated[int, Field(ge=1, le=10_000)] = Field(default=1, description="cell-file objects in parallel")
-    initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
+    series: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        default=1, description="number of cell-file objects in series"
+    )
+    parallel: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        default=1, description="number of cell-file objects in parallel"
+    )
+    initial_soc: Fraction | None = Field(default=None, description="initial SOC, 0..1; default: from the OCV")
 
 
 class PublishSettings(Strict):
     """Publish rate."""
 
     rate_hz: Annotated[float, Field(ge=LEAST_RATE_HZ, le=MOST_RATE_HZ)] = Field(
-        default=1.0, description="snapshots per second"
+        default=1.0, description="publications per second"
     )
 
 
@@ -61,13 +65,12 @@ class StateSettings(Strict):
 
     folder: Path | None = Field(
         default=None,
-        description="where checkpoints go; systemd's StateDirectory when left out, else the user's XDG state folder",
+        description="folder of checkpoints and history; default: systemd's StateDirectory, or the user's XDG state folder",
     )
     checkpoint_s: Annotated[float, Field(ge=1)] = 60.0
     longest_days: Positive | None = Field(
         default=None,
-        description="a checkpoint that is known to be older is not taken up, as where packs are exchanged; "
-        "without: any age, only the SOC is less sure",
+        description="maximum age of a checkpoint, for packs that are exchanged [days]; default: no limit",
     )
 
 
@@ -76,17 +79,17 @@ class StoreSettings(Strict):
 
     outbox_messages: Annotated[int, Field(ge=1, le=10_000_000)] = Field(
         default=90_000,
-        description="states and events that wait for a broker, a day of states at one a second; then the oldest goes",
+        description="maximum number of queued states and events, a day of states at 1 Hz; beyond it the oldest is dropped",
     )
     history_days: Annotated[int, Field(ge=0, le=36_600)] = Field(
-        default=366, description="how long minutes and events are kept; 0: none are"
+        default=366, description="length of the stored history [days]; 0: none"
     )
 
 
 class LogSettings(Strict):
     """Logging."""
 
-    level: LogLevel = Field(default="info", description="and what is worse")
+    level: LogLevel = Field(default="info", description="minimum level of log messages")
 
 
 class Settings(Strict):
@@ -94,18 +97,16 @@ class Settings(Strict):
 
     pack: PackSettings = PackSettings()
     sensor: SensorSettings = SensorSettings()
-    source: SourceSettings | None = Field(
-        default=None, description="leave out where the board of [sensor] is the source"
-    )
+    source: SourceSettings | None = Field(default=None, description="omit if the source is the board of [sensor]")
     observer: ObserverSettings = ObserverSettings()
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
-    mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
-    edge: EdgeSettings | None = Field(default=None, description="leave out to send no samples to a fleet")
+    mqtt: MqttSettings | None = Field(default=None, description="omit to publish nothing")
+    edge: EdgeSettings | None = Field(default=None, description="omit to send no samples to a fleet")
     home_assistant: HomeAssistantSettings = HomeAssistantSettings()
-    influx: InfluxSettings | None = Field(default=None, description="leave out to write to none")
-    prometheus: PrometheusSettings | None = Field(default=None, description="leave out to listen nowhere")
-    page: PageSettings | None = Field(default=None, description="leave out to serve none")
+    influx: InfluxSettings | None = Field(default=None, description="omit to write to none")
+    prometheus: PrometheusSettings | None = Field(default=None, description="omit to disable")
+    page: PageSettings | None = Field(default=None, description="omit to serve no page")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()

@@ -51,20 +51,17 @@ def _of_listen(text: str) -> str:
 
 
 class PageSettings(Strict):
-    """The live page in a browser."""
+    """Live page for a browser."""
 
     listen: Annotated[str, AfterValidator(_of_listen)] = Field(
         default=DEFAULT_LISTEN,
-        description="host:port; packs of one process that name the same share a page. Beyond this machine, "
-        "such as 0.0.0.0:8765, it needs token_file",
+        description="host:port; packs of one process with the same address share a page. Beyond this machine, such as 0.0.0.0:8765, token_file is required",
     )
     token_file: Path | None = Field(
         default=None,
-        description="file that holds what a browser must show, read at start; as mqtt.password_file",
+        description="file with the access token; as mqtt.password_file",
     )
-    hosts: tuple[str, ...] = Field(
-        default=(), description="further names under which browsers reach it, as behind a proxy"
-    )
+    hosts: tuple[str, ...] = Field(default=(), description="further host names of the page, for example behind a proxy")
 
     @property
     def address(self) -> Listen:

@@ -22,45 +22,44 @@ def _filled(sensor: dict[str, object]) -> dict[str, object]:
 
 
 class SensorSettings(Strict):
-    """The board, what it resolves, and its sign of current."""
+    """Sensor board or serial device: port, resolution, current sign."""
 
     port: str = Field(
-        default="auto", description="device path, best under /dev/serial/by-id; auto: the only board found"
+        default="auto", description="device path, preferably below /dev/serial/by-id; auto: the only board"
     )
     serial: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")] | None = Field(
         default=None,
-        description='the only board that is taken, as `bms-estimator board` shows its number, such as "0000002a"; '
-        "the first that came, which is remembered, when left out",
+        description='serial number of the board, as `bms-estimator board` prints it, such as "0000002a"; default: that of the first board, which is stored',
     )
     protocol: Annotated[str, OneOf(PROTOCOLS)] = Field(
-        default=BOARD, description="frames of the firmware, text lines, or a BMS or meter by its name"
+        default=BOARD, description="binary (this project's firmware), text, or the name of a BMS or meter"
     )
     address: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
-        description="of several packs on one RS485 line, the one that is taken; the first that answers when left out",
+        description="address of the pack on a shared RS485 line; default: the first that responds",
     )
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
-        default=500_000, description="a device's own when left out"
+        default=500_000, description="default: that of the device"
     )
-    sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
+    sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(
+        default=100, description="sample rate requested from a binary board"
+    )
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
         default="discharge_positive",
-        description="what the board, or a table, calls positive; inside, discharge is; a device's own when left out",
+        description="direction of positive current in the source or a table; default: that of the device",
     )
-    voltage_resolution_v: Positive = Field(
-        default=25.0 / 1024, description="one step of the voltage converter; a device's own when left out"
-    )
+    voltage_resolution_v: Positive = Field(default=25.0 / 1024, description="voltage step; default: that of the device")
     voltage_noise_v: NotNegative | None = Field(
-        default=None, description="standard deviation of one voltage sample; half a step when left out"
+        default=None, description="standard deviation of one voltage sample; default: half a step"
     )
     current_resolution_a: NotNegative | None = Field(
-        default=None, description="one step of the current; a device's own when left out, of a board as good as none"
+        default=None, description="current step; default: that of the device, none for a board"
     )
     current_dead_band_a: NotNegative | None = Field(
-        default=None, description="smaller currents are shown as 0; a device's own when left out, else none are"
+        default=None, description="smaller currents are reported as 0; default: that of the device, otherwise none"
     )
     period_s: Positive | None = Field(
-        default=None, description="between two samples, where they come at their own pace; a device's when left out"
+        default=None, description="sample period of a source with a fixed pace; default: that of the device"
     )
 
     @model_validator(mode="wrap")

@@ -10,6 +10,8 @@ from tests.deploy.boot import SECRET, boot, make_root
 from tests.deploy.kernel_cache import LEFT_OUT
 from tests.patience import LONG_S
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory) -> dict[str, str]:

@@ -130,7 +130,7 @@ async def a_board(kind: str, truth: Truth, folder: Path) -> AsyncIterator[Board]
             yield Board(simulated.path, lambda: None)  # it powers up when its line is opened
 
 
-@pytest.fixture(params=["simavr", "python"])
+@pytest.fixture(params=["simavr", pytest.param("python", marks=pytest.mark.thorough)])
 def kind(request: pytest.FixtureRequest) -> str:
     if request.param == "simavr":
         request.getfixturevalue("firmware")

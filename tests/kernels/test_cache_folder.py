@@ -85,7 +85,13 @@ def zeros_in_its_code(content: bytes) -> bytes:
 
 @pytest.mark.parametrize(
     ("kind", "damaged"),
-    [("nbi", cut), ("nbi", emptied), ("nbc", cut), ("nbc", emptied), ("nbc", zeros_in_its_code)],
+    [
+        ("nbi", cut),
+        pytest.param("nbi", emptied, marks=pytest.mark.thorough),
+        pytest.param("nbc", cut, marks=pytest.mark.thorough),
+        pytest.param("nbc", emptied, marks=pytest.mark.thorough),
+        ("nbc", zeros_in_its_code),
+    ],
 )
 def test_a_kept_kernel_that_was_damaged_is_compiled_and_kept_again(
     tmp_path: Path, kind: str, damaged: Callable[[bytes], bytes]

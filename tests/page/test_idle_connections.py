@@ -34,9 +34,11 @@ async def test_the_service_saves_checkpoints_and_finds_its_broker_again(tmp_path
     assert_unimpressed(await attack_service(tmp_path, broker))
 
 
+@pytest.mark.thorough
 async def test_the_dashboard_finds_its_broker_again(tmp_path: Path, broker: Broker) -> None:
     assert_unimpressed(await attack_dashboard(tmp_path, broker))
 
 
+@pytest.mark.thorough
 async def test_the_page_of_a_fleet_finds_its_server_again(tmp_path: Path, engine: Engine) -> None:
     assert_unimpressed(await attack_fleet_page(tmp_path, engine))

@@ -197,6 +197,7 @@ def shift_of_a2(start, law):
     return solved.y[7, -1] - started[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_fitted_starts_move_the_parameters_as_the_differential_equations_do(simulation, n):
     """E25: each fits Tables 2 and 3, whatever the kernel's step; k integrates the e^2 that moves the parameters."""

@@ -206,6 +206,7 @@ def real_cells(shared_data):
     return {experiment.name: chapter5.protocol(experiment) for experiment in chapter5.EXPERIMENTS}
 
 
+@pytest.mark.thorough
 def test_the_document_gives_every_error_that_is_measured(real_cells):
     """To the digits that it prints."""
     measured = [" | ".join(row) for name, p in real_cells.items() for row in chapter5.lines(name, p)]
@@ -213,6 +214,7 @@ def test_the_document_gives_every_error_that_is_measured(real_cells):
     assert re.findall(r"^\| (.*) \|$", table, re.MULTILINE)[1:] == measured
 
 
+@pytest.mark.thorough
 def test_the_document_gives_every_verdict(real_cells):
     room = [real_cells[experiment.name] for experiment in chapter5.EXPERIMENTS if experiment.room]
     measured = [

@@ -72,14 +72,14 @@ def alarms(
         Path | None, typer.Option(help="settings of the pack with its limits, pack.toml", show_default=False)
     ] = None,
     soc: Annotated[
-        float | None, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample; else from the OCV")
+        float | None, typer.Option(parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the OCV")
     ] = None,
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which alarms a recorded capture would have raised, and when; hooks are left alone.
+    """List the alarms that a capture would have raised, with their times. No hooks are run.
 
-    The same judgement of the same samples as in live operation.
+    The checks are those of live operation.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:

@@ -56,22 +56,24 @@ def replay(
     capacity_ah: CapacityAh = None,
     pack: Annotated[Path | None, typer.Option(help="settings of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
-        float | None, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample; else from the OCV")
+        float | None, typer.Option(parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the OCV")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="estimates sample by sample: .csv, .csv.gz, .parquet", show_default=False)
+        Path | None,
+        typer.Option(help="file for the estimates of each sample: .csv, .csv.gz, .parquet", show_default=False),
     ] = None,
     force: Force = False,
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,
     mqtt: Annotated[str | None, typer.Option(help="publish to this broker, mqtt://host:port")] = None,
     speed: Annotated[
-        float | None, typer.Option(parser=decimal(1e-3), help="times as fast as recorded; else as fast as it goes")
+        float | None,
+        typer.Option(parser=decimal(1e-3), help="speed relative to the recording; default: as fast as possible"),
     ] = None,
 ) -> None:
-    """Estimate from a recorded capture or a table.
+    """Estimate from a capture or a table.
 
-    The same estimator as in live operation: a capture that ``record`` made gives the same estimates to the last bit.
+    The estimator is that of live operation. A capture of ``record`` gives bit-identical estimates.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:

@@ -37,12 +37,12 @@ def thesis(
     cell: Annotated[str | None, typer.Option(help=f"of the captures: {CELL_HELP}", show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     resolution_v: Annotated[
-        float, typer.Option(parser=decimal(1e-9), help="one step of the captures' voltage [V]")
+        float, typer.Option(parser=decimal(1e-9), help="voltage step of the captures [V]")
     ] = TABLE_RESOLUTION_V,
     current_sign: SignOfCurrent = None,
     out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
-    table: Annotated[str | None, typer.Option(help="this table only, 1 to 13 or Errata", show_default=False)] = None,
-    figure: Annotated[str | None, typer.Option(help="this figure only, 1 to 50", show_default=False)] = None,
+    table: Annotated[str | None, typer.Option(help="only this table, 1 to 13 or Errata", show_default=False)] = None,
+    figure: Annotated[str | None, typer.Option(help="only this figure, 1 to 50", show_default=False)] = None,
 ) -> None:
     """Recompute the thesis's tables and figures, and write them beside the printed ones as one HTML page.
 

@@ -24,14 +24,16 @@ def validate_command(
     capacity_ah: CapacityAh = None,
     soc: Annotated[
         float | None,
-        typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample; else from the first rest's voltage"),
+        typer.Option(
+            parser=decimal(0.0, 1.0), help="SOC at the first sample; default: from the voltage of the first rest"
+        ),
     ] = None,
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a capture's voltage from its current alone and compare.
 
-    Open loop: the parameters are frozen and the voltage is not used, except the first rest's for the initial SOC.
+    The parameters are frozen, and the measured voltage gives only the SOC of the first rest.
     """
     model = load_cell(cell, capacity_ah)
     found = validate(load_capture(capture, current_sign=current_sign), model, initial_soc=soc)

@@ -62,7 +62,7 @@ def capacity(
         float | None,
         typer.Option(
             parser=decimal(0.0),
-            help="how wrong the sensor's zero may be [A]; else as `identifier.current_offset_std_a` has it",
+            help="standard deviation of the current sensor's offset [A]; default: that of `identifier.current_offset_std_a`",
             show_default=False,
         ),
     ] = None,
@@ -71,9 +71,8 @@ def capacity(
 ) -> None:
     """Measure the capacity from rests and the charge counted between them.
 
-    Each rest tells the SOC by the cell's OCV, as well as the curve is known and steep there. From all of them together,
-    over any load, comes the charge from full to empty with its standard deviation. A cell file is not written:
-    `cell.capacity_ah` and `cell.capacity_std` of a cell file are the place for what was measured.
+    Each rest gives an SOC by the cell's OCV. All rests together give the charge from full to empty with its standard
+    deviation, under any load. No cell file is written; enter the result as `cell.capacity_ah` and `cell.capacity_std`.
     """
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]

@@ -47,14 +47,14 @@ def export(
     pack: Annotated[Path, typer.Argument(help="settings of the pack, pack.toml", show_default=False)],
     out: NewCellFile,
     checkpoint: Annotated[
-        Path | None, typer.Option(help="its checkpoint; else where its service keeps it", show_default=False)
+        Path | None, typer.Option(help="checkpoint file; default: that of the service", show_default=False)
     ] = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a cell file with what a pack's checkpoint holds: OCV, capacity and resistances, each with its error.
+    """Write a cell file from a pack's checkpoint: OCV, capacity and resistances, each with its error.
 
-    A service that starts from it, here or on a replacement, begins with what this one has learned.
+    A service that uses the file starts with what this one has learned.
     """
     settings, model = load_pack(pack)
     cell, series = unpacked_cell(pack, settings), settings.pack.series

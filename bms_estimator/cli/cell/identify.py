@@ -42,20 +42,22 @@ def identify_command(
     temperature_c: Annotated[
         float | None,
         typer.Option(
-            parser=decimal(), help="of captures without the column temperature_c; else 25", show_default=False
+            parser=decimal(),
+            help="temperature of captures without the column temperature_c [°C]; default: 25",
+            show_default=False,
         ),
     ] = None,
-    keep_ocv: Annotated[bool, typer.Option(help="leave the open-circuit voltage as it is")] = False,
+    keep_ocv: Annotated[bool, typer.Option(help="do not correct the open-circuit voltage")] = False,
     current_sign: SignOfCurrent = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Identify a cell's resistances from captures and write a cell file.
 
-    Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole range of SOC tell most;
-    the OCV is better found by `ocv` before. Written is only what makes replays cut in mid-load no worse, give or take 5 %.
+    Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole SOC range are best. Run
+    `ocv` first. The file is written only if replays started in mid-load get at most 5 % worse.
 
-    Of a fuel cell: polarisation curves (columns current_a, voltage_v) and records, docs/theory/fuel-cell.md.
+    For a fuel cell use polarization curves (columns current_a, voltage_v) and records: docs/theory/fuel-cell.md.
     """
     check_out(out, captures, force=force)
     check_once(captures)

@@ -127,26 +127,27 @@ def ocv(
         float | None,
         typer.Option(
             parser=decimal(1e-6),
-            help="capacity SOC is counted against [Ah]; else by a slow discharge",
+            help="capacity for counting the SOC [Ah]; default: measured by a slow discharge",
             show_default=False,
         ),
     ] = None,
-    form: Annotated[Form, typer.Option(help="a smooth table, or the polynomial (2.10)")] = Form.TABLE,
+    form: Annotated[Form, typer.Option(help="smooth table, or the polynomial (2.10)")] = Form.TABLE,
     soc: Annotated[
-        float, typer.Option(parser=decimal(0.0, 1.0), help="at the first sample of the fullest captures")
+        float, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample of the fullest captures")
     ] = 1.0,
     series: Annotated[
-        int | None, typer.Option(parser=whole(1), help="cells in series; else by 3.7 V each", show_default=False)
+        int | None,
+        typer.Option(parser=whole(1), help="number of cells in series; default: from 3.7 V a cell", show_default=False),
     ] = None,
     current_sign: SignOfCurrent = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the open-circuit voltage and write a cell file.
+    """Determine the open-circuit voltage and write a cell file.
 
-    From captures with rests (relaxation tests, thesis 5.2.1, or HPPC), from slow discharges with or without their charges,
-    and from curves with columns soc, ocv_v[, hysteresis_v], at any temperatures, fitted jointly. What each is, is found out.
-    The file's elements are a first idea, from the rests and the generic cell most like it: `identify` makes them good.
+    Sources are captures with rests (relaxation tests, thesis 5.2.1, or HPPC), slow discharges and charges, and curves with
+    columns soc, ocv_v[, hysteresis_v], at any temperatures. The kind of each file is recognized. The file's resistances are
+    estimates from the rests and the most similar generic cell; `identify` improves them.
     """
     check_out(out, captures, force=force)
     check_once(captures)

@@ -25,9 +25,11 @@ BLOCK_S = 120.0
 minute."""
 
 Since = Annotated[
-    datetime | None, typer.Option("--from", formats=FORMATS, help="UTC; else from the oldest that is kept")
+    datetime | None, typer.Option("--from", formats=FORMATS, help="start time, UTC; default: the oldest block")
 ]
-Until = Annotated[datetime | None, typer.Option("--to", formats=FORMATS, help="to before, UTC; else to the newest")]
+Until = Annotated[
+    datetime | None, typer.Option("--to", formats=FORMATS, help="end time (exclusive), UTC; default: the newest block")
+]
 
 
 def capture(
@@ -40,10 +42,10 @@ def capture(
     ca: Ca = None,
     force: Force = False,
 ) -> None:
-    """Write what a pack has sent as a table that `replay`, `identify`, `validate` and `capacity` read.
+    """Write a pack's samples to a table that `replay`, `identify`, `validate` and `capacity` read.
 
-    Blocks are in the order of their numbers, each once; the server keeps them for days only (`fleet serve`). With
-    `fleet packs show PACK --out FOLDER` beside it, `replay` estimates as the workers did.
+    Blocks are in the order of their numbers. The server keeps them for some days (`fleet serve`). With the settings of
+    `fleet packs show PACK --out FOLDER`, `replay` estimates as the workers did.
     """
     check_out(out, [], force=force)
     sink = table_sink(out)

@@ -16,19 +16,18 @@ from bms_estimator.process.signals import stop_on_signal
 
 
 def demo(
-    packs: Annotated[int, typer.Option(parser=whole(1, 100_000), help="simulated, each with its edge")] = 1000,
-    seconds: Annotated[float, typer.Option(parser=decimal(3.0), help="how long edges send")] = 45.0,
+    packs: Annotated[int, typer.Option(parser=whole(1, 100_000), help="number of simulated packs")] = 1000,
+    seconds: Annotated[float, typer.Option(parser=decimal(3.0), help="duration for which edges send [s]")] = 45.0,
     page_port: Annotated[
-        int | None, typer.Option(parser=whole(1, 65535), help="of the page; else a free one", show_default=False)
+        int | None,
+        typer.Option(parser=whole(1, 65535), help="port of the page; default: a free port", show_default=False),
     ] = None,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="open the page where there is a desktop")
-    ] = True,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
 ) -> None:
-    """Server, simulated packs, two workers and the fleet's page in one terminal; one worker is killed. About a minute.
+    """Run server, simulated packs, two workers and the fleet's page in one terminal for a minute; one worker is killed.
 
-    All are real processes on the loopback, with free ports and a folder that goes at the end. The edges run at ten times
-    the speed. What is said comes from the workers' heartbeats and from estimates beside the simulated packs' true SOC.
+    All are real processes on loopback with free ports and a temporary folder. The edges run ten times as fast as real
+    time. The output compares estimates with the true SOC of the simulated packs.
     """
     with show_compile_progress():
         load_fleet_kernels()

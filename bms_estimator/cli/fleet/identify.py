@@ -37,16 +37,15 @@ RESULTS = "results.csv"
 def identify(
     packs: Annotated[list[str] | None, typer.Argument(help="their names", show_default=False)] = None,
     from_file: Annotated[
-        Path | None, typer.Option(help="names, one a line, or a CSV with the column pack", show_default=False)
+        Path | None, typer.Option(help="file with names, one a line, or a CSV with the column pack", show_default=False)
     ] = None,
     out: Annotated[Path, typer.Option(help="folder for cell files and results.csv")] = Path("identified"),
-    put: Annotated[
-        bool, typer.Option("--put", help="let the fleet know the new cells: workers take them at once")
-    ] = False,
+    put: Annotated[bool, typer.Option("--put", help="upload the new cells, which workers use at once")] = False,
     since: Since = None,
     until: Until = None,
     processes: Annotated[
-        int | None, typer.Option(parser=whole(1), help="on this machine; else one for each CPU", show_default=False)
+        int | None,
+        typer.Option(parser=whole(1), help="number of processes; default: one for each CPU", show_default=False),
     ] = None,
     server: Server = SERVER,
     creds: Creds = None,
@@ -54,7 +53,7 @@ def identify(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Re-identify packs from the blocks that the server still has of them.
+    """Re-identify packs from the blocks on the server.
 
     Two thirds of the samples identify; the last third judges the old cell and the new one by the voltage that each
     predicts. A cell file is written only if the new one is better; the reason is given for each other pack.

@@ -26,11 +26,11 @@ def load(
     server: Server = SERVER,
     creds: Creds = None,
     ca: Ca = None,
-    remove: Annotated[bool, typer.Option("--remove", help="packs that are not in the table go")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="remove packs that are not in the table")] = False,
 ) -> None:
-    """Let the server know the packs of a table; what it knows already is not written again.
+    """Upload a table of packs; unchanged rows are not written again.
 
-    Workers take up what has changed within seconds. A cell that ends in .toml is a cell file beside the table.
+    Workers use changes within seconds. A cell that ends in .toml is a cell file beside the table.
     """
     read = read_table(table)
     files = {name: _text(path) for name, path in read.cell_files.items()}
@@ -39,7 +39,7 @@ def load(
 
 @app.command("list")
 def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> None:
-    """Print the table that the server has, as CSV that `load` reads; what is wrong with a row goes to stderr."""
+    """Print the server's table as CSV that `load` reads; errors in rows go to stderr."""
     known = asyncio.run(known_packs((server, creds, ca)))
     kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackSpec)}
     of_each = {
@@ -58,7 +58,7 @@ def remove(
     creds: Creds = None,
     ca: Ca = None,
 ) -> None:
-    """Let the server forget packs; what they send from then on is held by the workers as unknown."""
+    """Remove packs from the server's table; their later blocks wait as unknown."""
     asyncio.run(_remove(set(packs), (server, creds, ca)))
     typer.echo(f"{len(set(packs))} removed")
 
@@ -69,9 +69,7 @@ def show(
     server: Server = SERVER,
     creds: Creds = None,
     ca: Ca = None,
-    out: Annotated[
-        Path | None, typer.Option(help="folder for its pack.toml and its cell file", show_default=False)
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for pack.toml and the cell file", show_default=False)] = None,
 ) -> None:
     """Print a pack's settings as a pack file, with which `replay` estimates as the workers do."""
     known = asyncio.run(known_packs((server, creds, ca)))

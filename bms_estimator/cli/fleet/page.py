@@ -24,17 +24,11 @@ def page(
     listen: Annotated[str, typer.Option(help="host:port of the page")] = DEFAULT_LISTEN,
     folder: Annotated[
         Path | None,
-        typer.Option(
-            help="of the Parquet files, as `fleet collect` writes them, for what is seen over time", show_default=False
-        ),
+        typer.Option(help="folder that `fleet collect` writes, for trends", show_default=False),
     ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(help="file with the token that a browser must show", show_default=False)
-    ] = None,
-    host: Annotated[
-        list[str] | None, typer.Option(help="a further name under which browsers reach it", show_default=False)
-    ] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open it where there is a desktop")] = True,
+    token_file: Annotated[Path | None, typer.Option(help="file with the access token", show_default=False)] = None,
+    host: Annotated[list[str] | None, typer.Option(help="further host name of the page", show_default=False)] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
 ) -> None:
     """Serve the page of all packs of a fleet, until SIGINT or SIGTERM."""
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))

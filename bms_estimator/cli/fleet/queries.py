@@ -25,10 +25,10 @@ def collect(
     server: Server = SERVER,
     creds: Creds = None,
     ca: Ca = None,
-    folder: Annotated[Path, typer.Option(help="of the Parquet files")] = FOLDER,
-    period: Annotated[float, typer.Option(min=0.0, help="a row waits at most so long for its file [s]")] = 300.0,
+    folder: Annotated[Path, typer.Option(help="folder of the Parquet files")] = FOLDER,
+    period: Annotated[float, typer.Option(min=0.0, help="maximum time that a row waits for its file [s]")] = 300.0,
 ) -> None:
-    """Write the summaries of hours to Parquet, until SIGINT or SIGTERM."""
+    """Write hourly summaries to Parquet, until SIGINT or SIGTERM."""
     from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
     from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
 
@@ -65,13 +65,15 @@ def ask(
         str | None, typer.Argument(help="of the question, or sql; all are listed without", show_default=False)
     ] = None,
     query: Annotated[str | None, typer.Argument(help="of sql: SELECT ... FROM hours", show_default=False)] = None,
-    folder: Annotated[Path, typer.Option(help="of the Parquet files, as `fleet collect` writes them")] = FOLDER,
-    days: Annotated[int | None, typer.Option(min=1, help="only the last so many; else all", show_default=False)] = None,
-    within: Annotated[float, typer.Option(min=0.0, help="failing: a limit is reached within so many days")] = 90.0,
-    json: Annotated[bool, typer.Option("--json", help="as a list of objects")] = False,
-    csv: Annotated[bool, typer.Option("--csv", help="as CSV")] = False,
+    folder: Annotated[Path, typer.Option(help="folder that `fleet collect` writes")] = FOLDER,
+    days: Annotated[
+        int | None, typer.Option(min=1, help="number of most recent days; default: all", show_default=False)
+    ] = None,
+    within: Annotated[float, typer.Option(min=0.0, help="forecast of `failing` [days]")] = 90.0,
+    json: Annotated[bool, typer.Option("--json", help="print a JSON list of objects")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="print CSV")] = False,
 ) -> None:
-    """Ask the summaries of all packs; without a name: what can be asked."""
+    """Query the hourly summaries of all packs; without a name list the queries."""
     from bms_estimator.fleet.queries import duckdb_queries as questions  # noqa: PLC0415 - its packages are optional
 
     if name is None:

@@ -23,15 +23,15 @@ from bms_estimator.settings.page import parse_listen
 SettingsFile = Annotated[
     Path | None, typer.Argument(help="settings of the fleet, fleet.toml; without, all as it comes", show_default=False)
 ]
-Folder = Annotated[Path | None, typer.Option(help="for streams and keys; else that of the settings")]
+Folder = Annotated[Path | None, typer.Option(help="folder for streams and keys; default: that of the settings")]
 
 
 def serve(
     settings_file: SettingsFile = None,
     folder: Folder = None,
-    listen: Annotated[str | None, typer.Option(help="host:port for workers; else that of the settings")] = None,
-    mqtt: Annotated[str | None, typer.Option(help="host:port for edges; else that of the settings")] = None,
-    node: Annotated[int, typer.Option(min=1, max=5, help="number of this node, of those of --of")] = 1,
+    listen: Annotated[str | None, typer.Option(help="host:port for workers; default: that of the settings")] = None,
+    mqtt: Annotated[str | None, typer.Option(help="host:port for edges; default: that of the settings")] = None,
+    node: Annotated[int, typer.Option(min=1, max=5, help="number of this node in --of")] = 1,
     of: Annotated[
         str | None,
         typer.Option(help=f"three nodes: where each is heard by the others, host:port,host,... ({CLUSTER_PORT})"),
@@ -39,7 +39,7 @@ def serve(
 ) -> None:
     """Run a node of the fleet's server, with its streams, until SIGINT or SIGTERM.
 
-    The first start makes keys for each tenant. Nodes other than the one that has them need a copy of keys/claims.json.
+    The first start creates keys for each tenant. The other nodes need a copy of keys/claims.json.
     """
     settings = _settings(settings_file, listen=listen, mqtt=mqtt)
     place = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, of))
@@ -60,12 +60,12 @@ def user(
     settings_file: Annotated[Path | None, typer.Option("--settings", help="fleet.toml")] = None,
     folder: Folder = None,
     days: Annotated[
-        float | None, typer.Option(min=0.0, max=36_600.0, help="it is refused afterwards; without: never")
+        float | None, typer.Option(min=0.0, max=36_600.0, help="validity of the token [days]; default: unlimited")
     ] = None,
 ) -> None:
-    """Print the token with which a pack's edge connects: MQTT's password, with any name.
+    """Print the token of a pack's edge, which is its MQTT password.
 
-    It may send blocks of this pack and hear what is awaited of it, nothing else. Keep it as a password.
+    The token permits only blocks of this pack and their confirmations. Keep it secret.
     """
     try:
         TypeAdapter(DeviceName).validate_python(pack)

@@ -7,13 +7,13 @@ import typer
 
 SERVER = "nats://127.0.0.1:4222"
 
-Server = Annotated[str, typer.Option(help="of the fleet, nats://host:port or tls://host:port; several with commas")]
-Creds = Annotated[
-    Path | None, typer.Option(help="the tenant's credentials, where the server asks for some", show_default=False)
+Server = Annotated[
+    str, typer.Option(help="fleet server, nats://host:port or tls://host:port; separate several with commas")
 ]
+Creds = Annotated[Path | None, typer.Option(help="credentials file of the tenant", show_default=False)]
 Ca = Annotated[
     Path | None,
-    typer.Option(help="certificate of who signed the server's; else those of the system", show_default=False),
+    typer.Option(help="certificate authority of the server; default: the system's", show_default=False),
 ]
 ServerAddress = tuple[str, Path | None, Path | None]
 """Server, credentials, authority."""

@@ -26,34 +26,34 @@ MOST_PACKS = 999_999
 
 
 def simulate(
-    packs: Annotated[int, typer.Option(parser=whole(1, MOST_PACKS), help="how many")] = 1000,
+    packs: Annotated[int, typer.Option(parser=whole(1, MOST_PACKS), help="number of packs")] = 1000,
     mqtt: Annotated[
         str | None,
-        typer.Option(help="of the fleet's server, mqtt://host:port or mqtts://host:port; several with commas"),
+        typer.Option(help="fleet server, mqtt://host:port or mqtts://host:port; separate several with commas"),
     ] = None,
-    username: Annotated[str | None, typer.Option(help="of somebody who may publish for all of them")] = None,
+    username: Annotated[str | None, typer.Option(help="MQTT user that may publish for all packs")] = None,
     password_file: Annotated[Path | None, typer.Option(help="file with the password")] = None,
-    ca: Annotated[
-        Path | None, typer.Option(help="certificate of who signed the server's; else those of the system")
-    ] = None,
-    speed: Annotated[float, typer.Option(parser=decimal(1e-3, 1e5), help="the packs' seconds per second")] = 1.0,
+    ca: Annotated[Path | None, typer.Option(help="certificate authority of the server; default: the system's")] = None,
+    speed: Annotated[float, typer.Option(parser=decimal(1e-3, 1e5), help="speed relative to real time")] = 1.0,
     blocks: Annotated[
-        int | None, typer.Option(parser=whole(1), help="minutes of each pack; else until Ctrl-C", show_default=False)
+        int | None,
+        typer.Option(
+            parser=whole(1), help="number of blocks (minutes) of each pack; default: until Ctrl-C", show_default=False
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(parser=whole(), help="another seed, other packs")] = 1,
+    seed: Annotated[int, typer.Option(parser=whole(), help="seed of the packs")] = 1,
     begin: Annotated[
-        datetime | None, typer.Option(help="when the edges began; a minute ago when left out", show_default=False)
+        datetime | None, typer.Option(help="start time of the edges; default: a minute ago", show_default=False)
     ] = None,
-    prefix: Annotated[str, typer.Option(help="of the packs' names")] = "sim",
+    prefix: Annotated[str, typer.Option(help="prefix of the names")] = "sim",
     connections: Annotated[int, typer.Option(parser=whole(1, 100), help="MQTT connections for all edges")] = 4,
-    table: Annotated[Path | None, typer.Option(help="write the table for `fleet packs load` here")] = None,
-    truth: Annotated[Path | None, typer.Option(help="write what no estimator is told here, as CSV")] = None,
+    table: Annotated[Path | None, typer.Option(help="write the table for `fleet packs load` to this file")] = None,
+    truth: Annotated[Path | None, typer.Option(help="write the true values to this CSV file")] = None,
 ) -> None:
-    """Be the edges of many packs: send a block of samples a minute for each, and again what workers ask for.
+    """Simulate the edges of many packs: send a block a minute for each, and again if a worker requests it.
 
-    A few MQTT connections stand for all edges, so that the cost of a connection an edge is not in what is measured. Of
-    the shipped cells, with capacities and resistances that differ; a block follows from seed, pack and number, so that
-    nothing is kept. With --table and without --mqtt the table is written, and that is all.
+    A few MQTT connections stand for all edges. The packs have shipped cells with different capacities and resistances. A
+    block is computed from seed, pack and number. With --table and without --mqtt only the table is written.
     """
     if mqtt is None and table is None and truth is None:
         raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write the table of the packs alone")

@@ -25,15 +25,15 @@ def worker(
     creds: Creds = None,
     ca: Ca = None,
     name: Annotated[
-        str | None, typer.Option(help="its own among workers", show_default="host and process number")
+        str | None, typer.Option(help="name of the worker; must be unique", show_default="host and process number")
     ] = None,
     checkpoint_s: Annotated[
-        float, typer.Option(min=1.0, help="between two checkpoints of a partition [s]")
+        float, typer.Option(min=1.0, help="interval between checkpoints of a partition [s]")
     ] = CHECKPOINT_S,
 ) -> None:
     """Estimate the packs of some partitions, until SIGINT or SIGTERM.
 
-    All workers of a tenant share its partitions; when one joins or leaves, the others take over.
+    All workers of a tenant share its partitions.
     """
     options = Options(server, _named(name), creds, ca, checkpoint_s)
     configure_logs()

@@ -35,14 +35,14 @@ def board(
     aref_v: Annotated[
         float | None,
         typer.Option(
-            parser=decimal(), help="measured between AREF and GND [V]: sets the board's bandgap", show_default=False
+            parser=decimal(), help="voltage measured between AREF and GND [V]; sets the bandgap", show_default=False
         ),
     ] = None,
     divider: Annotated[
         float | None,
         typer.Option(
             parser=decimal(LEAST_DIVIDER, MOST_DIVIDER),
-            help="sets how many times A0 the pack's voltage is",
+            help="set the divider ratio: pack voltage / voltage at A0",
             show_default=False,
         ),
     ] = None,
@@ -50,7 +50,7 @@ def board(
         float | None,
         typer.Option(
             parser=decimal(LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE),
-            help="sets the slope of the current sensor [V/A]; of a ratiometric one at 5 V",
+            help="set the slope of the current sensor [V/A], for a ratiometric sensor at 5 V",
             show_default=False,
         ),
     ] = None,
@@ -58,33 +58,32 @@ def board(
         bool | None,
         typer.Option(
             "--ratiometric/--absolute",
-            help="sets whether that slope is proportional to the 5 V supply or the same at any",
+            help="set whether the slope is proportional to the 5 V supply",
             show_default=False,
         ),
     ] = None,
     serial: Annotated[
         int | None,
         typer.Option(
-            parser=whole(1, 2**32 - 1), help="sets the board's serial number; shown in hexadecimal", show_default=False
+            parser=whole(1, 2**32 - 1), help="set the serial number, which is shown in hexadecimal", show_default=False
         ),
     ] = None,
     accept: Annotated[
         Path | None,
         typer.Option(
-            help="settings of a pack: its service takes the next board that comes as the pack's; no port is opened",
+            help="accept the next board that connects for the pack with these settings; no port is opened",
             show_default=False,
         ),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(help="with --accept: state folder of the service, if not that of the settings or yours"),
+        typer.Option(help="state folder of the service with --accept; default: that of the settings, or the user's"),
     ] = None,
-    baud: Annotated[int, typer.Option(parser=whole(1200), help="of the board")] = BAUD,
+    baud: Annotated[int, typer.Option(parser=whole(1200), help="baud rate of the board")] = BAUD,
 ) -> None:
-    """Show what a board says of itself, and set what it keeps in its EEPROM: bandgap, gains and serial number.
+    """Show a board's properties, and set its bandgap, gains and serial number, which it stores in EEPROM.
 
-    Voltage and current are as right as the bandgap is, which differs by up to 10 % from board to board, and as the gains
-    of divider and current sensor are.
+    The bandgap voltage differs by up to 10 % between boards and scales the measured voltage, so calibrate it once.
     """
     if accept is not None:
         settings = load_settings(accept)

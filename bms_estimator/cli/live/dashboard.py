@@ -23,18 +23,16 @@ def dashboard(
         typer.Argument(help="settings of a pack, whose \\[mqtt] and \\[page] are taken", show_default=False),
     ] = None,
     mqtt: Annotated[
-        str | None, typer.Option(help="broker, mqtt://host:port; else that of PACK, or mqtt://localhost:1883")
+        str | None, typer.Option(help="broker, mqtt://host:port; default: that of PACK, or mqtt://localhost:1883")
     ] = None,
     listen: Annotated[
         str | None, typer.Option(help=f"host:port of the page; else that of PACK, or {DEFAULT_LISTEN}")
     ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(help="file with the token that a browser must show", show_default=False)
-    ] = None,
+    token_file: Annotated[Path | None, typer.Option(help="file with the access token", show_default=False)] = None,
     folder: Annotated[
-        Path | None, typer.Option(help="state folder of the services on this machine, for their history")
+        Path | None, typer.Option(help="state folder of services on this machine, for their history")
     ] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open it where there is a desktop")] = True,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
 ) -> None:
     """Serve the live page of all packs that publish to a broker, until SIGINT or SIGTERM."""
     settings = load_settings(pack) if pack else Settings()

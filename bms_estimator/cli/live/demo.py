@@ -20,33 +20,35 @@ from bms_estimator.sinks.terminal.panels import LOG_LINES
 
 def demo(
     seconds: Annotated[
-        float | None, typer.Option(parser=decimal(0.1), help="else until Ctrl-C", show_default=False)
+        float | None, typer.Option(parser=decimal(0.1), help="duration [s]; default: until Ctrl-C", show_default=False)
     ] = None,
     port: Annotated[
         int | None,
-        typer.Option(parser=whole(1, 65535), help="of the broker; else 1883, or a free one", show_default=False),
+        typer.Option(
+            parser=whole(1, 65535), help="port of the broker; default: 1883, or a free port", show_default=False
+        ),
     ] = None,
     page_port: Annotated[
         int | None,
-        typer.Option(parser=whole(1, 65535), help="of the live page; else 8765, or a free one", show_default=False),
+        typer.Option(
+            parser=whole(1, 65535), help="port of the live page; default: 8765, or a free port", show_default=False
+        ),
     ] = None,
-    rate_hz: Annotated[int, typer.Option(parser=whole(1, 1000), help="samples per second")] = 100,
+    rate_hz: Annotated[int, typer.Option(parser=whole(1, 1000), help="sample rate [Hz]")] = 100,
     speed: Annotated[
-        float, typer.Option(parser=decimal(0.1, 10.0), help="of the board's time, as far as the machine keeps up")
+        float, typer.Option(parser=decimal(0.1, 10.0), help="speed of the board's clock relative to real time")
     ] = 1.0,
     firmware: Annotated[
         Path | None, typer.Option(help="folder of the built firmware and its simulator", show_default=False)
     ] = None,
-    python_board: Annotated[bool, typer.Option("--python-board", help="the firmware's stand-in in Python")] = False,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="open the page where there is a desktop")
-    ] = True,
+    python_board: Annotated[bool, typer.Option("--python-board", help="simulate the board in Python")] = False,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
 ) -> None:
-    """Broker, board, service and live page in one terminal, until Ctrl-C.
+    """Run broker, board, service and live page in one terminal, until Ctrl-C.
 
-    A simulated 275 mAh cell under a changing load is at the pins of a board: the real firmware in simavr where that is
-    built (make firmware), else its stand-in in Python. The real service reads it from a pseudo-terminal and publishes
-    to a broker of its own on the loopback. Its initial SOC is 20 % wrong; the true SOC is shown beside the estimate.
+    The board measures a simulated 275 mAh cell under a changing load. It is the real firmware in simavr if that is built
+    (make firmware), otherwise a simulation in Python. The real service reads it from a pseudo-terminal and publishes to
+    a broker on loopback. The initial SOC is 20 % wrong; the true SOC is shown beside the estimate.
     """
     build = None if python_board else find_build(firmware)
     log = deque[str](maxlen=LOG_LINES)

@@ -18,9 +18,9 @@ def edge(
     pack: Annotated[Path, typer.Argument(help="settings of the pack, with \\[edge]")] = Path("pack.toml"),
     port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
 ) -> None:
-    """Send a pack's raw samples to a fleet's server, until SIGINT or SIGTERM. Estimates nothing.
+    """Send a pack's raw samples to a fleet's server, until SIGINT or SIGTERM.
 
-    What the server has not got is kept on disk, and sent when it can be: see docs/fleet/edge.md.
+    Unconfirmed samples are stored on disk: see docs/fleet/edge.md.
     """
     settings = with_sensor(load_settings(pack), port=port)
     configure_logs()

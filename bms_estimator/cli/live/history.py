@@ -25,21 +25,25 @@ FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
 
 def history(
     pack: Annotated[Path, typer.Argument(help="settings of the pack, pack.toml")],
-    since: Annotated[datetime | None, typer.Option(formats=FORMATS, help="from, UTC; else all there is")] = None,
-    until: Annotated[datetime | None, typer.Option(formats=FORMATS, help="to before, UTC; else now")] = None,
-    step: Annotated[
-        int, typer.Option(parser=whole(MINUTE_S), help="a row for each so many seconds, whole minutes")
-    ] = MINUTE_S,
-    events: Annotated[bool, typer.Option("--events", help="what happened, in place of what was measured")] = False,
-    folder: Annotated[
-        Path | None, typer.Option(help="state folder of the service, if not that of the settings or yours")
+    since: Annotated[
+        datetime | None, typer.Option(formats=FORMATS, help="start time, UTC; default: the oldest row")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="CSV file to write; else to stdout")] = None,
+    until: Annotated[
+        datetime | None, typer.Option(formats=FORMATS, help="end time (exclusive), UTC; default: now")
+    ] = None,
+    step: Annotated[
+        int, typer.Option(parser=whole(MINUTE_S), help="interval of the rows [s], whole minutes")
+    ] = MINUTE_S,
+    events: Annotated[bool, typer.Option("--events", help="print events instead of measurements")] = False,
+    folder: Annotated[
+        Path | None, typer.Option(help="state folder of the service; default: that of the settings, or the user's")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file to write; default: stdout")] = None,
     force: Force = False,
 ) -> None:
-    """Print the history of a pack as CSV: means, extremes and sums by the minute, or longer steps.
+    """Print the history of a pack as CSV: means, extremes and totals by the minute or a longer interval.
 
-    Reads while the service runs. Charge and energy out are of discharge.
+    The service may run meanwhile. Charge and energy out are discharge.
     """
     if step % MINUTE_S:
         raise UserError(f"--step {step}: must be whole minutes: a multiple of {MINUTE_S}")

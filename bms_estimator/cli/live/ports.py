@@ -17,16 +17,18 @@ from bms_estimator.sources.serial.port_list import holder, stable_names
 def ports(
     paths: Annotated[list[str] | None, typer.Argument(help="these only; else all that are found")] = None,
     probe: Annotated[
-        bool, typer.Option("--probe", help="ask each who is there; opening a port may reset its board")
+        bool, typer.Option("--probe", help="identify the device on each port; opening a port may reset its board")
     ] = False,
     baud: Annotated[
         int | None,
-        typer.Option(parser=whole(1200), help="to ask at; else each protocol's own", show_default=False),
+        typer.Option(
+            parser=whole(1200), help="baud rate of the probe; default: that of each protocol", show_default=False
+        ),
     ] = None,
 ) -> None:
-    """List serial ports under their stable names, and ask them for boards, BMS and meters.
+    """List serial ports by their stable names, and identify boards, BMS and meters on them.
 
-    ``stable name`` is what belongs in ``sensor.port``: it stays when boards are plugged in another order.
+    A stable name does not change when devices are plugged in another order. Use it as ``sensor.port``.
     """
     found = {port.device: port.description for port in list_ports.comports()}
     shown = {path: found.get(path, "") for path in paths} if paths else found

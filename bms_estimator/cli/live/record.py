@@ -34,20 +34,22 @@ def record(
         Path | None, typer.Option(help="settings of the pack, for its \\[sensor] or \\[source]", show_default=False)
     ] = None,
     port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
-    baud: Annotated[int | None, typer.Option(parser=whole(1200), help="in place of sensor.baud")] = None,
+    baud: Annotated[int | None, typer.Option(parser=whole(1200), help="baud rate in place of sensor.baud")] = None,
     rate_hz: Annotated[
-        int | None, typer.Option(parser=whole(1, 1000), help="in place of sensor.sample_rate_hz")
+        int | None, typer.Option(parser=whole(1, 1000), help="sample rate in place of sensor.sample_rate_hz")
     ] = None,
-    text: Annotated[bool, typer.Option("--text", help="the board prints text lines")] = False,
+    text: Annotated[bool, typer.Option("--text", help="read a board that prints text lines")] = False,
     seconds: Annotated[
         float | None,
-        typer.Option(parser=decimal(0.0), help="from the first bytes; else until Ctrl-C", show_default=False),
+        typer.Option(
+            parser=decimal(0.0), help="duration from the first bytes [s]; default: until Ctrl-C", show_default=False
+        ),
     ] = None,
 ) -> None:
     """Record a board's raw bytes with their arrival times, until Ctrl-C.
 
-    Each read of the line goes to the file as it comes: whatever kills the recorder, ``replay`` reads all to the last whole
-    frame. Without --pack and --port the only board that is there is taken.
+    Each chunk is written as it arrives, so a killed recorder leaves a readable capture. Without --pack and
+    --port the only connected board is used.
     """
     settings = load_pack(pack)[0] if pack else Settings()
     protocol = "text" if text else None

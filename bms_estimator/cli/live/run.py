@@ -39,12 +39,12 @@ def run(
         Path | None, typer.Option(help="also record the board's raw bytes in this new file", show_default=False)
     ] = None,
     view: Annotated[
-        bool | None, typer.Option("--view/--no-view", help="live view on stdout; without either: on a terminal")
+        bool | None, typer.Option("--view/--no-view", help="live view on stdout; default: on a terminal")
     ] = None,
 ) -> None:
     """Estimate live from a board and publish, until SIGINT or SIGTERM.
 
-    Several packs are served in one process, each with its own board and connection to the broker.
+    One process may serve several packs, each with its own source and broker connection.
     """
     paths = packs or [Path("pack.toml")]
     told = partial(_told, port=port, mqtt=mqtt)

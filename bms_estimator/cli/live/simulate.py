@@ -31,17 +31,19 @@ DEFAULT_LOAD_C = 3.0
 def simulate(
     cell: Annotated[str, typer.Option(help=CELL_HELP)] = "chen_mora",
     capacity_ah: CapacityAh = None,
-    series: Annotated[int, typer.Option(parser=whole(1), help="of them in series")] = 1,
-    load: Annotated[LoadName, typer.Option(help="what it is under")] = LoadName.RANDOM,
+    series: Annotated[int, typer.Option(parser=whole(1), help="number of cells in series")] = 1,
+    load: Annotated[LoadName, typer.Option(help="load profile")] = LoadName.RANDOM,
     current_a: Annotated[
         float | None,
-        typer.Option(parser=decimal(), help="of the load, positive on discharge; else 3C", show_default=False),
+        typer.Option(
+            parser=decimal(), help="current of the load [A], positive on discharge; default: 3C", show_default=False
+        ),
     ] = None,
-    soc: Annotated[float, typer.Option(parser=decimal(0.0, 1.0), help="at the start")] = 0.9,
+    soc: Annotated[float, typer.Option(parser=decimal(0.0, 1.0), help="initial SOC, 0..1")] = 0.9,
     rate_hz: Annotated[
-        int, typer.Option(parser=whole(1, 1000), help="samples per second until the host asks for others")
+        int, typer.Option(parser=whole(1, 1000), help="sample rate until the host requests another [Hz]")
     ] = RATE_HZ_AT_RESET,
-    text: Annotated[bool, typer.Option("--text", help="print text lines, as hobby sketches do")] = False,
+    text: Annotated[bool, typer.Option("--text", help="print text lines")] = False,
     protocol: Annotated[
         str | None,
         typer.Option(
@@ -51,20 +53,21 @@ def simulate(
     ] = None,
     mqtt: Annotated[
         str | None,
-        typer.Option(help="publish to this broker what an ESPHome node says of a JK-BMS", show_default=False),
+        typer.Option(help="publish to this broker as an ESPHome node with a JK-BMS", show_default=False),
     ] = None,
-    prefix: Annotated[str, typer.Option(help="name of that node")] = "jk-bms",
-    noise_lsb: Annotated[float, typer.Option(parser=decimal(0.0), help="of its converter, in steps")] = 0.5,
-    speed: Annotated[float, typer.Option(parser=decimal(1e-3), help="its seconds per second")] = 1.0,
+    prefix: Annotated[str, typer.Option(help="name of the ESPHome node")] = "jk-bms",
+    noise_lsb: Annotated[float, typer.Option(parser=decimal(0.0), help="noise of the converter, in steps")] = 0.5,
+    speed: Annotated[float, typer.Option(parser=decimal(1e-3), help="speed relative to real time")] = 1.0,
     seconds: Annotated[
-        float, typer.Option(parser=decimal(0.0), help="of its time; else until Ctrl-C", show_default=False)
+        float,
+        typer.Option(parser=decimal(0.0), help="simulated duration [s]; default: until Ctrl-C", show_default=False),
     ] = math.inf,
-    seed: Annotated[int, typer.Option(parser=whole(), help="of load and noise")] = 0,
+    seed: Annotated[int, typer.Option(parser=whole(), help="seed of load and noise")] = 0,
 ) -> None:
     """Serve a simulated board on a pseudo-terminal, until Ctrl-C.
 
-    Prints the path of the pseudo-terminal, for ``run --port PATH``. The board speaks the firmware's protocol; a
-    simulated pack with a 10-bit converter is at its pins. With --mqtt it is a JK-BMS that an ESPHome node publishes, for
+    Prints the path of the pseudo-terminal for ``run --port PATH``. The board uses the firmware's protocol and measures a
+    simulated pack with a 10-bit converter. With --mqtt it publishes as an ESPHome node with a JK-BMS, for
     ``source.profile = "esphome-jk"``.
     """
     model = load_cell(cell, capacity_ah).pack(series, 1)

@@ -31,12 +31,13 @@ def top(
         Path | None, typer.Argument(help="pack file whose \\[mqtt] says where the broker is", show_default=False)
     ] = None,
     mqtt: Annotated[
-        str | None, typer.Option(help="broker, mqtt://host:port; without a pack file: localhost", show_default=False)
+        str | None,
+        typer.Option(help="broker, mqtt://host:port; default: that of PACK, or localhost", show_default=False),
     ] = None,
 ) -> None:
-    """All packs of a broker at a glance, one in full: what they publish, from any machine that reaches the broker.
+    """Show all packs of a broker, one of them in detail.
 
-    On a terminal: Tab and the arrows show another pack, q ends. Elsewhere a line for each state, until Ctrl-C.
+    On a terminal Tab and the arrow keys select a pack, and q quits. Elsewhere each state is a line, until Ctrl-C.
     """
     settings = load_settings(pack) if pack else Settings()
     if mqtt or not pack:

@@ -14,13 +14,15 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
-CELL_HELP = "lfp, nmc, nca, lco, lmo, lto: generic; else a shipped cell's name or a cell file"
+CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
 OR_FUEL_CELL_HELP = f"{CELL_HELP}; pem_30w or a fuel cell's file"
 CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
 CapacityAh = Annotated[
     float | None,
     typer.Option(
-        parser=decimal(), help="what the cell holds; a generic one needs it, else the cell file's", show_default=False
+        parser=decimal(),
+        help="capacity of the cell [Ah]; required for a generic cell; default: that of the cell file",
+        show_default=False,
     ),
 ]
 CapturesFromRest = Annotated[
@@ -29,14 +31,15 @@ CapturesFromRest = Annotated[
 InitialSoc = Annotated[
     float | None,
     typer.Option(
-        parser=decimal(0.0, 1.0), help="at the first sample of each capture; else from the first rest's voltage"
+        parser=decimal(0.0, 1.0),
+        help="SOC at the first sample of each capture; default: from the voltage of the first rest",
     ),
 ]
 NewCellFile = Annotated[Path, typer.Option(help="cell file to write", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="replace the file of --out")]
 SignOfCurrent = Annotated[
     CurrentSign | None,
-    typer.Option(help="what the current in the file is when positive; else as the file's format says, else discharge"),
+    typer.Option(help="direction of positive current in the file; default: that of the format, otherwise discharge"),
 ]
 
 

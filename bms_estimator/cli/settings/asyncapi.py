@@ -14,5 +14,5 @@ def asyncapi(
         MqttSettings.model_fields["base_topic"].default
     ),
 ) -> None:
-    """Print all topics and payloads as an AsyncAPI 3 document, for generators of clients and of pages."""
+    """Print all topics and payloads as an AsyncAPI 3 document."""
     typer.echo(json.dumps(document(base_topic), indent=2, allow_nan=False))

@@ -47,10 +47,10 @@ PackFile = Annotated[Path, typer.Argument(help="settings of the pack")]
 @app.command()
 def init(
     file: PackFile = Path("pack.toml"),
-    probe: Annotated[bool, typer.Option("--probe", help="find out what is on the serial ports, and set it")] = False,
-    port: Annotated[
-        str | None, typer.Option(help="to find out on; else all that may be it", show_default=False)
-    ] = None,
+    probe: Annotated[
+        bool, typer.Option("--probe", help="identify the device on the serial ports, and configure it")
+    ] = False,
+    port: Annotated[str | None, typer.Option(help="serial port to probe; default: all", show_default=False)] = None,
 ) -> None:
     """Write a settings file with every setting, its unit, default and meaning."""
     if port is not None and not probe:
@@ -96,7 +96,7 @@ def _probed(ports: Sequence[str]) -> Given:
 
 @app.command()
 def check(file: PackFile = Path("pack.toml")) -> None:
-    """Check a settings file and its cell file; name what is wrong, warn of what will not work well."""
+    """Check a settings file and its cell file; report errors and likely mistakes."""
     settings, cell = load_pack(file)
     warnings = [
         *implausible_settings(settings, cell),
@@ -128,7 +128,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
 
 @app.command()
 def show(file: Annotated[Path | None, typer.Argument(help="settings of the pack; else the defaults")] = None) -> None:
-    """Print the settings in effect, and what follows from them, as TOML."""
+    """Print the settings in effect and derived values as TOML."""
     settings, cell = load_pack(file) if file else (Settings(), load_cell(Settings().pack.cell))
     shown = settings.model_dump(mode="json", by_alias=True, exclude_none=True)
     shown["observer"].setdefault("rearm_gain", "never")  # the one None that is not the default

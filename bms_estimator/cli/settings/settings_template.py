@@ -14,8 +14,8 @@ UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": 
 """Last part of a key -> the unit it stands for."""
 WIDTH = 110
 HEAD = """\
-# Settings of one pack. A setting that is commented out has the value shown; take the # away to change it.
-# Values are SI, the unit stands in the key. Current is positive on discharge.
+# Settings of one pack. A setting in a comment has the value shown; remove the # to change it.
+# Values are in SI units, which the keys contain. Current is positive on discharge.
 """
 _SIGNS = {Gt: ("gt", "above"), Ge: ("ge", "at least"), Lt: ("lt", "below"), Le: ("le", "at most")}
 

@@ -86,6 +86,7 @@ def page(whole):
     return Page(whole)
 
 
+@pytest.mark.thorough
 def test_every_table_stands_printed_beside_recomputed(page):
     for key in TABLES:
         table = page.articles[f"table-{key}"]
@@ -95,6 +96,7 @@ def test_every_table_stands_printed_beside_recomputed(page):
         assert table["rows"] > 2, key
 
 
+@pytest.mark.thorough
 def test_every_figure_is_drawn(page):
     for key in FIGURES:
         assert page.articles[f"figure-{key}"]["shapes"] > 5, key
@@ -102,6 +104,7 @@ def test_every_figure_is_drawn(page):
     assert "A block diagram" in page.articles["figure-9"]["reason"]
 
 
+@pytest.mark.thorough
 def test_every_item_has_a_verdict_and_a_reason(page):
     fits = {f"fitted, {count} free parameters" for count in (2, 7, 8)}
     verdicts = {*fits, "recomputed", NO_DATA, CONTRADICTED, "given", "added"}
@@ -111,6 +114,7 @@ def test_every_item_has_a_verdict_and_a_reason(page):
     assert {article["verdict"] for article in page.articles.values()} == verdicts
 
 
+@pytest.mark.thorough
 def test_nothing_is_called_reproduced_that_hangs_on_unpublished_recordings(page):
     for key in ("8", "9", "11", "13"):
         article = page.articles[f"table-{key}"]
@@ -118,12 +122,14 @@ def test_nothing_is_called_reproduced_that_hangs_on_unpublished_recordings(page)
         assert "not published" in article["reason"]
 
 
+@pytest.mark.thorough
 def test_a_fit_gives_the_number_of_its_free_parameters(page):
     fits = {key: found["verdict"] for key, found in page.articles.items() if found["verdict"].startswith("fitted")}
     free = {"table-2": 2, "table-3": 2, "table-5": 8, "table-10": 7}
     assert fits == {key: f"fitted, {count} free parameters" for key, count in free.items()}
 
 
+@pytest.mark.thorough
 def test_items_without_data_are_not_those_that_other_printed_numbers_contradict(page):
     contradicted = {key for key, found in page.articles.items() if found["verdict"] == CONTRADICTED}
     assert contradicted == {"table-4", "table-6", "table-7", "table-12", "figure-20"}
@@ -131,10 +137,12 @@ def test_items_without_data_are_not_those_that_other_printed_numbers_contradict(
     assert [found["verdict"] for found in recordings].count(NO_DATA) == 17
 
 
+@pytest.mark.thorough
 def test_the_report_says_that_only_the_text_was_available(whole):
     assert "Only the text of the thesis was available" in whole
 
 
+@pytest.mark.thorough
 def test_the_documentation_counts_the_verdicts(page):
     text = (Path(__file__).parents[3] / "docs" / "theory" / "thesis.md").read_text(encoding="utf-8")
     verdicts = [item["verdict"].partition(",")[0] for item in page.articles.values() if item["verdict"] != "added"]
@@ -142,12 +150,14 @@ def test_the_documentation_counts_the_verdicts(page):
         assert f"| {verdict} | {count} |" in text
 
 
+@pytest.mark.thorough
 def test_page_loads_nothing(whole, page):
     assert page.loads == [target for target in page.loads if target.startswith("#")]
     assert not re.search(r"@import|url\(\s*[\"']?(?!#)", whole)
     assert not re.search(r"(?:src|href)\s*=\s*[\"'](?:https?:)?//", whole)
 
 
+@pytest.mark.thorough
 def test_closing_note_lists_every_item(whole, page):
     note = whole.split('id="account"', 1)[1]
     for key in page.articles:
@@ -160,10 +170,12 @@ def cells(whole, key):
     return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(<td.*?)</tr>", article)]
 
 
+@pytest.mark.thorough
 def test_errata_are_numbered(whole):
     assert [row[0] for row in cells(whole, "table-errata")] == [f"E{n}" for n in range(1, 37)]
 
 
+@pytest.mark.thorough
 def test_one_start_gives_what_tables_2_and_3_print(whole):
     """To the printed digits, which are four to seven; small parameters of Table 3 as they began."""
     for key in ("table-2", "table-3"):
@@ -173,11 +185,13 @@ def test_one_start_gives_what_tables_2_and_3_print(whole):
             assert float(row[4]) == pytest.approx(float(row[3]), rel=2e-5), (key, row)
 
 
+@pytest.mark.thorough
 def test_small_parameters_of_table_3_are_off_by_what_the_start_was(whole):
     off = {row[0]: float(row[8]) for row in cells(whole, "table-3")}
     assert [off[f"a{i}"] for i in (1, 3, 6, 13, 15)] == pytest.approx([6.48, 14.3, 19.7, 36.0, 5.99], abs=0.05)
 
 
+@pytest.mark.thorough
 def test_static_beats_dynamic_with_the_printed_parameters(whole):
     dynamic, static = ([float(cell) for cell in row[2:]] for row in cells(whole, "table-12"))
     assert (dynamic[0], static[0]) == pytest.approx((0.0826, 0.0812), abs=5e-5)

@@ -43,7 +43,7 @@ async def listening(port):
             await asyncio.sleep(0.1)
 
 
-@pytest.mark.parametrize("board", ["firmware", "python"])
+@pytest.mark.parametrize("board", ["firmware", pytest.param("python", marks=pytest.mark.thorough)])
 async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
     if board == "firmware" and not FirmwareBoard.is_built(FIRMWARE_BUILD):
         pytest.skip("the firmware is not built (make firmware)")
@@ -86,6 +86,7 @@ async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
     assert "Traceback" not in err
 
 
+@pytest.mark.thorough
 async def test_a_board_whose_time_passes_faster_takes_the_estimate_with_it():
     port = free_port()
     async with demo("--python-board", "--speed", 5, "--port", port):

@@ -137,11 +137,11 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ),
         (
             '[source]\nkind = "linux"\nshunt_ohm = 0\n',
-            ["source.shunt_ohm = 0: ", "greater than 0", "shunt that is fitted"],
+            ["source.shunt_ohm = 0: ", "greater than 0", "resistance of the shunt"],
         ),
         ('[pack]\ncell = "nonsense"\n', ["nonsense", "ncr18650", "lfp"]),
         ('[pack]\ncell = "lfp"\n', ["lfp is a generic cell", "capacity_ah of [pack]"]),
-        ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "holds"]),
+        ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "capacity of one"]),
     ],
 )
 def test_what_is_wrong_is_named_with_what_is_allowed(text, said, pack, capsys):

@@ -7,6 +7,8 @@ import pytest
 
 from tests.estimator.anywhere.cycles import CHEMISTRIES, HEAD, PATH, THREE_TIMES_PHOSPHATE, CycleRow, row, rows
 
+pytestmark = pytest.mark.thorough
+
 LIMITS = {
     "nmc": (95, 80, 4.2),
     "nca": (95, 80, 4.9),

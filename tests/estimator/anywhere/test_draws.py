@@ -15,6 +15,8 @@ from bms_estimator.model.sample import SAMPLE
 from tests.estimator.anywhere.cases import CASES
 from tests.estimator.anywhere.summary import rows
 
+pytestmark = pytest.mark.thorough
+
 SEEDS = range(100, 106)
 LIMITS = {
     "full at -10C": (3.3, 4.2),

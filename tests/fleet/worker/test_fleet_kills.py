@@ -1,6 +1,10 @@
 """A worker and the server killed while edges send: no sample is lost or counted twice. ``make fleet-kills`` is the long one."""
 
+import pytest
+
 from tests.benchmarks.fleet_kills import Plan, run
+
+pytestmark = pytest.mark.thorough
 
 
 def test_end_states_are_those_of_all_samples_whoever_is_killed() -> None:
