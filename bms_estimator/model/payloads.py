@@ -4,6 +4,7 @@ Every number that can be missing is ``None`` and never NaN: the payloads are JSO
 are published as JSON schema.
 """
 
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -20,6 +21,11 @@ class Payload(BaseModel):
     """Base of all published values."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @cached_property
+    def json_bytes(self) -> bytes:
+        """JSON text, serialized once for all sinks."""
+        return self.model_dump_json().encode()
 
 
 _COUNTED = "at the terminals over all runs, up to the last checkpoint where there is one; it never decreases"

@@ -371,4 +371,4 @@ def _values(job: Job, device: str) -> dict[str, str]:
     fields = {name: getattr(alarm, name) for name in ("name", "severity", "since", "value", "limit", "unit")}
     values = {name: "" if value is None else str(value) for name, value in fields.items()}
     text = alarm.text or alarm.unwatched_reason or ""
-    return values | {"text": text, "device": device, "state": job.state, "json": alarm.model_dump_json()}
+    return values | {"text": text, "device": device, "state": job.state, "json": alarm.json_bytes.decode()}

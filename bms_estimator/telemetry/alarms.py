@@ -111,6 +111,7 @@ class AlarmEvaluator:
         self._reasons: dict[AlarmName, Reasons] = {}
         self._changes: list[Change] = []
         self._unshown: dict[AlarmName, AlarmMessage] = {}
+        self._payloads: dict[AlarmName, tuple[AlarmMessage, Alarm]] = {}  # rebuilt only when the message changes
         self.kept = ""
 
     @property
@@ -358,10 +359,13 @@ class AlarmEvaluator:
 
     def _alarm(self, state: AlarmState) -> Alarm:
         name = state.watched.name
-        told = AlarmMessage(
+        message = AlarmMessage(
             state.raising, gone=state.cause_cleared, reasons=self._texts(name), unwatched=self._unwatched.get(name)
         )
-        return _alarm(state.watched, told)
+        latest = self._payloads.get(name)
+        if latest is None or latest[0] != message:
+            latest = self._payloads[name] = message, _alarm(state.watched, message)
+        return latest[1]
 
     def _texts(self, name: AlarmName) -> tuple[str, ...]:
         """Known causes of an alarm, one sentence each."""

@@ -108,22 +108,22 @@ class MessageBuilder:
         before, messages = sent.snapshot, []
         known = bool(parameters.elements)  # not before the first sample
         if known and (before is None or before.parameters is not parameters):
-            messages.append(self._live("parameters", _report(parameters)))
+            messages.append(self._live("parameters", parameters.json_bytes))
         if before is None or before.health.sensor_online != health.sensor_online:
             messages.append(self._sensor(health))
         if before is None or before.health is not health:
-            messages.append(self._retained("health", _report(health)))
+            messages.append(self._retained("health", health.json_bytes))
         if before is None or before.info != info:
-            messages.append(self._retained("info", _report(info)))
+            messages.append(self._retained("info", info.json_bytes))
         described = self._described(sent, snapshot)
         if described != sent.described:
             payload = self._discovery(described)
             if sent.described is None or payload != self._discovery(sent.described):
                 messages.append(Message(discovery_topic(self._home, self._device), payload, 1, retain=True))
-        known_alarms = before.alarms if before else ()
-        messages += [self._retained(f"alarm/{a.name}", _report(a)) for a in alarms if a not in known_alarms]
-        told, shown = self._home_assistant(sent.shown, snapshot, described, now_s)
-        return messages + told, PublishedState(snapshot, shown, described)
+        published = {alarm.name: alarm for alarm in before.alarms} if before else {}
+        messages += [self._retained(f"alarm/{a.name}", a.json_bytes) for a in alarms if a != published.get(a.name)]
+        values, shown = self._home_assistant(sent.shown, snapshot, described, now_s)
+        return messages + values, PublishedState(snapshot, shown, described)
 
     def _described(self, sent: PublishedState, snapshot: Snapshot) -> DiscoveryInputs:
         """Cells that were measured once stay."""
@@ -149,7 +149,7 @@ class MessageBuilder:
         return _json(discovery(self._home, described, self.root, self._sample_period_s)) if self._home.enabled else b""
 
     def _kept(self, topic: str, report: Payload) -> Message:
-        return Message(f"{self.root}/{topic}", _report(report), 1, retain=False)
+        return Message(f"{self.root}/{topic}", report.json_bytes, 1, retain=False)
 
     def _live(self, topic: str, payload: bytes) -> Message:
         return Message(f"{self.root}/{topic}", payload, 0, retain=False)
@@ -162,10 +162,6 @@ class MessageBuilder:
 def _schema() -> bytes:
     """Return the schema, which is equal for all packs."""
     return _json(schema())
-
-
-def _report(report: Payload) -> bytes:
-    return report.model_dump_json().encode()
 
 
 def _json(value: Mapping[str, Any]) -> bytes:
