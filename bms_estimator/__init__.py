@@ -1,8 +1,9 @@
 """Real-time Li-ion battery estimator: adaptive observer, parameters, SOC and stability margins.
 
-What others may build on is here, see docs/reference/python.md; all else may change from one version to the next.
+The names in ``__all__`` are stable, see docs/reference/python.md; other modules may change.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from bms_estimator.estimator import Estimator, estimate
     from bms_estimator.model.cell import load_cell
     from bms_estimator.sources.captures.replay import load_capture
+
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
+"""Highlighting starts colorama, whose exit handler would wait for a terminal that nobody reads."""
 
 __all__ = ["Estimator", "__version__", "estimate", "identify", "load_capture", "load_cell", "validate"]
 

@@ -42,7 +42,8 @@ BEYOND = 3.0
 DISAGREE = 9.0
 """Maximum squared distance between two consistent anchors, in units of their variance."""
 HYST_UNSURE = 0.3
-"""Std of the hysteresis h where the way is known, and of its size, which errs the other way after a charge."""
+"""Std of the hysteresis h if the direction of the current is known, and of its amplitude, whose error has the
+opposite sign after a charge."""
 
 
 @dataclass(frozen=True)

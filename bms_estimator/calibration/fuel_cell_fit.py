@@ -1,7 +1,7 @@
 """A fuel cell's parameters from polarisation curves and records under changing current (thesis 7.3).
 
-Least squares of the voltage, over the ln of all parameters at once, with the kernel that the observer runs. What the data do
-not tell to ``KNOWN`` keeps the value of the file, and the reason is said.
+Least squares of the voltage, over the ln of all parameters at once, with the kernel that the observer runs. A
+parameter that the data determine less well than ``KNOWN`` keeps the value of the file, with a reason.
 """
 
 import math
@@ -29,7 +29,7 @@ ROUNDS = 3
 LEAST_V = 1e-4
 """No source is better than this [V]: what leaves less has as many points as parameters."""
 BLOCKS = 20
-"""Parts of a record whose means tell how long its errors are alike."""
+"""Number of parts of a record whose means show how long its errors are correlated."""
 KEYS: tuple[Parameter, ...] = get_args(Parameter)
 """Keys of ``[fuel_cell]``, in the order of ``NAMES``."""
 NEEDS = {
@@ -89,7 +89,7 @@ def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFi
 
     Args:
         sources: Curves and records.
-        start: Where the search begins, and what is kept of what the data do not tell.
+        start: Start of the search, and values of parameters that the data do not determine.
 
     Raises:
         UserError: The data tell of no parameter.

@@ -1,7 +1,7 @@
 """Checkpoints: the estimator's state on disk, taken up again only when it belongs to the same pack and is sane.
 
-One file for each meaning that a state can have (``pack_identity``), its fields under their own names: settings may be
-edited, and versions that know other fields may come, without what was learned being lost.
+Each meaning of a state (``pack_identity``) has its own file with named fields. Edited settings and versions with
+other fields therefore lose nothing.
 """
 
 import io
@@ -38,7 +38,7 @@ LONGEST_FILE = 1 << 20
 KEPT = 8
 """Number of files of one pack that are kept, those saved last."""
 REFUSED = "refused: "
-"""A reason that begins so tells why a file that was found is not taken up."""
+"""Prefix of the reason for rejecting a file."""
 LATER = 4
 """Number of files of later formats that are kept for a return to the version that wrote them."""
 _OF_LEDGER = "restarts", "total", "clean", "alarms"
@@ -120,7 +120,7 @@ class CheckpointFile:
         self._write(content, ledger)
 
     def update_counters(self, ledger: RunCounters) -> None:
-        """Change what the file tells of the runs, and nothing else: its state is as old as before. Without a file: nothing.
+        """Update the counters of the runs in the file, if there is one; the state keeps its age.
 
         Raises:
             OSError: The file cannot be written.
@@ -161,9 +161,10 @@ class CheckpointFile:
             return CheckpointContent({}, 0.0, new, f"{REFUSED}damaged, perhaps by a power cut ({type(error).__name__})")
 
     def quarantine(self) -> str:
-        """Keep a file that was refused out of the way of the next save. Returns what was done, for people.
+        """Move a rejected file out of the way of the next save. Returns what was done, for people.
 
-        One of a later format is good, and in place of none: who goes back to a version and forth has each of them. It is
+        A file of a later format is valid and replaces none, so that each version finds its own file after a
+        downgrade. It is
         not taken up unasked: what this version saves meanwhile is newer, though it may have learned less.
         """
         aside = self.path.with_name(f"{self._name}.refused.npz")

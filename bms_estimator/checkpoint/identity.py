@@ -17,8 +17,8 @@ def pack_identity(settings: Settings, cell: PackModel) -> str:
 
     Of a fuel cell: all its parameters and the sign.
 
-    Plain numbers and not the sections of the settings: a description, a tuning value or a setting that a later version
-    adds leave the meaning as it is.
+    Plain numbers and not the sections of the settings: a new description, tuning value or setting does not change the
+    meaning.
     """
     if isinstance(cell, FuelCellModel):  # theta is over the file's values
         return hashlib.sha256(repr((*cell.a, settings.sensor.current_sign)).encode()).hexdigest()

@@ -98,7 +98,7 @@ def _open_curve(estimator: Estimator) -> None:
 
 
 def _open_new_states(estimator: Estimator) -> None:
-    """Offset and capacity begin as configured where they were no states of the filter before, or are none now."""
+    """Offset and capacity start as configured if they were not states of the filter before, or are not now."""
     f, p = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
     best = f["best"]
     for j, variance in ((OFFSET, offset_variance(p)), (LN_Q, p["capacity_std"] ** 2)):

@@ -126,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(arguments: Sequence[str] | None) -> None:
-    """Run the command line; what is left of its output goes out here, where a fault of stdout can still be said."""
+    """Run the command line; flush the remaining output here, where an error of stdout can still be reported."""
     try:
         app(None if arguments is None else list(arguments), prog_name="bms-estimator")
     except SystemExit:

@@ -1,6 +1,6 @@
 """An MQTT broker inside the process, for the demo: nothing to install, loopback only.
 
-No broker for a pack that matters: it knows no passwords here, keeps nothing over a restart, and see ``_Broker``.
+Not for a real pack: it has no passwords and no persistence, see ``_Broker``.
 """
 
 import asyncio
@@ -32,8 +32,8 @@ UNSUPPORTED_VERSION = b"\x20\x02\x00\x01"
 class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
     """amqtt 0.12, put right where it is wrong.
 
-    It hands a client that connects the retained messages of everyone's subscriptions: only its own are right. What
-    MQTT 5 adds to a CONNECT it takes for something else and waits for more: the client is to hear that 3.1.1 is spoken.
+    It hands a client that connects the retained messages of everyone's subscriptions: only its own are right. It
+    misreads the MQTT 5 fields of a CONNECT and waits for more; the client must learn that it speaks 3.1.1.
     """
 
     async def stream_connected(
@@ -129,7 +129,7 @@ class DemoBroker:
 
 
 def choose_port(port: int | None, usual: int) -> int:
-    """Return the port to listen on: the requested one, else the usual one, else a free one.
+    """Return the port to listen on: the requested one, otherwise the usual one, otherwise a free one.
 
     Raises:
         UserError: The port asked for is taken.

@@ -14,7 +14,7 @@ from bms_estimator.simulation.simulated_pack import SimulatedPack
 from bms_estimator.simulation.virtual_adc import Reading
 
 TAIL_BYTES = 256
-"""The end of what came holds a whole sample's frame, whatever else is there."""
+"""The last bytes contain a complete sample frame among others."""
 
 
 class TrueSoc:

@@ -1,7 +1,7 @@
 """The edge: a pack's raw samples on their way to a fleet's server, by MQTT, in blocks.
 
-``take`` gathers; ``BlockStore`` keeps blocks until a worker has said that they are safe; here they are sent, and what
-workers say is heard. How a broker is reached is the same as for estimates.
+``take`` gathers; ``BlockStore`` keeps blocks until a worker has confirmed them; this module sends them and receives
+the confirmations. How a broker is reached is the same as for estimates.
 """
 
 import asyncio
@@ -54,7 +54,7 @@ class BlockSender:
         pack: Name of the pack.
         folder: Where blocks are kept, in ``<pack>.edge.sqlite``.
         connect: Makes a connection; over TCP when left out.
-        clock: Its wall clock says when samples came.
+        clock: Its wall clock dates samples.
         steady: A clock that never steps, and goes on while the machine sleeps [s].
         most_samples: Of a block.
         first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
@@ -197,7 +197,7 @@ class BlockSender:
                 self.store.on_request(awaits)
 
     def _lose(self, kind: str, topic: str) -> None:
-        """Something came that a worker does not say."""
+        """Count a message that is not a worker's answer."""
         if not self.unread:
             log.warning("what came from a worker cannot be read", reason=kind, topic=topic[:100])
         self.unread += 1

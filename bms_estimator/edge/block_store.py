@@ -1,7 +1,7 @@
-"""An edge's blocks: on disk until a worker has said that they are safe, handed out in order, and again where asked for.
+"""Blocks of an edge: on disk until a worker has confirmed them, returned in order, and again on request.
 
-The event loop never waits for the disk. What the disk does not take waits in memory, without a number: nothing is sent
-that a restart would not know, or a number could come twice for different samples.
+The event loop never waits for the disk. Blocks that cannot be written wait in memory without a number. Nothing is
+sent that a restart would not know, since a number could otherwise be used twice.
 """
 
 import asyncio
@@ -100,7 +100,7 @@ class BlockStore:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Write what is left."""
+        """Write the remaining data."""
         if self._task is None:
             return
         self._closing = True
@@ -187,7 +187,7 @@ class BlockStore:
     def _give_up(self, first: int) -> None:
         """Give up the unreadable blocks from the cursor on.
 
-        If an earlier block is not safe yet, wait until a worker asks for them.
+        If an earlier block is not confirmed yet, wait until a worker requests them.
         """
         if self.oldest >= self._cursor:
             self._drop(first - self._cursor, "blocks on the disk are damaged")

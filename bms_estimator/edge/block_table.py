@@ -112,7 +112,7 @@ class Page(NamedTuple):
     """Blocks that follow each other, as they are read."""
 
     first: int
-    """Number of the first one that can be read; what was asked for before it cannot."""
+    """Number of the first one that can be read; earlier requests cannot."""
     blocks: list[tuple[int, bytes]]
 
 

@@ -17,14 +17,14 @@ WINDOW_S = 600.0
 """Window of the smallest delay [s]: a sample comes late and never early, so that the smallest delay shows a clock's
 lag."""
 GRID = 2.0**20
-"""Offsets are whole parts of a second, 1/GRID: what is added so leaves an even pace even, which packs best."""
+"""Offsets are multiples of 1/GRID, so that a constant period stays constant, which compresses best."""
 
 
 class SampleClock:
-    """Seconds since 1970 that never decrease, whatever becomes of the wall clock.
+    """Seconds since 1970 that never decrease, even if the wall clock does.
 
-    Between samples counts the source's clock. Where it begins, and whether it is still right, the host says: by the
-    wall clock at the start, then by its steady one. A wall clock that is set ahead is followed, as of a machine that
+    Between samples counts the source's clock. The host gives its start by the wall clock, and its corrections by the
+    monotonic clock. A wall clock that is set ahead is followed, as of a machine that
     has come up without knowing the time: that was a gap. One that is set back is not.
 
     Args:

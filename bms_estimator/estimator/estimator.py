@@ -141,7 +141,7 @@ class Estimator:
     def resume(self, unseen_s: float) -> None:
         """Prepare for samples of another clock, after a time without measurements.
 
-        The next sample comes after a gap of ``unseen_s``, as gaps in the samples do: the load may have gone on or changed.
+        The next sample follows a gap of ``unseen_s``, in which the load may have continued or changed.
 
         Args:
             unseen_s: Length of the unmeasured gap [s]; infinite if unknown.
@@ -183,7 +183,7 @@ def estimate(
 
     Returns:
         The columns of dtype ``TRACE``, one row for each accepted sample: ``soc`` with ``soc_std``, the elements with
-        their standard deviations, the observer's values. NaN is what is not known.
+        their standard deviations, the observer's values. Unknown values are NaN.
     """
     estimator = Estimator(cell, initial_soc=initial_soc, voltage_resolution_v=voltage_resolution_v)
     return Columns(estimator.run(capture.rows), capture.name)

@@ -25,7 +25,8 @@ class Heartbeat(BaseModel):
     blocks: int = 0
     samples: int = 0
     faults: int = 0
-    """Blocks left out for a fault of ours, beside those that ``counters`` has as failed: the log has its traceback."""
+    """Blocks skipped because of an internal error, in addition to the failed ones in ``counters``: the log has its
+    traceback."""
     lag_s: float | None = None
     """Largest time from the arrival of a block's last sample at the edge to its processing since the last heartbeat
     [s]; None without a block."""

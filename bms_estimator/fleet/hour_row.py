@@ -1,4 +1,4 @@
-"""An hour of a pack in one row: what was measured, and what was known at its end. What a fleet is asked about."""
+"""One hour of a pack in one row: measurements, and estimates at its end. What a fleet is asked about."""
 
 from typing import Annotated
 
@@ -11,7 +11,7 @@ Correlation = Annotated[float, Field(ge=-1.001, le=1.001)]
 
 
 class Hour(Payload):
-    """One row. Charge and energy out are of discharge; std are of one standard deviation; what is not known is null."""
+    """One row. Charge and energy out are of discharge; std are of one standard deviation; unknown values are null."""
 
     model_config = ConfigDict(extra="ignore")  # who collects may be older than who sums up
 

@@ -16,7 +16,7 @@ CompileCallback = Callable[[str, int, int], None]
 
 @contextmanager
 def report_compilation(tell: CompileCallback) -> Iterator[None]:
-    """Have ``tell`` hear of each kernel whose compilation begins meanwhile, among the kernels imported so far."""
+    """Call ``tell`` for each imported kernel whose compilation begins meanwhile."""
     with event.install_listener("numba:compile", _Listener(_kernels(), tell)):
         yield
 

@@ -72,7 +72,7 @@ class ChenMoraOcv(Strict):
 
 
 class TableOcv(Strict):
-    """E_o(SOC) at 25 C through measured points, monotone between them (PCHIP), and what else is known of it there."""
+    """E_o(SOC) at 25 C through measured points (monotone, PCHIP), with its error, hysteresis and entropy."""
 
     form: Literal["table"]
     soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=4, description="increasing, from 0 to 1")
@@ -274,7 +274,7 @@ def _product(value: Any, factor: float) -> Any:
 
 
 def shipped_cells() -> list[str]:
-    """Names of the cells whose files come with the package."""
+    """Names of the shipped cells."""
     return _names("cells")
 
 
@@ -284,7 +284,7 @@ def generic_cells() -> list[str]:
 
 
 def shipped_fuel_cells() -> list[str]:
-    """Names of the fuel cells whose files come with the package."""
+    """Names of the shipped fuel cells."""
     return _names("cells/fuel_cell")
 
 

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 
 @dataclass(frozen=True)
 class Clock:
-    """Two clocks: ``wall`` says when (and may be stepped), ``monotonic`` says how long."""
+    """Two clocks: ``wall`` gives the time of day (and may be stepped), ``monotonic`` gives durations."""
 
     wall: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic

@@ -36,7 +36,7 @@ def _number(value: object) -> object:
 
 
 def _make_strict(schema: Any) -> None:
-    """Let each number and truth value within a schema be nothing else."""
+    """Restrict numbers and booleans within a schema to their exact types."""
     kind = schema.get("type") if isinstance(schema, dict) else None
     if kind == "bool":
         schema["strict"] = True

@@ -1,4 +1,4 @@
-"""The real connection: aiomqtt and paho, and what they say in words of ours."""
+"""The real connection: aiomqtt and paho, with their errors in plain words."""
 
 import asyncio
 import contextlib

@@ -38,7 +38,7 @@ class ConnectOptions(NamedTuple):
     will: Message | None
     """Last will; None for a reader."""
     on_message_lost: Callable[[str, str], None]
-    """Hears kind (``too_long``, ``overflow``) and topic of each message that came and was thrown away."""
+    """Callback with kind (``too_long``, ``overflow``) and topic of each discarded message."""
     most_waiting: int = MOST_WAITING
     """Messages that wait to be read; more are lost."""
     most_bytes: int = MOST_BYTES
@@ -55,7 +55,8 @@ class Connection(Protocol):
         """Ask for messages at QoS 0.
 
         Args:
-            requests: What is retained there must say so though it comes live, as far as the protocol can; None: nowhere.
+            requests: Topic filter subscribed with retain-as-published (MQTT 5), so that retained messages can be
+                recognized; None: nowhere.
             others: Further topics.
 
         Returns:
@@ -65,7 +66,7 @@ class Connection(Protocol):
     async def publish(self, message: Message) -> PublishRejection | None:
         """Hand over a message and wait until the broker has acknowledged it.
 
-        What is published by several tasks goes out in the order in which they called.
+        Messages of several tasks are sent in the order of their calls.
 
         Returns:
             The broker's refusal, where it does and says so.

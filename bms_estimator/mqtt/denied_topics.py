@@ -14,7 +14,7 @@ log = structlog.get_logger(__name__)
 
 
 class DeniedTopics:
-    """Names what is denied in log and health, and has what is retained said again when it was refused for now.
+    """Reports denied topics in log and health, and has retained messages sent again after a temporary rejection.
 
     Args:
         delivery: The topics are named there.

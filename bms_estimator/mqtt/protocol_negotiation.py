@@ -1,4 +1,4 @@
-"""Connecting to a broker whose version of MQTT is not known beforehand."""
+"""Connection to a broker whose MQTT version is unknown."""
 
 import asyncio
 import contextlib
@@ -16,7 +16,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 
 
 class BrokerConnector:
-    """Connects by MQTT 5; by 3.1.1 where the broker refuses that or does not know what to say.
+    """Connects by MQTT 5; by 3.1.1 if the broker rejects that or does not respond.
 
     Args:
         settings: Name, password and certificates. The files are reloaded for each connection.

@@ -11,8 +11,7 @@ from bms_estimator.mqtt.message import QueuedMessage
 from bms_estimator.process.backoff import Backoff
 
 WINDOW = 16
-"""Messages on their way to a broker that has not acknowledged them: below the 20 that brokers allow, so that the live
-topics find room beside them."""
+"""Maximum number of unacknowledged messages: below the 20 that brokers allow, so that live topics have room."""
 
 
 class MessageQueue(Protocol):
@@ -61,7 +60,7 @@ class QueueSender:
         self._moved = asyncio.Event()
 
     async def send(self, connection: Connection) -> None:
-        """Send what is there and what comes, until the connection is lost.
+        """Send queued and new messages until the connection is lost.
 
         Raises:
             BrokerConnectionError: It is, alone or in a group.
@@ -114,7 +113,7 @@ class QueueSender:
     async def _send_one(self, connection: Connection, waiting: QueuedMessage) -> bool:
         """Send one message; False: to be tried again.
 
-        What is refused for good is counted and given up: else it would hold up all the rest.
+        A permanently rejected message is counted and dropped, because it would block all others.
         """
         refusal = await connection.publish(waiting.message)
         self._refusals.record_result(waiting.message, refusal)

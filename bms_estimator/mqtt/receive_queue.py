@@ -8,7 +8,8 @@ import aiomqtt
 MOST_WAITING = 100
 """Messages that wait to be read; more are lost."""
 MOST_BYTES = 16_384
-"""Nothing that a service hears is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
+"""Maximum length of a received message [bytes]: an MQTT 5 broker enforces it, longer ones of an older broker are
+discarded."""
 
 
 class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):

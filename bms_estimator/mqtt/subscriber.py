@@ -1,4 +1,4 @@
-"""A subscriber to all devices of a broker: it keeps what each published last, stays connected, and says when it is not."""
+"""A subscriber to all devices of a broker: it keeps the latest messages and reconnects."""
 
 import asyncio
 import contextlib
@@ -37,7 +37,7 @@ class Subscriber:
 
     Args:
         settings: The brokers, and what opens their doors.
-        heard: Called with each message of a device, once it is kept.
+        heard: Called with each message of a device after it is stored.
         linked: Called when the broker was reached, and when it is lost; ``lost_since`` says which.
         connect: Makes a connection; over TCP when left out.
         left_out: Called with the name of a device that is not stored, because there are too many.
@@ -88,7 +88,7 @@ class Subscriber:
         """Since when there is no broker, seconds since 1970; None while there is one.
 
         Raises:
-            Exception: A callback's, which has ended the work: let it be seen.
+            Exception: An exception of a callback, which has ended the task.
         """
         if self._task is not None and self._task.done() and not self._task.cancelled():
             self._task.result()

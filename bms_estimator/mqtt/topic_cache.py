@@ -87,7 +87,7 @@ class TopicCache:
             now_s: When it came, seconds since 1970.
 
         Returns:
-            What was heard; None where it is nothing of a device, or more than is kept.
+            The received message; None where it is nothing of a device, or more than is kept.
         """
         name, _, rest = topic.removeprefix(self._root).partition("/")
         if not topic.startswith(self._root) or not rest or rest.split("/")[0] in ASKED:

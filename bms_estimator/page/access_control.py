@@ -32,7 +32,7 @@ class AccessControl:
     """Decides on requests.
 
     Args:
-        hosts: Names of ours, beside addresses, ``localhost`` and this machine's own name.
+        hosts: Host names of this server, in addition to addresses, ``localhost`` and the machine's name.
         token: What is to be shown; None: nothing.
     """
 

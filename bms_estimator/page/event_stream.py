@@ -66,7 +66,7 @@ class LatestValues:
 
 
 class Reader:
-    """Keys whose newest text one reader has not been sent yet. The texts are shared by all readers.
+    """Keys whose newest text has not been sent to one reader. The texts are shared by all readers.
 
     Args:
         newest: Source of the keys and texts.

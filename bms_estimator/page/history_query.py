@@ -53,7 +53,7 @@ class HistoryQuery:
         self.thread = DiskThread("page")
 
     def add(self, pack: str, path: Path) -> None:
-        """Say where a pack's history is kept."""
+        """Register the location of a pack's history."""
         self._files[pack] = path
 
     def drop(self, pack: str) -> None:

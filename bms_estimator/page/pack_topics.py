@@ -127,7 +127,7 @@ class PackTopics(LatestValues):
         self.set_value(PACKS, _json({"names": self.packs, "hidden": self._hidden}))
 
     def _remember(self, pack: str, state: Mapping[str, Any]) -> None:
-        """Keep what the curves show, once a second; a state that comes late or is dated far in the future is left out."""
+        """Keep what the curves show, once a second; a late state, or one dated far in the future, is omitted."""
         try:
             row = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
         except (TypeError, ValueError, KeyError):  # another publisher's

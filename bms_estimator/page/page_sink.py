@@ -44,7 +44,7 @@ class PageSink:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Say that nothing more will come, and part from the browsers."""
+        """Close the streams of all browsers."""
         self._put(self._messages.offline_messages())
         await self._stack.aclose()
 

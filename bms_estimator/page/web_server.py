@@ -1,4 +1,4 @@
-"""An HTTP server of pages: their files, the stream of what is new, what is asked for; nothing can be changed through it."""
+"""An HTTP server of pages: static files, the event stream, queries; nothing can be changed through it."""
 
 import asyncio
 import contextlib
@@ -61,7 +61,7 @@ class WebServer:
 
     Args:
         settings: Where, and to whom.
-        files: What is served as it stands, by the path of its URL.
+        files: Static files by the path of their URL.
         newest: What is streamed from ``/events``.
         handlers: What else is answered, by path.
         opened: Called with its address once it is served.
@@ -178,7 +178,7 @@ class WebServer:
         return f"bms_page_{self._listening.port}"
 
     def _let_in(self) -> web.Response:
-        """Have the browser keep a cookie, and leave the address with the token behind."""
+        """Set the cookie, and redirect to the address without the token."""
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(self._cookie, self._guard.cookie, max_age=31_536_000, httponly=True, samesite="Strict")
         return response

@@ -27,10 +27,10 @@ log = structlog.get_logger(__name__)
 def instance_lock(folder: Path, pack: str) -> Iterator[None]:
     """Serve a pack alone: two services would overwrite each other's checkpoint and availability.
 
-    Held is an abstract socket named after folder and pack. It is gone with the process however that ends, is no file that
-    could be planted, deleted or left over, and does not depend on a disk. Whoever is on the machine could take the name
-    first; so a holder that may not write the folder anyway does not count. One of whom nothing is known counts: two
-    services are worse than none. A container with a network of its own has names of its own.
+    Held is an abstract socket named after folder and pack. It disappears with the process, is not a file that could
+    be deleted or left over, and does not depend on a disk. Whoever is on the machine could take the name
+    first; so a holder that may not write the folder anyway does not count. An unknown holder counts as a service,
+    because two services are worse than none. A container with a network of its own has names of its own.
 
     Args:
         folder: Where the pack's state is kept.

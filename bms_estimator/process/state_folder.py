@@ -12,9 +12,10 @@ log = structlog.get_logger(__name__)
 
 
 def state_folder(settings: Settings) -> Path:
-    """Return the folder of checkpoints: that of the settings, else systemd's StateDirectory, else the user's XDG state folder.
+    """Return the folder of checkpoints, and create it.
 
-    Made where it is not there; where it cannot be made, what is saved there later says so.
+    It is that of the settings, otherwise systemd's StateDirectory, otherwise the user's XDG state folder. If it cannot
+    be created, a later save reports it.
 
     Raises:
         UserError: The folder of the settings cannot be made.

@@ -29,7 +29,7 @@ class Erratum:
 
     Attributes:
         where: Equation, table or section.
-        says: What is printed.
+        says: The printed text.
         holds: What holds instead.
     """
 

@@ -31,7 +31,7 @@ class Recorded:
 
 
 class Experiment:
-    """The protocol on one pack, with what is known of it.
+    """The protocol on one pack.
 
     Args:
         recorded: Real captures; None for the simulated pack.

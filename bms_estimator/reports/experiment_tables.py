@@ -1,4 +1,4 @@
-"""Tables 8 to 11 and 13: the procedure of chapter 5 on captures, beside what is printed."""
+"""Tables 8 to 11 and 13: the procedure of chapter 5 on captures, beside the printed values."""
 
 from collections.abc import Callable
 

@@ -164,7 +164,7 @@ class Procedure:
         return self.cell.model_copy(update={"ocv": self.joint_fit.ocv})
 
     def initial_soc(self, capture: Capture) -> float:
-        """1 when the capture begins as full as the relaxation tests do, else from its first voltage at rest."""
+        """1 if the capture starts as full as the relaxation tests do, otherwise from its first voltage at rest."""
         first = remove_glitches(capture.samples, capture.name)[0]
         full_v = float(self.table.ocv_v[-1])
         if capture.kind is Kind.RELAXATION or abs(first["current_a"]) > 0.01 * self.cell.cell.capacity_ah:

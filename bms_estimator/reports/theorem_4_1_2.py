@@ -1,7 +1,7 @@
 """Test of Theorem 4.1.2: do the products R_ts C_ts, R_tl C_tl converge to the truth?
 
-The theorem says so for a small current, whatever a1..a12 converge to. Here the observer runs at several currents and
-with several bounds on a cell whose truth is known.
+The theorem claims this for a small current, for any limits of a1..a12. Here the observer runs at several currents and
+with several bounds on a simulated cell.
 """
 
 from dataclasses import dataclass

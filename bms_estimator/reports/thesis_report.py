@@ -156,7 +156,7 @@ def build(
 def _wanted(
     builders: dict[str, Callable[[], Item]], table: str | None, figure: str | None
 ) -> Sequence[tuple[str, tuple[str, ...]]]:
-    """Chapters and marks of what is asked for."""
+    """Chapters and marks of the requested items."""
     asked = [f"T{table}"] * (table is not None) + [f"F{figure}"] * (figure is not None)
     for mark in asked:
         if mark not in builders:

@@ -102,7 +102,7 @@ class AlarmHooks:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Let what is under way end, within ``CLOSE_S``."""
+        """Let running programs end within ``CLOSE_S``."""
         for hook in self._hooks:
             hook.close()
         if self._tasks:

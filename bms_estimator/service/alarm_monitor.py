@@ -1,4 +1,4 @@
-"""Looks for alarms while samples come, and while none does; the log hears of each, and whoever else wants to."""
+"""Looks for alarms while samples come, and while none does; changes are logged, and passed to a callback."""
 
 import math
 from collections.abc import Callable
@@ -39,10 +39,10 @@ class AlarmMonitor:
         source: Its counters, cells and message are read.
         clock: The clocks.
         on_alarm: Called with each change of an alarm, as soon as it occurs.
-        hooks: Successes and failures of alarm hooks; None where there are none.
+        hooks: Successes and failures of alarm hooks; None without hooks.
 
     Attributes:
-        alarms: What is watched, and what is raised.
+        alarms: The monitored alarms and their states.
 
     Raises:
         UserError: As ``watched``.
@@ -74,7 +74,7 @@ class AlarmMonitor:
             self.evaluate(now_s)
 
     def evaluate(self, now_s: float) -> None:
-        """Look at what has come since the last time, and at that nothing came, at ``now_s`` of the monotonic clock [s]."""
+        """Judge the samples since the last call, or their absence, at ``now_s`` of the monotonic clock [s]."""
         passed_s, self._judged_s = now_s - self._judged_s, now_s
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))

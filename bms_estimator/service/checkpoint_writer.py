@@ -86,9 +86,9 @@ class CheckpointWriter:
         return int(state["samples"]), float(np.nan_to_num(state["soc"]))  # a fuel cell has none, NaN equals nothing
 
     async def _save(self, *, clean: bool = False) -> bool:
-        """Save what is not saved yet: False, it cannot be written.
+        """Save unsaved state. Return False if it cannot be written.
 
-        What is saved already keeps its time: it would seem to be of now, and not of before nothing was measured.
+        An unchanged state is not saved again: a new save time would hide the gap since the last sample.
         """
         taught, ledger = self._taught, self._ledger(clean=clean)
         if not taught[0] or taught == self._saved:

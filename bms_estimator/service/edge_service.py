@@ -38,7 +38,7 @@ async def serve_edge(
         settings: The pack's settings, with ``[edge]``.
         folder: Where blocks are kept.
         stop: Set by someone else to end as a signal does.
-        notifier: Who hears that the loop is ready and alive.
+        notifier: Is notified that the loop is ready and alive.
 
     Raises:
         UserError: A setting that cannot be used.
@@ -82,7 +82,7 @@ async def _keep_alive(
 
 
 async def _report(edge: BlockSender) -> None:
-    """Say in the log, at times, what has become of the blocks."""
+    """Log the state of the blocks at intervals."""
     while True:
         await asyncio.sleep(REPORT_S)
         log.info("blocks of samples", **edge.health().model_dump())

@@ -33,8 +33,8 @@ def environment(passed: Collection[str], fields: Mapping[str, str]) -> dict[str,
 
     Args:
         passed: Names of further variables of the service that it gets.
-        fields: Fields of the alarm; each becomes ``BMS_`` and its name in capitals. A null character in a text that came
-            from outside becomes a space, because no program could be started with it.
+        fields: Fields of the alarm; each becomes ``BMS_`` and its name in capitals. A null character in a foreign
+            text becomes a space, because no program can be started with it.
     """
     names = {*PASSED, *passed}
     inherited = {name: value for name, value in os.environ.items() if name in names or name.startswith("LC_")}

@@ -1,4 +1,4 @@
-"""Everything a live run computes with, called once before it begins: nothing compiles once samples come."""
+"""All kernels of a live run, called once before it begins, so that nothing compiles once samples arrive."""
 
 import gc
 

@@ -72,7 +72,7 @@ async def run_estimation_loop(
         requests: Where this loop offers what it can answer.
         delivery: Counters of sent messages and received requests.
         current_zero: Has the board take the present current as zero; None: it cannot.
-        notifier: Who hears that the loop is ready and alive.
+        notifier: Is notified that the loop is ready and alive.
         clock: The clocks.
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
@@ -193,7 +193,7 @@ async def _measure_lag(publisher: Publisher) -> None:
 
 
 def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clock) -> tuple[RunCounters, str]:
-    """Go on from the checkpoint where there is a good one. Returns what the runs before have counted, and what was done."""
+    """Continue from a valid checkpoint. Returns what the runs before have counted, and what was done."""
     if checkpoint is None:
         return RunCounters(0, new_totals(clock.wall())), "off"
     found = checkpoint.load()

@@ -60,7 +60,7 @@ async def run_pack_service(
         tap: Gets all that the source is decoded from, with its arrival times.
         stop: Set by someone else to end as a signal does.
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
-        notifier: Who hears that the loop is ready and alive.
+        notifier: Is notified that the loop is ready and alive.
         pages: The live pages of this process.
 
     Returns:

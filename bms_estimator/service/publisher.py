@@ -57,14 +57,14 @@ class Publisher:
         source: Its counters, message and board are read.
         sinks: Where snapshots go.
         clock: The clocks.
-        tally: What is counted over restarts; else begins with this run.
+        tally: What is counted over restarts; default: new totals.
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the checkpoint at start.
         delivery: Counters of sent messages and received requests.
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
         edge: Of raw samples on their way to a fleet; None where none are sent.
-        hooks: Successes and failures of alarm hooks; None where there are none.
+        hooks: Successes and failures of alarm hooks; None without hooks.
         on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
 
     Attributes:

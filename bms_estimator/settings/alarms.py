@@ -40,14 +40,14 @@ class AlarmRule(Strict):
 
 
 class VoltageRule(AlarmRule):
-    """An alarm of a voltage; what is left out follows from the cell."""
+    """An alarm of a voltage; omitted values follow from the cell."""
 
     limit_v: Positive | None = None
     clear_v: Positive | None = None
 
 
 class CurrentRule(AlarmRule):
-    """An alarm of a current's magnitude; what is left out follows from the cell."""
+    """An alarm of a current's magnitude; omitted values follow from the cell."""
 
     limit_a: Positive | None = None
     clear_a: NotNegative | None = None

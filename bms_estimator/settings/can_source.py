@@ -23,7 +23,7 @@ PROFILES: dict[str, dict[str, object]] = {
         "temperature": {"id": 0x356, "start_bit": 32, "bits": 16, "signed": True, "scale": 0.1},
     },
 }
-"""Buses whose signals are known, by name: what ``[source]`` does not say itself. All of them count charge as positive."""
+"""Buses with known signals, by name: defaults of ``[source]``. All of them count charge as positive."""
 
 
 class Signal(Strict):
@@ -142,7 +142,7 @@ class CanSource(PolledSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The sign of a known bus, and the steps of what is placed by hand."""
+        """The sign of a known bus, and the steps of signals defined by hand."""
         sign = {"current_sign": "charge_positive"} if self.profile else {}
         volts = {} if self.voltage.signal else {"voltage_resolution_v": abs(self.voltage.scale)}
         amperes = {} if self.current.signal else {"current_resolution_a": abs(self.current.scale)}

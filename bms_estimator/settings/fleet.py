@@ -99,7 +99,7 @@ class FleetSettings(Strict):
         return self
 
     def refuse_open(self, where: str) -> None:
-        """Say what is missing for other machines to reach the server.
+        """Reject a server that other machines can reach without TLS and tenants.
 
         Args:
             where: What lets them.

@@ -32,7 +32,7 @@ PROFILES: dict[str, dict[str, object]] = {
         "cells": {"address": 0x1100, "table": "input", "type": "uint16", "scale": 0.001, "count": 16},
     },
 }
-"""Devices whose registers are known, by name: what ``[source]`` does not say itself. All of them count charge as positive."""
+"""Devices with known registers, by name: defaults of ``[source]``. All of them count charge as positive."""
 
 
 class Register(Strict):

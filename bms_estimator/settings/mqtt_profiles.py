@@ -1,7 +1,7 @@
 """Profiles of battery projects that publish over MQTT: settings of ``[source]`` by the project's name.
 
-``{prefix}`` is ``source.prefix``, ``{instance}`` is ``source.instance``, ``{cell}`` the number of a cell from 1. What the settings
-themselves tell goes before what stands here. Where the forms come from stands at each; looked up in November 2026.
+``{prefix}`` is ``source.prefix``, ``{instance}`` is ``source.instance``, ``{cell}`` the number of a cell from 1. Explicit
+settings take precedence over a profile. Each profile names its source; looked up in November 2026.
 """
 
 from collections.abc import Mapping
@@ -37,8 +37,8 @@ class Profile(NamedTuple):
 def _esphome(voltage: str, current: str, temperature: str, cell: str) -> dict[str, Any]:
     """ESPHome: ``<topic_prefix>/sensor/<object_id>/state``, a plain number; the object id is the sensor's name.
 
-    esphome/components/mqtt/mqtt_component.cpp. The examples begin each name with that of the node, which is the prefix unless
-    ``instance`` says another; names without it are taken, too.
+    esphome/components/mqtt/mqtt_component.cpp. The examples begin each name with that of the node, which is the
+    prefix unless ``instance`` names another; names without it are taken, too.
     """
 
     def topics(name: str) -> dict[str, Any]:

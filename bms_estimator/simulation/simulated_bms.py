@@ -64,7 +64,7 @@ class SimulatedBms(SimulatedMeter):
         self._faults: deque[BmsFault] = deque()
 
     def inject(self, fault: BmsFault, answers: int = 1) -> None:
-        """Let ``fault`` happen to the next ``answers`` that have none yet."""
+        """Apply ``fault`` to the next ``answers`` responses without one."""
         self._faults.extend([fault] * answers)
 
     def mend(self) -> None:

@@ -214,7 +214,7 @@ class VirtualBoard:
             await self._drained.wait()
 
     def inject(self, fault: BoardFault, frames: int = 1) -> None:
-        """Let ``fault`` happen to the next ``frames`` samples that have none yet."""
+        """Apply ``fault`` to the next ``frames`` samples without one."""
         self._faults.extend(itertools.repeat(fault, frames))
 
     def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> None:

@@ -21,7 +21,7 @@ GZIP_LEVEL = 3
 class TableSink(Protocol):
     """A file that grows by trace blocks; leaving completes it.
 
-    The first block replaces an older file: work that fails before it leaves that one as it was.
+    The first block replaces an older file, so that an earlier failure leaves that one unchanged.
     """
 
     def __enter__(self) -> Self:

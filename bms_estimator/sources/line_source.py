@@ -206,7 +206,7 @@ class LineSource:
         log.info("connected", source=self._bringer.name)
 
     async def _watch(self) -> None:
-        """Say why nothing comes; have faults logged."""
+        """Report why nothing arrives; have faults logged."""
         while True:
             self._tended_s = now_s = self._monotonic()
             if self._connected and now_s - self._heard_s >= self._silent_s:
@@ -216,7 +216,7 @@ class LineSource:
             await asyncio.sleep(self._look_s)
 
     def _say(self, message: str) -> None:
-        """Say why no samples come; in the log once for each reason, until samples come."""
+        """Report why no samples arrive; in the log once for each reason, until samples come."""
         if message != self._said:
             log.warning("no samples", reason=message)
         self._message = self._said = message

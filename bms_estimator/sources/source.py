@@ -55,7 +55,7 @@ class Source(Protocol):
 
     @property
     def cells(self) -> CellBlock:
-        """Beside the samples of the block that came last; ``NO_CELLS`` where no cells are measured."""
+        """Cell voltages of the latest block; ``NO_CELLS`` where no cells are measured."""
 
     def __aiter__(self) -> AsyncIterator[SampleBlock]:
         """Blocks of samples, none of them empty."""

@@ -230,7 +230,7 @@ class _File:
         migrate(connection, self._tables)
 
     def _refuse_planted(self, path: Path) -> None:
-        """Put a link, or what is no file, out of the way: SQLite would write where it leads."""
+        """Quarantine a link or anything but a regular file: SQLite would write to its target."""
         try:
             found = path.lstat()
         except FileNotFoundError:
@@ -240,7 +240,7 @@ class _File:
             log.warning("no file stands where the database must: set aside", file=str(path))
 
     def _set_aside(self, reason: str) -> None:
-        """Keep a file that cannot be used, and its log, out of the way of a new one."""
+        """Quarantine an unusable file and its log."""
         aside = self._path.with_name(f"{self._path.stem}.refused{self._path.suffix}")
         for suffix in ("", "-wal", "-shm"):
             source, target = (path.with_name(path.name + suffix) for path in (self._path, aside))
@@ -251,7 +251,7 @@ class _File:
 
 
 def _trim(connection: sqlite3.Connection) -> None:
-    """Give back free pages once they are most of the file: what is left is moved at most once or twice."""
+    """Release free pages once they are most of the file, so that data are moved at most once or twice."""
     (free,) = connection.execute("PRAGMA freelist_count").fetchone()
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     if free > max(FREE_PAGES, pages // 2):

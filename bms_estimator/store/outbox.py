@@ -61,7 +61,7 @@ class Outbox:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Write what is left."""
+        """Write the remaining messages."""
         if self._task is None or self._database is None:
             return
         self._closing = True

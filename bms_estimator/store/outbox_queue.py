@@ -1,7 +1,7 @@
 """The order of what waits for the broker, in memory and on disk. Pure: no disk, no clock, no task.
 
-From the oldest to the newest a message is on its way (``in_flight``), ready to be handed out, on disk alone
-(``stored``), or in the tail of what came last. While the broker takes what comes, nothing goes beyond ready.
+From the oldest to the newest, a message is sent (``in_flight``), ready to be sent, on disk only (``stored``), or in
+the tail of the newest. While the broker accepts messages, none goes beyond ready.
 """
 
 from collections import deque
@@ -30,9 +30,9 @@ class Queue:
         most: Maximum number of stored messages; beyond it the oldest one not in flight is dropped.
         dropped: Messages that found no room.
         next: The number of the next message.
-        in_flight: On their way, not yet acknowledged.
+        in_flight: Sent and not yet acknowledged.
         stale: Whether something may be on disk that is not kept any more.
-        disk_state_known: Whether it is known what is on disk; if not, what is in memory is written again.
+        disk_state_known: True if the content of the disk is known; if not, what is in memory is written again.
         stored: What is on disk alone.
         skip_disk: Hand out what came last though older ones are on disk, which cannot be read.
     """

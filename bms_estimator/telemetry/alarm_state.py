@@ -36,7 +36,7 @@ class AlarmState:
         raising: Of an alarm that is active; None of one that is not.
         cause_cleared: The cause is gone, but it is latched.
         acknowledged: True if acknowledged: the alarm ends once its cause is gone.
-        known: A value has come.
+        known: A value has arrived.
         lost_s: Shorter times without values count toward a delay [s].
     """
 

@@ -36,8 +36,8 @@ def alarm_text(watched: AlarmDefinition, value: float | None, reasons: Sequence[
     Args:
         watched: The alarm.
         value: What was measured when it was raised; None: there is no number.
-        reasons: What else is known of the cause.
-        gone: The cause is gone, but it is latched.
+        reasons: Other known causes.
+        gone: The cause is gone, but the alarm is latched.
     """
     what, to_do = _WHAT[watched.name]
     unit = f" {watched.unit}" if watched.unit else ""

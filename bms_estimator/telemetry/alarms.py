@@ -1,7 +1,7 @@
-"""All alarms of a pack: from every sample, and what the estimator made of it, to what is raised.
+"""All alarms of a pack: from samples and estimates to raised alarms.
 
-Each sample is judged, not the means that are published, and on the samples' own clock: a replay raises the same. What the
-sensors say counts as it came, also what the estimator takes for a glitch; the delays keep single ones out.
+Each sample is judged, not the means that are published, and on the samples' own clock: a replay raises the same. Raw
+values count, including those that the estimator drops as glitches; the delays keep single ones out.
 """
 
 import json
@@ -120,7 +120,7 @@ class AlarmEvaluator:
         return self._waiting.size
 
     def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock) -> None:
-        """Take a block, what the estimator made of it, and the cells beside it; ``evaluate`` looks at them."""
+        """Take a block, its estimates, and its cell voltages; ``evaluate`` looks at them."""
         self._waiting.add(block, trace, cells)
 
     def evaluate(self, arrival_s: float, counts: SampleCounts, suspects: InputFault, suspicions: Sequence[str]) -> None:
@@ -217,7 +217,7 @@ class AlarmEvaluator:
         return changes
 
     def report(self) -> tuple[Alarm, ...]:
-        """All that are watched. What was raised since the last call is shown as it was raised, though it may have ended."""
+        """All that are watched. An alarm raised since the last call is shown as raised, even if it has ended."""
         unshown, self._unshown = self._unshown, {}
         return tuple(
             _alarm(state.watched, unshown[name]) if state.raising is None and name in unshown else self._alarm(state)
@@ -226,7 +226,7 @@ class AlarmEvaluator:
         )
 
     def restore(self, kept: str) -> None:
-        """Go on from what a run before has ``kept``.
+        """Continue from the ``kept`` state of an earlier run.
 
         Raises:
             ValueError, TypeError, LookupError: It is damaged.
@@ -351,7 +351,7 @@ class AlarmEvaluator:
             self._changes.append(Change(turn.at_s, _alarm(state.watched, told)))
 
     def _suspect(self, name: AlarmName, suspects: InputFault, suspicions: Sequence[str]) -> None:
-        """Keep the sentences as they were when one came or went: numbers in them may change each second."""
+        """Keep the sentences of the moment when a diagnostic began or ended: their numbers may change each second."""
         state, before = self._states.get(name), self._reasons.get(name, _NO_REASONS)
         if state is not None and suspects != before.suspects and (suspects or state.raising is None):
             texts = tuple(said for said in suspicions for suspect in suspects if said.endswith(suspect.text))

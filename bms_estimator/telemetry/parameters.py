@@ -96,7 +96,7 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
 
 
 def _of_fuel_cell(estimator: Estimator, now_s: float) -> ParameterReport:
-    """No SOC, no a1..a21; what is learned stands among the elements."""
+    """No SOC, no a1..a21; learned values are among the elements."""
     elements = fuel_cell_parameters(estimator, now_s) if estimator.state[0]["started"] else {}
     return ParameterReport(publish_time=iso_utc(now_s), soc=None, a={}, ocv=None, elements=elements, state_of_health={})
 
@@ -190,7 +190,7 @@ def _parameter(held: Parameter, fit: IdentifiedValue | None, now_s: float) -> Pa
 
 
 def _identified(learned: IdentifiedValue, held: Parameter, limit: float, now_s: float) -> Parameter:
-    """Learned value if its error is small enough, else the observer's value and how far learning has come."""
+    """Learned value if its error is small enough, otherwise the observer's value and the progress of learning."""
     if math.isinf(learned.age_s):
         return held
     if learned.relative_std < limit:

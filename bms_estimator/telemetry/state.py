@@ -37,7 +37,7 @@ def make_state_payload(
 
     Args:
         window: What came since the last publication.
-        remaining: What is left in the pack.
+        remaining: Remaining charge and energy.
         counters: The source's.
         now_s: Wall clock [s since 1970].
         flow: What has gone through the terminals.

@@ -1,4 +1,4 @@
-"""Contradictions between a capture and the cell that it is said to come from."""
+"""Contradictions between a capture and its alleged cell."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 
 LEAST_CURRENT_C = 0.1
-"""A capture whose current never exceeds this C-rate says nothing of the resistances: it is for `ocv` [1/h]."""
+"""Maximum C-rate of a capture without information on resistances [1/h]; such a capture is for `ocv`."""
 STEP_SHARE = 0.1
 """Change of current between two samples that counts as a step, of the capture's largest current."""
 STEP_S = 3.0
@@ -36,7 +36,7 @@ def capture_contradictions(load: CleanCapture, cell: CellModel, start: float) ->
 
     Args:
         load: The capture.
-        cell: That it is said to come from.
+        cell: Its alleged cell.
         start: SOC at the first sample, 0..1.
     """
     found = _short(load) or _no_excitation(load, cell) or _sign(load, cell) or _answer(load, cell) or _gap(load, cell)

@@ -28,7 +28,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
     """Return the valid samples: finite, time increasing, voltage within half of the median of those above 0 V.
 
     Raises:
-        UserError: Nothing is left, most voltages are glitches, or time goes back and goes on from there.
+        UserError: Nothing is left, most voltages are glitches, or the time goes back.
     """
     finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
     good = samples[finite]

@@ -133,7 +133,7 @@ class Identification:
 
 @dataclass(frozen=True)
 class Run:
-    """One capture with what is known of it beside its samples."""
+    """One capture with derived information."""
 
     load: CleanCapture
     soc: Floats
@@ -209,7 +209,7 @@ def initial_soc(load: CleanCapture, cell: CellModel) -> float:
 
 
 class _Candidate:
-    """One way to fit the captures: with the OCV refined or kept."""
+    """One variant of the fit: with the OCV refined or kept."""
 
     def __init__(self, runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> None:
         self._runs, self._cell, self._refine = runs, cell, refine_ocv

@@ -93,7 +93,7 @@ class Moments:
         information: X'WX, the miscount marginalised.
         right: X'Wy, the same.
         along: X'Wc, with c what a miscount of 1 would do to the voltage.
-        own: c'Wc with what is known of the miscount beforehand.
+        own: c'Wc with the prior of the miscount.
         seen: c'Wy, the same.
     """
 

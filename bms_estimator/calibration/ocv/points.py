@@ -40,8 +40,8 @@ class Points:
         temperature_c: Shape (n,) [C]; NaN where it is not known.
         way: Shape (n,), the hysteresis h that it was measured at: -1 after a discharge, 1 after a charge, 0 between.
         source: Shape (n,), which source each is of, from 0.
-        empty_v: Voltage at SOC 0 as far as it is known [V]; NaN when it is not.
-        full_v: Voltage at SOC 1 as far as it is known [V]; NaN when it is not.
+        empty_v: Voltage at SOC 0 if known [V]; NaN when it is not.
+        full_v: Voltage at SOC 1 if known [V]; NaN when it is not.
     """
 
     soc: Floats
@@ -56,7 +56,7 @@ class Points:
     full_v: float = float("nan")
 
     def __post_init__(self) -> None:
-        """Fill what was left out: no common error, no temperature, no hysteresis, one source."""
+        """Fill in defaults: no common error, no temperature, no hysteresis, one source."""
         if self.common_v.size == 0:
             object.__setattr__(self, "common_v", np.zeros(self.soc.size))
         if self.cold_v.size == 0:
@@ -74,7 +74,7 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
 
     Args:
         test: What ``relaxation_test`` found.
-        series_count: Cells in series, for what is known per cell.
+        series_count: Cells in series, for values per cell.
     """
     rests = test.rests
     temperature_c = np.array([rest.temperature_c for rest in rests])

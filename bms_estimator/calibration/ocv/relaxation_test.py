@@ -1,7 +1,8 @@
 """Voltage relaxation test (5.2.1): from a capture of loads and rests to points of the open-circuit voltage.
 
 A cell discharged in steps with a rest after each shows its open-circuit voltage at the end of every rest, as far as it
-has relaxed by then. What is left is extrapolated with an exponential; how far that can be trusted is part of the point.
+has relaxed by then. The remaining relaxation is extrapolated with an exponential; how far that can be trusted is part
+of the point.
 """
 
 from dataclasses import dataclass
@@ -258,8 +259,8 @@ def _relaxed(rest: SampleBlock, soc: float, *, after_charge: bool) -> Rest:
 def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[float, float]:
     """Fit v = v_inf + b e^(-t/tau): v_inf and its standard deviation [V].
 
-    For each tau of a grid, v_inf and b are linear least squares. What comes out is the mean over the taus, each with
-    its likelihood: noise or few samples that cannot tell them apart leave v_inf uncertain.
+    For each tau of a grid, v_inf and b are linear least squares. The result is the mean over the taus, weighted by
+    their likelihoods: noise or few samples leave v_inf uncertain.
     """
     elapsed = time_s - time_s[0]
     taus = np.geomspace(SHORTEST_TAU * duration_s, LONGEST_TAU * duration_s, TAU_GRID)

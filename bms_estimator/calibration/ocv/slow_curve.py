@@ -46,13 +46,14 @@ POINT_V, POINT_SOC = 1e-3, 0.002
 PAIR_V, PAIR_PART = 1.5e-3, 0.1
 """Systematic error of the mean of a paired curve per cell in series [V], and as a fraction of the half difference."""
 ALONE_PART = 0.5
-"""Fraction for an unpaired curve, whose difference is known in the middle only."""
+"""Fraction for an unpaired curve, whose difference is known only in the middle."""
 TURN = 0.03
 """SOC within which a charge that ends early, at its highest voltage, is not the mean's other half."""
 LONE_V = 0.01
 """Systematic error of an unpaired curve without its ohmic part, per cell in series [V]."""
 COLD_PART = 0.25
-"""Part of what cold leaves unrelaxed in a rest that is left in the mean of a pair; a lone branch has all of it."""
+"""Fraction of the cold-relaxation error that remains after averaging charge and discharge; a lone branch has all of
+it."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class SlowCurve:
         branches: One, or discharge and charge.
         points: On a grid of SOC.
         hysteresis_v: At ``GRID`` [V]; None of a lone branch.
-        notes: What is to be known of it, one line each.
+        notes: Remarks, one line each.
     """
 
     branches: tuple[SlowBranch, ...]
@@ -109,7 +110,7 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
     """Return the slow discharges and charges of a capture without glitches; empty for another kind of capture.
 
     Raises:
-        UserError: The voltage goes the other way than the current.
+        UserError: The voltage changes in the wrong direction for the current.
     """
     moved_ah = np.r_[0.0, np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"]))] / 3600.0
     if good.size < 2 or np.ptp(moved_ah) == 0.0:
@@ -172,13 +173,13 @@ def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
 def slow_curves(
     branches: Sequence[SlowBranch], capacity_ah: float, *, initial_soc: float = 1.0, series_count: int = 1
 ) -> list[SlowCurve]:
-    """Pairs, and what is left of the branches alone.
+    """Pairs, and the remaining unpaired branches.
 
     Args:
         branches: Of all captures.
         capacity_ah: Capacity that SOC is counted against [Ah].
         initial_soc: SOC at the first sample of each capture, 0..1.
-        series_count: Cells in series, for what is known per cell.
+        series_count: Cells in series, for values per cell.
 
     Raises:
         UserError: A discharge takes more than there is.

@@ -72,7 +72,7 @@ class Source:
         points: Its points.
         temperature_c: Mean [C]; NaN where it is not known.
         hysteresis_v: At ``GRID`` [V]; None where it does not tell.
-        notes: What is to be known of it.
+        notes: Remarks.
         lone: The slow curve that it is, if its other half is missing; what the branches take is still in ``points``.
     """
 
@@ -94,7 +94,8 @@ class OcvSources:
         measured_ah: By a full slow discharge [Ah]; NaN without one.
         sources: Slow curves, given curves, rests.
         tests: Those captures that are relaxation tests, as ``sources`` has them.
-        hysteresis_v: At ``NODES`` and 25 C [V], of the source nearest to it that tells, as far as rests keep it; None when
+        hysteresis_v: At ``NODES`` and 25 C [V], from the nearest source that shows it, as far as rests keep it; None
+            when
             none does.
         hysteresis_std_v: Its standard deviation [V].
         usual_hysteresis: It is no source's: ``center_on_typical_hysteresis``.
@@ -122,7 +123,7 @@ def find_sources(
     initial_soc: float = 1.0,
     series_count: int = 1,
 ) -> OcvSources:
-    """Find out what each capture is, and what it says.
+    """Recognize the kind of each capture and extract its points.
 
     Args:
         recordings: Captures.
@@ -287,7 +288,7 @@ def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
 
     Args:
         found: Of ``find_sources``.
-        ladder: As far as it is known, with its relative standard deviation.
+        ladder: RC ladder with its relative standard deviation, if known.
     """
     return replace(found, sources=tuple(_without_branches(one, ladder) for one in found.sources))
 

@@ -5,8 +5,9 @@ One linear Gaussian model over all points (a smoothing spline with random effect
 
     v = f(SOC) + (T - 25 C) u(SOC) + c(T) w(SOC) + f'(SOC) (s + q (1 - SOC)) + d(SOC) + noise
 
-f is a cubic spline with the curvature of real cells. u is dE/dT. w is the error of cold, unrelaxed rests; it is common to all
-sources and hardly distinguishable from u, so that the priors share what is seen between both. s and q are each source's errors
+f is a cubic spline with the curvature of real cells. u is dE/dT. w is the error of cold, unrelaxed rests; it is
+common to all sources and hardly distinguishable from u, so that the priors divide the observed difference between
+both. s and q are each source's errors
 of its first SOC and of its capacity. d is the systematic error of a source. Priors pull all but f to 0. The curve's standard deviation is that of the model: wide in gaps.
 """
 
@@ -32,8 +33,8 @@ NODES: Floats = np.unique(
 )
 """SOCs of the table."""
 BEND_V, BEND_REACH = 2.0, 0.12
-"""Standard deviation of d2V/dSOC2 before any point is seen [V], and within which SOC a curve may change its slope by all
-of it: what is steep bends more."""
+"""Prior standard deviation of d2V/dSOC2 [V], and SOC range within which the slope may change by all of it, because
+steep parts bend more."""
 EMPTY_SLOPE_V, EMPTY_REACH = 60.0, 0.02
 """Every curve may be so steep at empty, and how far that reaches in SOC [V]."""
 FIRST_SLOPE_V = 0.8
@@ -111,7 +112,7 @@ class TableFit:
 
 @dataclass(frozen=True)
 class _Model:
-    """Rows of the linear model: what the points say, and what is known beforehand.
+    """Rows of the linear model: points and priors.
 
     Columns: spline coefficients; entropy and cold nodes, if any; then for each source its deviation's nodes, s and q.
     """

@@ -55,7 +55,7 @@ def settled(
         time_s: Shape (n,) [s].
         error_v: e(t) (3.15) [V].
         voltage_v: y(t) [V].
-        margin: SOC - max(delta1, delta2), less what is kept free of it.
+        margin: SOC - max(delta1, delta2), less the guard.
         a: Shape (n, 16), a1..a15 at index 1..15.
         epsilon_v: What counts as settled [V].
         t_int_s: Given by the user instead [s].

@@ -1,4 +1,4 @@
-"""``bms-estimator board``: what a board says of itself, and what is set once when it is new."""
+"""``bms-estimator board``: show a board's properties, and calibrate it."""
 
 from pathlib import Path
 from typing import Annotated

@@ -51,7 +51,7 @@ def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None)
 
 
 def _found(pack: Path, cell: str) -> str:
-    """Return the cell file beside a pack file if it exists, else ``cell``, which may be a name or another path."""
+    """Return the cell file beside a pack file if it exists, otherwise ``cell``, a name or another path."""
     beside = pack.parent / cell
     return str(beside) if beside.is_file() else cell
 

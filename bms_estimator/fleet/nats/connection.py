@@ -1,4 +1,4 @@
-"""The connection of a service of the fleet to the server: made again without end, and what is wrong with it said once."""
+"""Connection of a fleet service to the server: reconnects without limit and reports each trouble once."""
 
 import asyncio
 import contextlib

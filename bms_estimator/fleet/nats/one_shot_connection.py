@@ -1,4 +1,4 @@
-"""A connection for one question to the server: what is wrong with it is said at once."""
+"""Connection for one request to the server: a failure is reported at once."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager

@@ -1,7 +1,7 @@
 """Messages of a stream, read in batches from a sequence number on, without a consumer on the server.
 
-The server's direct gets by batch (https://github.com/nats-io/nats-architecture-and-design, ADR-31), which nats-py does not
-know: each request stands for itself, so that nothing is to be set up again after a server was killed.
+The server's direct gets by batch (https://github.com/nats-io/nats-architecture-and-design, ADR-31), which nats-py
+does not support. Each request is independent, so a restart of the server needs no new setup.
 """
 
 import json

@@ -177,7 +177,7 @@ async def _keep_consumer(nc: Client, partition: int, replicas: int) -> None:
 
 
 async def _repeated(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Ask until there is an answer; whatever is asked here may be asked twice.
+    """Ask until there is an answer; every request here may be repeated.
 
     Raises:
         NoAnswerError: No response.
@@ -190,7 +190,7 @@ async def _repeated(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.k
 
 
 async def _ask(nc: Client, what: str, request: dict[str, Any]) -> dict[str, Any]:
-    """One request to the server's JetStream, whose library knows neither metadata nor priority groups.
+    """One request to the server's JetStream, because nats-py supports neither metadata nor priority groups.
 
     Raises:
         UserError: It has no JetStream, or none for this account.

@@ -40,7 +40,7 @@ class PackBucket:
         nc: Connected as the tenant.
 
     Attributes:
-        packs: What is known by now: call it with a pack's name.
+        packs: Known packs, as a function of the name.
         faults: How often the server could not be read.
         fault: Why, the last time; empty while it can.
     """
@@ -80,7 +80,7 @@ class PackBucket:
             self._next[bucket] = batch[-1].sequence + 1
 
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
-        """Go on for ever: tell ``changed`` which packs have another row or cell now.
+        """Follow changes without end; call ``changed`` with the packs whose row or cell has changed.
 
         What the server does not give now it is asked for again.
         """
@@ -120,7 +120,7 @@ async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, 
         nc: Connected.
         bucket: Its name.
         values: By key.
-        remove: Whether what is not in ``values`` goes.
+        remove: Remove entries that are not in ``values``.
 
     Raises:
         StreamError: The server does not answer, or refuses.

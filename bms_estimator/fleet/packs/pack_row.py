@@ -77,7 +77,7 @@ def kind_of(data: bytes) -> PackSpec:
     """Decode a row encoded by ``stored``.
 
     Raises:
-        ValueError: It did not; the message says what is wrong.
+        ValueError: It did not; the message gives the reason.
     """
     try:
         return PackSpec.model_validate_json(data)
@@ -109,7 +109,7 @@ def model_of(kind: PackSpec, cell_file: str | None) -> PackModel:
     """Return the pack as one object.
 
     Args:
-        kind: Names the cell, and says what it holds and how many there are.
+        kind: Names the cell, its capacity and its number.
         cell_file: Text of the loaded file of that name; None without one. A shipped cell takes precedence.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The page of a fleet: what was heard, sent to browsers at most once in a while, and what is asked of one pack."""
+"""The page of a fleet: latest messages, sent to browsers at a limited rate, and details of one pack on request."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""All packs of a fleet as its page shows them: who is alive, how they are spread, who needs attention. Pure.
+"""All packs of a fleet as its page shows them: which are alive, their distribution, which need attention. Pure.
 
 Of each pack the bytes of its newest state are kept, and the ranked values in columns; the rest is decoded on request.
 """
@@ -135,7 +135,8 @@ class FleetPacks:
 
         Args:
             now_s: The clock.
-            since_s: Since when states are heard without a break: who was not heard before then may not be silent.
+            since_s: Time since which states are received without a break; a pack that was last seen before may not be
+                silent.
 
         Returns:
             ``packs`` (counts), ``types`` (of each: how many, and how they are spread), ``soc_std_edges`` (of bins, the last is

@@ -1,4 +1,4 @@
-"""The workers of a fleet as its page shows them: who lives, who holds which partition, whether they keep up. Pure."""
+"""The workers of a fleet as its page shows them: which are alive, their partitions, their lag. Pure."""
 
 from collections import deque
 from typing import Any, NamedTuple

@@ -25,7 +25,7 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 
 DURABLE = "collector"
-"""The consumer: who collects goes on where the one before was."""
+"""Name of the consumer, so that a collector continues where the last one ended."""
 PERIOD_S = 300.0
 """Maximum time that a row waits for its file [s]; more files of a day slow down queries."""
 MOST_ROWS = 10_000
@@ -66,7 +66,7 @@ class Collector:
         """Collect until ``stop`` is set; what waits then is written.
 
         Raises:
-            UserError: The server has no such stream, or has closed the connection for good.
+            UserError: The server has no such stream, or has closed the connection permanently.
         """
         while not stop.is_set():
             await self._take(await self._fetch(stop))

@@ -95,7 +95,7 @@ def _sync(path: Path) -> None:
 
 
 def to_compact(folder: Path, now_s: float) -> list[Path]:
-    """Folders of days whose files should become one: closed for the first time, or of ``MANY`` files.
+    """Folders of days whose files should be merged: closed for the first time, or with ``MANY`` files.
 
     Args:
         folder: Of the days.
@@ -112,7 +112,7 @@ def to_compact(folder: Path, now_s: float) -> list[Path]:
 
 
 def compact(day: Path) -> Path:
-    """One file, sorted by pack and hour, each once, in the place of all that are whole; what was left unfinished goes.
+    """One file, sorted by pack and hour, each once, in the place of all that are whole; unfinished files are removed.
 
     Killed at any time it loses nothing: the old files go when the new one is on the disk.
 

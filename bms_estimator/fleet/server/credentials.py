@@ -61,7 +61,7 @@ def read_accounts(folder: Path) -> Accounts:
     """Claims that another machine has made.
 
     Raises:
-        UserError: There are none, or something else.
+        UserError: They are missing or invalid.
     """
     path = folder / CLAIMS
     try:

@@ -1,8 +1,8 @@
 """Claims that a server checks by signature alone: an operator, its tenants' accounts, their users.
 
 A claim is a JSON Web Token whose parts are those of https://github.com/nats-io/jwt, version 2, signed with an ed25519
-key in the writing of https://github.com/nats-io/nkeys. What a user may do stands in the account's claims, beside the
-public key that signs users of that role: a token says no more than who one is, and no server need hear of a new one.
+key in the writing of https://github.com/nats-io/nkeys. The permissions of a role are in the account's claims, beside
+the public key that signs its users. A token contains only an identity, so the server needs no list of tokens.
 """
 
 import base64
@@ -30,7 +30,7 @@ class Role(Enum):
     """Role of a tenant's user."""
 
     EDGE = "edge"
-    """Beside one pack: sends its blocks, hears what is awaited."""
+    """Role of an edge: sends the blocks of one pack, and receives the confirmations."""
     DASHBOARD = "dashboard"
     """Reads estimates over MQTT."""
     READER = "reader"

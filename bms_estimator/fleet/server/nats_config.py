@@ -130,7 +130,7 @@ def _cluster(node: Node) -> list[str]:
 
 
 def _accounts(node: Node) -> list[str]:
-    """Return the lines that say who may connect; without accounts, anybody."""
+    """Return the lines with accounts and permissions; without accounts, anybody."""
     if node.accounts is None:
         return []
     preload = [f"  {key}: {claims}" for key, claims in node.accounts.claims.items()]

@@ -1,6 +1,6 @@
 """A nats-server as a child process: start it, wait for it, make its streams, forward signals.
 
-It ends with us, even where we are killed. It is not started again: that is the work of who has started us.
+It ends with this process, even if that is killed. It is not restarted here: systemd does that.
 """
 
 import asyncio
@@ -69,7 +69,7 @@ class NodeLocation:
 
 
 def find_server() -> Path:
-    """Find nats-server beside the running Python, else in PATH.
+    """Find nats-server beside the running Python, otherwise in PATH.
 
     Raises:
         UserError: It is missing or too old.
@@ -130,7 +130,7 @@ def _tls(settings: TlsSettings) -> Tls:
 
 
 def _check(tls: Tls) -> None:
-    """Say what the server would say in its own words, and end with a code that stands for a fault.
+    """Report a problem that the server would report in its own words with a wrong exit code.
 
     Raises:
         UserError: A file cannot be read, or key and certificate are not of each other.
@@ -153,7 +153,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], say: Callab
     Args:
         place: Of this node.
         read: Its settings; called at start and at each SIGHUP.
-        say: Gets lines for people: where it listens, what it has made.
+        say: Receives lines for people: addresses and created streams.
 
     Returns:
         The server's exit code; 0 where it was asked to end.

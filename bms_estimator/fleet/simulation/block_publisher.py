@@ -132,7 +132,7 @@ async def run_edges(
         settings: Where to.
         connections: How many stand for all.
         stop: Ends it.
-        said: Hears how it goes.
+        said: Receives progress messages.
         quiet_s: After the last block.
 
     Raises:

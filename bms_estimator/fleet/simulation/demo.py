@@ -1,6 +1,6 @@
 """The demo of a fleet: server, simulated edges, two workers and the page as processes; one worker is killed.
 
-What it says is what it hears: heartbeats of the workers, and estimates of some packs beside their true SOC.
+It reports what it receives: heartbeats of the workers, and estimates of some packs beside their true SOC.
 """
 
 import asyncio
@@ -60,7 +60,7 @@ class DemoObserver:
         workers: Last heartbeat by name, with its moment of a monotonic clock [s].
         errors: Estimated less true SOC, of estimates since the last line.
         within: Whether the true SOC was within two standard deviations.
-        dead: Workers that are known not to come back.
+        dead: Workers that were killed on purpose.
         worst_s: Longest lag since the last line [s].
     """
 
@@ -106,7 +106,7 @@ class Demo:
         seconds: How long edges send.
         page_port: Of the page.
         folder: For the server's files and all logs.
-        say: Hears the story, line by line.
+        say: Receives the progress, line by line.
         opened: Called with the page's address.
     """
 
@@ -171,7 +171,7 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
 
 
 async def _tell(demo: Demo, seen: DemoObserver, processes: "Processes", stop: asyncio.Event) -> None:
-    """Say how it goes; in the middle of it kill a worker, and see the other one take over: with the packs' next blocks."""
+    """Report the progress, and kill a worker in the middle; the other one takes over with the packs' next blocks."""
     begin_s, kill_s, gone_s, spoke, done = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
     while not stop.is_set():
         now_s = time.monotonic() - begin_s
@@ -273,7 +273,7 @@ class Processes:
         self._running: dict[str, asyncio.subprocess.Process] = {}
 
     async def start(self, name: str, *arguments: object) -> asyncio.subprocess.Process:
-        """Start one, in a process group of its own: Ctrl-C is for us, who end them in order."""
+        """Start one in its own process group, so that Ctrl-C reaches this process only, which ends the others."""
         command = (sys.executable, "-c", "from bms_estimator.cli.main import main; main()", "fleet")
         with (self.folder / f"{name}.log").open("ab") as log:
             process = await asyncio.create_subprocess_exec(

@@ -37,13 +37,13 @@ SHORTEST_S, LONGEST_S = 8 * 3600.0, 24 * 3600.0
 PULSE_S, PULSE_C = 15, 0.6
 """Length [s] and maximum size [C] of a pulse in each minute; a third of it in the other direction follows."""
 PAST_MINUTES = 5
-"""Whose pulses are still felt: e^(-300/20) of them is left after that."""
+"""Number of pulses that still have an effect: e^(-300/20) of a pulse remains after that."""
 TAU_TS_S, TAU_TL_S = 20.0, 800.0
 """Time constants of the branches [s]."""
 JITTER_S = 0.02
 """Maximum error of a real device's timestamps [s]."""
 WORN, NEW, TIRED = 0.75, 1.02, 0.6
-"""True capacity to the declared one: the range, and that of a pack whose capacity leaves it."""
+"""Range of true to declared capacity, and its value for a pack with a defect."""
 MOST_RESISTANCE, FAILING = 1.6, 3.0
 """True resistances to the cell file's: the range begins at 0.8; and those of a pack about to fail."""
 OUTLIERS = 0.01

@@ -11,8 +11,8 @@ Layout, little-endian::
 
     entry:  layout u1, length of the name u2, of the data u4, name, data
 
-A layout names each field of a record, so that a version with other fields can take the state over. Layout 255 is a block that
-an earlier version kept here for a pack which it did not know: the messages of this pack are read from the stream again.
+A layout names each field of a record, so that a version with other fields can take the state over. Layout 255 is a
+block that an earlier version stored here for an unknown pack: this pack's messages are read from the stream again.
 """
 
 import json

@@ -93,7 +93,7 @@ class WorkRecord:
             raise StateError(f"{len(packed)} bytes are no state of a pack")
 
     def put_former(self, dtype: np.dtype[Any], packed: bytes) -> Fields:
-        """Lay a pack there as another version left it, as far as its fields are known, but for its estimator.
+        """Store a pack's record of another layout, except for its estimator, as far as the fields match.
 
         Args:
             dtype: Of its record.

@@ -46,7 +46,7 @@ class BlockResult(NamedTuple):
         state: Topic ``state``.
         parameters: Topic ``parameters``.
         hours: Finished hours: an id that is the same whoever makes the row, and the row.
-        failed: Blocks that were left out for a fault of ours.
+        failed: Blocks that were skipped because of an internal error.
     """
 
     pack: str
@@ -242,7 +242,7 @@ class Partition:
         return made._replace(awaits=edge_reply(order, d, block, first=first))
 
     def _put_former_delivery(self, pack: str) -> None:
-        """Put the counts of blocks that came since the start on the bench, for a pack that another version left."""
+        """Add the counts of blocks since the start for a pack with a record of another layout."""
         if pack in self._former_deliveries:
             self._bench.record["delivery"][0] = self._former_deliveries[pack]
 
@@ -262,7 +262,7 @@ class Partition:
         return None
 
     def _open(self, pack: str) -> Fields | None:
-        """Lay a pack on the bench. Of one that another version left come its estimator's fields, which are not there yet."""
+        """Lay a pack on the bench. A record of another layout also gets the estimator's fields, which it lacks."""
         packed, former = self._packs.get(pack), self._former.get(pack)
         try:
             if packed is not None:

@@ -67,7 +67,7 @@ class PartitionLease:
         hours: Summaries that the server has not acknowledged yet: (id, pack, row).
         lag_s: Largest lag since it was last reset to None [s].
         blocks: Taken here, as are ``samples``.
-        faults: Of ours: blocks that were left out.
+        faults: Blocks that were skipped because of an internal error.
         due_s: When a checkpoint is to be written, of a monotonic clock [s].
         trouble: What does not work now; empty: nothing.
     """
@@ -389,7 +389,7 @@ class PartitionLease:
         self._lost = False
 
     async def _confirm(self) -> None:
-        """See whether our claim still stands; ``_changing`` is held."""
+        """Check that this worker's claim still holds; ``_changing`` is held."""
         if self.claim:
             try:
                 self.claim = await self._keeping.confirm_claim(self.claim)

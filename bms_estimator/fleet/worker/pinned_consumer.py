@@ -42,12 +42,12 @@ class DeliveredMessage(NamedTuple):
 
 
 class PinnedConsumer:
-    """Asks for a partition's messages and keeps them until they are taken.
+    """Requests messages of a partition and holds them until they are taken.
 
     Args:
         nc: Connected.
         partition: Its number.
-        inbox: Where the server is to answer: it adds one token; what comes there goes to ``receive``.
+        inbox: Where the server is to answer: it adds one token; its messages go to ``receive``.
 
     Attributes:
         waiting: Messages not taken yet.

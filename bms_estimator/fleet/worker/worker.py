@@ -58,7 +58,7 @@ class Options:
 
 
 async def work(options: Options, stop: asyncio.Event) -> None:
-    """Work until ``stop`` is set; then keep what is known and give it back.
+    """Work until ``stop`` is set; then save checkpoints and release the partitions.
 
     Raises:
         UserError: An option cannot be used, or the server has closed the connection for good.
@@ -124,7 +124,7 @@ class Worker:
         partitions: How many there are in all.
         keeping: Where checkpoints are.
         bucket: The table of packs.
-        notifier: Who hears that it is ready and alive.
+        notifier: Is notified that the worker is ready and alive.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class Worker:
             found[0].receive(message)
 
     async def _beat(self) -> None:
-        """Say that we live, and how."""
+        """Publish the heartbeat."""
         if self._nc.is_connected:
             heartbeat = self._heartbeat()
             await self._nc.publish(subjects.worker(self._options.name), heartbeat.model_dump_json().encode())
@@ -220,7 +220,7 @@ class Worker:
         self._notifier.alive(self._options.name)
 
     async def _tell_unknown(self) -> None:
-        """Say once of each pack that the table does not know it, and why."""
+        """Publish once for each unknown pack that the table lacks it, with the reason."""
         unknown = {pack for holding in self._holdings if holding.partition for pack in holding.partition.unknown}
         for pack in unknown - self._told:
             why = self._bucket.packs.reason(pack)
@@ -229,7 +229,7 @@ class Worker:
         self._told = unknown
 
     async def _renew(self) -> None:
-        """Try for what is ours by now, give back what is not, and ask for more messages."""
+        """Claim assigned partitions, release others, and request more messages."""
         _check(self._nc, self._options)
         now_s = time.monotonic()
         if not self._nc.is_connected or now_s > self._renewed_s + DEAD_S / 2.0:
@@ -300,7 +300,7 @@ class Worker:
             log.warning("the server does not keep what it is given", partition=holding.number, reason=error_text(error))
 
     async def _settle(self) -> None:
-        """Tell the partitions of packs that have other settings, or are known now."""
+        """Notify partitions of packs with changed settings or newly known packs."""
         while True:
             for pack in await self._changed.get():
                 held = self._held.get(subjects.partition_of(pack, self._partitions))

@@ -18,7 +18,7 @@ FLOW_SUMS = np.dtype(
     ],
     align=True,
 )
-"""All zero: nothing came yet."""
+"""All zero: no sample yet."""
 
 
 @njit(cache=True)

@@ -43,7 +43,7 @@ HOUR_SUMS = np.dtype(
     ],
     align=True,
 )
-"""All zero: nothing came yet."""
+"""All zero: no sample yet."""
 OF_HOUR = tuple(HOUR_SUMS.names or ())[(HOUR_SUMS.names or ()).index("samples") :]
 """Fields that restart with each hour."""
 

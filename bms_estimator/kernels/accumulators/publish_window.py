@@ -19,7 +19,7 @@ WINDOW_SUMS = np.dtype(
     ],
     align=True,
 )
-"""All zero: nothing came yet."""
+"""All zero: no sample yet."""
 
 
 @njit(cache=True)

@@ -20,7 +20,7 @@ State = tuple[float, float, float]
 OCV_POINTS = 401
 """Nodes of the OCV grid, evenly spaced over SOC 0..1."""
 INVERSE_ERROR_V = 1e-10
-"""An SOC whose OCV is as close to the voltage asked for is its SOC [V]."""
+"""Tolerance of the voltage when the OCV is inverted [V]."""
 
 
 @njit(cache=True)

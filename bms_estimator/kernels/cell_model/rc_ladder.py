@@ -36,7 +36,7 @@ WEAK_LEFT_SOC, WEAK_LEFT = (0.0, 0.1, 0.2, 0.3, 0.45), (0.45, 0.5, 0.8, 0.9, 1.0
 0.97 and 0.92 in the LFP cell."""
 
 TREND = 3
-"""The branch whose current tells whether the cell is charged or discharged: that of 120 s."""
+"""RC pair whose current decides between charge and discharge: that of 120 s."""
 
 TAUS = np.array(TAU_S)
 

@@ -124,9 +124,9 @@ def apply_offdiagonal_transition(cov: Floats, f: Floats, by_offset: float, moved
 
 @njit(cache=True)
 def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, float, float]:
-    """Take the mean voltage of the window in: the EKF's update, linear over what is known of the SOC afterwards.
+    """Apply the mean voltage of the window: the EKF's update, linear over the posterior SOC.
 
-    On a bend of the OCV the secant over what was known before may be many times too steep (posterior linearisation:
+    On a bend of the OCV the secant over the prior SOC may be many times too steep (posterior linearisation:
     Garcia-Fernandez et al., IEEE Trans. Signal Process. 63, 2015).
 
     Args:

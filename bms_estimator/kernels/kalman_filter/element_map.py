@@ -1,7 +1,8 @@
 """Map of each element over SOC as identified, and the thesis's functions fitted to it.
 
-The identifier knows the elements where the cell is now. A map keeps, for each SOC bin, the information-weighted mean
-of what it knew there. (2.5)-(2.9) are fitted to the map: one nonlinear exponent, searched; amplitude and offset, linear.
+The identifier knows the elements where the cell is now. A map stores, for each SOC bin, the information-weighted mean
+of the estimates there. (2.5)-(2.9) are fitted to the map: one nonlinear exponent, searched; amplitude and offset,
+linear.
 """
 
 import math
@@ -56,7 +57,7 @@ ELEMENT_FIT = np.dtype(
 
 @njit(cache=True)
 def add_observation(m: Record, element: int, soc: float, ln_value: float, variance: float, dt_s: float) -> bool:
-    """Add what is known of one element at ``soc`` to its bin: ln of its value and the variance of that.
+    """Add an estimate of one element at ``soc`` to its bin: ln of its value and the variance of that.
 
     Returns:
         Whether it was known well enough to be added.
@@ -73,7 +74,7 @@ def add_observation(m: Record, element: int, soc: float, ln_value: float, varian
 
 @njit(cache=True)
 def decay_weights(m: Record, e: int, factor: float) -> None:
-    """Let row ``e`` of the map forget: what it knows counts ``factor`` times as much from now on."""
+    """Let row ``e`` of the map forget: multiply its weights by ``factor``."""
     for b in range(BINS):
         m.weight[e, b] *= factor
         m.moment[e, b] *= factor

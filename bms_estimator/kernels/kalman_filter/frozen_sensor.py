@@ -24,7 +24,7 @@ HELD_V, LOAD_C = 0.01, 0.1
 """Change of the OCV of one cell that proves a constant voltage frozen [V]. Below this discharge current [C] only
 sudden changes count, because chargers hold a voltage."""
 UNCOUNTED = 0.1
-"""Charge that goes wrong while the voltage tells nothing, relative."""
+"""Relative charge error while the voltage is ignored."""
 OUTLIERS_S = 3600.0
 """Memory of single samples that were not believed [s]."""
 

@@ -116,7 +116,7 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
 
 @njit(cache=True)
 def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
-    """Begin again at ``soc`` with all that the likeliest hypothesis knows of sensor and cell.
+    """Restart at ``soc`` with the likeliest hypothesis's estimates of sensor and cell.
 
     SOC, polarisation, hysteresis and errors of the model are unknown.
     """
@@ -202,8 +202,9 @@ def update_hypotheses(s: Record, p: Record) -> None:
 def innovation_scale(s: Record, p: Record) -> float:
     """Return the ratio of the true innovation variance to S.
 
-    R and the biases allow for loads and cells that the file fits worst. Mostly it fits better, once what was before switch-on
-    is forgotten: innovations far within S would leave it to ln S to judge, and the hypothesis of the smallest S would win.
+    R and the biases allow for loads and cells that the file fits worst. Mostly the fit improves once the load before
+    switch-on is forgotten. Innovations far within S would leave the decision to ln S, and the hypothesis with the
+    smallest S would win.
     Outside the temperatures of the cell file less of the kind is known, ``OUTSIDE_K`` away nothing.
     """
     return min(

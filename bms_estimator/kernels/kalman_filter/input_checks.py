@@ -165,7 +165,7 @@ def gate_persists(c: Record) -> bool:
 
 @njit(cache=True)
 def store_last_good_state(c: Record, f: Record) -> None:
-    """Keep what the likeliest filter knows as the last good state."""
+    """Save the likeliest filter as the last good state."""
     c.good_mean[:] = f.mean[f.best]
     c.good_covariance[:, :] = f.covariance[f.best]
     c.good_soc, c.good_soc_std, c.good_age_s = f.soc, f.soc_std, 0.0
@@ -173,7 +173,7 @@ def store_last_good_state(c: Record, f: Record) -> None:
 
 @njit(cache=True)
 def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
-    """Back to the last good state when anything of the filter is not finite; else keep it now and then."""
+    """Back to the last good state when anything of the filter is not finite; otherwise save it at intervals."""
     total = (
         f.temperature_c
         + f.soc

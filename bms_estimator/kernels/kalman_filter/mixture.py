@@ -35,7 +35,7 @@ def copy_hypothesis(s: Record, source: int, to: int) -> None:
 
 @njit(cache=True)
 def clear_hypothesis(s: Record, q: int) -> None:
-    """Row ``q`` holds no hypothesis: all 0, so that a state that is kept without its zeros costs what it knows."""
+    """Clear row ``q``: all 0, because zeros need no space in a compressed checkpoint."""
     s.mean[q, :] = 0.0
     s.covariance[q, :, :] = 0.0
     s.ln_weight[q] = s.minute_u[q] = s.ten_minutes_u[q] = s.fast_inflation[q] = s.slow_inflation[q] = 0.0

@@ -44,7 +44,7 @@ WARMED_R_STD = 0.015
 AGED_SOC = 400.0
 """Charge over which the curve of a cell becomes another with age: 200 full cycles [SOC]."""
 HYST_LEFT = 0.17
-"""Std of the hysteresis h where the way the charge went is known."""
+"""Std of the hysteresis h if the direction of the charge is known."""
 LOWER_HALF = 0.5
 """SOC below which a cell may be empty early."""
 STEEP_V = 1.0

@@ -4,7 +4,8 @@
 blended between ``NODES`` states so that its variance stays, each in units of the curve's std there, correlated with its
 neighbours over ``ALIKE_SOC``. The rest, CURVE, is of temperature, load and history, and is another each time.
 
-A voltage tells SOC and curve together: what it tells of the curve is no more certain than the SOC was without it. The
+A voltage depends on SOC and curve together, so its information on the curve is no more certain than the SOC was
+without it. The
 joint covariance holds exactly that, so no rule is needed which voltages may be learned from (the same with a map and a
 place in it: Smith, Self and Cheeseman 1990).
 

@@ -172,7 +172,7 @@ def cholesky_factor(m: Record, q: Record) -> bool:
 def apply_parameter_step(m: Record, q: Record, share: float) -> None:
     """Move theta within its bounds, and the states with it: as though it had been so all along.
 
-    Sensitivities were of another theta: what is remembered fades with the square of the way that is to be gone.
+    Sensitivities belong to another theta: the memory fades with the square of the step.
     """
     way = 0.0
     for j in range(q.count):

@@ -1,6 +1,6 @@
-"""The models that the learning law knows, chosen by an integer: numba's disk cache keeps no first-class functions.
+"""Models of the learning law, selected by an integer because numba's disk cache cannot store first-class functions.
 
-A model is a file of the shape of ``chen_mora``; what the law asks of it goes through the functions here.
+A model is a file of the shape of ``chen_mora``; the law calls it through the functions here.
 """
 
 import math

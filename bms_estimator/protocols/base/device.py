@@ -29,7 +29,7 @@ class Resolution:
 class Device:
     """A kind of device.
 
-    Each module of ``protocols.devices`` has one as ``DEVICE``. Nothing else needs to know of it.
+    Each module of ``protocols.devices`` has one as ``DEVICE``. This is the only place where a device is declared.
 
     Attributes:
         name: Value of ``sensor.protocol``.

@@ -1,4 +1,4 @@
-"""Times that a device tells beside its values, as far as they can be right; else those of the arrivals."""
+"""Timestamps that a device sends with its values, if they are plausible; else those of the arrivals."""
 
 import math
 

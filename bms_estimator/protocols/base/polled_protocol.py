@@ -37,7 +37,7 @@ class ParseResult(Enum):
 class PolledProtocol(ReadingProtocol):
     """Frames to samples, and the questions at their own pace. It takes no commands.
 
-    What is no frame is skipped byte by byte, so that the next whole frame is found wherever it begins; how the bytes are
+    Bytes outside frames are skipped one by one, so that the next complete frame is found; how the bytes are
     cut into reads changes no value but the times.
 
     Args:
@@ -70,7 +70,7 @@ class PolledProtocol(ReadingProtocol):
 
     @abstractmethod
     def _query_variants(self) -> Sequence[Sequence[bytes]]:
-        """Ways of asking, each the questions of one round: the first that is answered is kept to."""
+        """Request variants, each with the requests of one poll cycle: the first that is answered is kept."""
 
     @abstractmethod
     def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
@@ -85,7 +85,10 @@ class PolledProtocol(ReadingProtocol):
         """Decode a whole frame; None if it is not a sample."""
 
     def on_port_opened(self) -> None:
-        """Ask at once, first in the first way. What was decoded stays: a recording does not tell of openings."""
+        """Poll at once, with the first variant.
+
+        Decoded values stay, because a recording does not contain openings.
+        """
         self._due, self._way, self._unanswered, self._answers_before = [], 0, 0, -1
         self._round_s = self._asked_s = -math.inf
 
@@ -118,7 +121,7 @@ class PolledProtocol(ReadingProtocol):
                 yield reading
 
     def _frames(self, data: bytes) -> list[bytes]:
-        """Whole frames that end in ``data``; what may become one is kept."""
+        """Whole frames that end in ``data``; an incomplete frame is kept."""
         rest = self._rest + data
         frames, done, waiting = list[bytes](), 0, -1  # all before ``done`` is over, at ``waiting`` a frame has begun
         at = self._next(rest, 0)

@@ -131,7 +131,7 @@ def sample_json_line(
 
     Args:
         voltage_v: Of the pack's terminals [V].
-        current_a: As the device counts it [A]; ``sensor.current_sign`` says what is positive.
+        current_a: As the device counts it [A]; ``sensor.current_sign`` gives the sign.
         temperature_c: None or NaN: not measured [degC].
         cells_v: Of single cells, from the first on; None or NaN: this one was not measured [V].
         time_s: When it was measured by the device's clock, whatever that counts from; None: it does not say [s].

@@ -89,10 +89,10 @@ class ReadingProtocol(DeviceProtocol):
 
 
 class RecentCellVoltages:
-    """Cell voltages that came in an answer of their own, for the sample that comes next.
+    """Cell voltages from a separate response, for the next sample.
 
     Args:
-        fresh_s: Older ones stand beside no sample [s].
+        fresh_s: Maximum age of values that are attached to a sample [s].
     """
 
     def __init__(self, fresh_s: float) -> None:

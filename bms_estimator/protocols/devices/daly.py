@@ -35,7 +35,7 @@ def sealed(frame: bytes) -> bytes:
 
 
 def question(host: int, command: int) -> bytes:
-    """Asks for what ``command`` tells; changes nothing."""
+    """Build the request for ``command``; changes nothing."""
     return sealed(bytes((START, host, command, DATA_BYTES)) + bytes(DATA_BYTES))
 
 

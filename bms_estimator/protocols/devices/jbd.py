@@ -18,7 +18,7 @@ from bms_estimator.protocols.base.reading_protocol import RecentCellVoltages
 BASIC, CELLS, NAME = 0x03, 0x04, 0x05
 START, END, READ = 0xDD, 0x77, 0xA5
 REFUSED = 0x80
-"""Status of an answer that has nothing else to say."""
+"""Status of a successful response."""
 HEAD, TAIL = 4, 3
 """Bytes of a frame before and behind its data."""
 LEAST_BASIC, MOST_DATA = 23, 128

@@ -6,7 +6,7 @@ communication protocol" 2.5 as in esphome-jk-bms. Current: 10 mA, positive on ch
 by version 1 with the highest bit set on charge.
 
 ``55 AA EB 90`` (PB series, RS485-2), little-endian: 300 bytes, the last one the sum of the others, then a Modbus record of eight bytes that begins
-with the pack's address. It comes by itself where the pack is its line's master, else when asked by a Modbus command. Voltage
+with the pack's address. The master of a line sends it unasked, other packs on a Modbus request. Voltage
 1 mV, current 1 mA, positive on charge. By the captures of esphome-jk-bms, jk-bms-passive-bridge and dbus-serialbattery.
 """
 
@@ -87,7 +87,7 @@ class JkProtocol(PolledProtocol):
 
     @property
     def description(self) -> str | None:
-        """Number of cells, and what else the frame tells."""
+        """Number of cells, and other properties in the frame."""
         return self._told
 
     @property

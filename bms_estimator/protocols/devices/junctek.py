@@ -51,7 +51,7 @@ class JunctekProtocol(ReadingProtocol):
         return f"Junctek battery monitor, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
     def on_port_opened(self) -> None:
-        """Ask at once. What was decoded stays: a recording does not tell of openings."""
+        """Poll at once. Decoded values stay, because a recording does not contain openings."""
         self._asked_s = -math.inf
 
     def next_output(self, now_s: float) -> bytes:

@@ -1,7 +1,8 @@
 """Batteries of Pylontech, US2000 to US5000 and their like, on the console port of the master.
 
-Text for people: asked ``pwr`` it prints a table of all batteries in parallel, asked ``bat N`` one of the cells of battery N,
-and then its prompt. Voltages in mV, currents in mA and positive on charge, temperatures in thousandths of a degree Celsius.
+Text for people: ``pwr`` prints a table of all batteries in parallel, ``bat N`` one of the cells of battery N, each
+followed by a prompt. Voltages in mV, currents in mA and positive on charge, temperatures in thousandths of a degree
+Celsius.
 There is no checksum: a table is taken that ended with the word of success, and each of whose rows can be read.
 """
 
@@ -27,7 +28,7 @@ SUCCESS = "Command completed"
 BATTERIES = 16
 CELLS = 32
 CELLS_S = 90.0
-"""Two turns of 16 batteries, and some answers that were lost: cell voltages that are older stand beside no sample [s]."""
+"""Maximum age of cell voltages [s]: two cycles of 16 batteries, with some lost responses."""
 DIGITS = 9
 ABSENT = "-"
 
@@ -62,7 +63,7 @@ class PylontechProtocol(ReadingProtocol):
         return f"Pylontech, {batteries}, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
     def on_port_opened(self) -> None:
-        """Ask at once. What was decoded stays: a recording does not tell of openings."""
+        """Poll at once. Decoded values stay, because a recording does not contain openings."""
         self._round_s = self._asked_s = -math.inf
         self._asked = b""
 

@@ -61,7 +61,7 @@ class TextProtocol(DeviceProtocol):
 
     @property
     def fault(self) -> str | None:
-        """The first line that said nothing, as it came."""
+        """The first line without values, unchanged."""
         if self._bad is None:
             return None
         shown = repr(self._bad[:SHOWN_BYTES])[1:] + ("..." if len(self._bad) > SHOWN_BYTES else "")

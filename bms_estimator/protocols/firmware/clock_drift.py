@@ -1,8 +1,8 @@
 """Rate of the board's clock by the host's: a line under the arrival times of its samples.
 
-A sample comes late by what the line, the USB bridge and the host's scheduler take, never early. So of each ten seconds only
-the sample that came with the least delay counts, and of those the ones on the lower hull: the line lies under all of them
-(Moon, Skelly, Towsley 1999). However many others were held up changes nothing. It moves no time stamp.
+A sample comes late by what the line, the USB bridge and the host's scheduler take, never early. Therefore only the
+sample with the smallest delay in each ten seconds counts, and of those the lower hull: the line lies under all of
+them (Moon, Skelly, Towsley 1999). However many others were held up changes nothing. It moves no time stamp.
 """
 
 import math
@@ -27,7 +27,7 @@ def forget_clock(d: Record) -> None:
 
 @njit(cache=True)
 def take_arrival(d: Record, arrival_s: float) -> None:
-    """See when the sample at ``d.elapsed_us`` came."""
+    """Record the arrival of the sample at ``d.elapsed_us``."""
     if d.clock_windows == 0:
         d.clock_origin_s = arrival_s
     late_s = arrival_s - d.clock_origin_s - d.elapsed_us * _US
@@ -45,7 +45,7 @@ def take_arrival(d: Record, arrival_s: float) -> None:
 def clock_ppm(d: Record) -> float:
     """Return the rate of the board's clock over the host's [1e-6].
 
-    NaN before it has been seen for a minute, and where all samples came at once.
+    NaN in the first minute, and if all samples arrived at once.
     """
     count = min(d.clock_windows, CLOCK_WINDOWS)
     at_s, late_s = np.empty(count), np.empty(count)

@@ -59,7 +59,7 @@ class FrameCounters:
     duplicates: int = 0
     out_of_order: int = 0
     before_hello: int = 0
-    """Samples that came before their scaling was known, or while another board may have been there."""
+    """Samples that arrived before their scaling was known, or while another board may have been connected."""
     overruns: int = 0
     """Samples before which the board had no room on the line."""
     implausible: int = 0

@@ -1,7 +1,7 @@
 """Decoder from serial bytes to samples: COBS, CRC, sequence and clock (firmware/PROTOCOL.md).
 
-One decoder serves the live line and the replay. All it knows between calls stands in its state, and nothing it does
-depends on how the bytes were cut into calls, except for the arrival time of the byte that ends a frame.
+One decoder serves the live line and the replay. Its state holds everything between calls, and the result does not
+depend on how the bytes were divided into calls, except for the arrival time of the byte that ends a frame.
 """
 
 import math
@@ -376,7 +376,7 @@ def decode(
 
     Args:
         data: Bytes of one or more reads of the line.
-        begin: Where to go on, 0 at first.
+        begin: Start index, 0 at first.
         ends: Shape (reads,): where in ``data`` each read ends, increasing; the last is ``data.size``.
         arrivals_s: Shape (reads,): when each read came.
         decoder: Shape (1,), dtype DECODER; updated.

@@ -127,7 +127,7 @@ def set_rate_command(rate_hz: int) -> bytes:
 
 
 def zero_current_command() -> bytes:
-    """Ask to take the present current as zero, for good."""
+    """Build the command to take the present current as zero, stored permanently."""
     return command(MessageType.COMMAND_ZERO_CURRENT)
 
 
@@ -137,22 +137,22 @@ def set_serial_command(serial: int) -> bytes:
 
 
 def set_bandgap_command(bandgap_v: float) -> bytes:
-    """Tell the board its internal reference as measured [V], 1.0..1.2, for good."""
+    """Build the command to set the measured internal reference [V], 1.0..1.2, stored permanently."""
     return command(MessageType.COMMAND_SET_BANDGAP, struct.pack("<I", round(bandgap_v * 1e6)))
 
 
 def set_divider_command(divider: float) -> bytes:
-    """Tell the board how many times the voltage at its pin the pack's is, 1..100, for good."""
+    """Build the command to set the divider ratio, 1..100, stored permanently."""
     return command(MessageType.COMMAND_SET_DIVIDER, struct.pack("<I", round(divider * 1e6)))
 
 
 def set_current_slope_command(volts_per_ampere: float) -> bytes:
-    """Tell the board the slope of its current sensor [V/A], 0.001..2, for good; of a ratiometric one at 5 V."""
+    """Build the command to store the slope of the current sensor [V/A], 0.001..2; of a ratiometric one at 5 V."""
     return command(MessageType.COMMAND_SET_CURRENT_SLOPE, struct.pack("<I", round(volts_per_ampere * 1e6)))
 
 
 def set_ratiometric_command(ratiometric: int) -> bytes:
-    """Tell the board whether its current sensor's slope is proportional to the supply: 0 or 1, for good."""
+    """Build the command to store whether the slope of the current sensor is proportional to the supply: 0 or 1."""
     return command(MessageType.COMMAND_SET_RATIOMETRIC, struct.pack("<I", ratiometric))
 
 

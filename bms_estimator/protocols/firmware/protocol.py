@@ -29,7 +29,7 @@ _HELLO = hello_command()
 
 @dataclass
 class _Told(Command):
-    """A command under way: sent, acknowledged, and done with the hello that tells what holds now."""
+    """A pending command: sent, acknowledged, and completed by the hello with the new values."""
 
     frame: bytes = b""
     again_s: float = ASK_AGAIN_S

@@ -64,7 +64,7 @@ class PrometheusSink(Collector):
         await self._stack.aclose()
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
-        """Answer a scrape, whatever its path, in the format that its Accept header asks for."""
+        """Answer a scrape on any path, in the format of its Accept header."""
         with CONNECTIONS.serving(request.transport):
             if request.method not in {"GET", "HEAD"}:
                 return web.Response(status=405, headers={"Allow": "GET, HEAD"})

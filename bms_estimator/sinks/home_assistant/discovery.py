@@ -39,7 +39,7 @@ class DiscoveryInputs(NamedTuple):
     commands: tuple[str, ...] = ()
     """Allowed commands."""
     unwatched: tuple[str, ...] = ()
-    """Alarms that are not, whatever comes: other settings may have had them."""
+    """Alarms that are not monitored; other settings may have had them."""
 
 
 def check_names(settings: HomeAssistantSettings) -> None:

@@ -94,7 +94,7 @@ class MessageBuilder:
     def live_messages(
         self, sent: PublishedState, snapshot: Snapshot, now_s: float
     ) -> tuple[list[Message], PublishedState]:
-        """Return the other messages of a snapshot whose content the broker does not have yet.
+        """Return the other messages of a snapshot with content that the broker does not have yet.
 
         Args:
             sent: What it got.

@@ -1,7 +1,7 @@
 """Requests that people and dashboards may make of a running service: bytes in, bytes out, over any transport.
 
-Whoever can reach the transport may ask, so what comes from there is bounded in everything: names stand in a list,
-payloads have a size, requests a rate, log lines too; a command needs the owner's leave; no handler's fault gets out.
+Any client of the transport may send requests, so everything is bounded: names are listed, payloads have a maximum
+size, requests and log lines a maximum rate; a command needs the owner's leave; no handler's fault gets out.
 """
 
 import json
@@ -22,7 +22,7 @@ NAMES = ("state", "parameters", "health", *COMMANDS)
 """All requests that there are."""
 MOST_PAYLOAD_BYTES = 4096
 READS_PER_MIN = 120.0
-"""Requests that change nothing, of all who ask together; as many may come at once [1/min]."""
+"""Rate limit of read requests of all clients together; the same number may arrive at once [1/min]."""
 COMMANDS_PER_MIN = 6.0
 """Requests that change something, granted or not [1/min]."""
 LOG_S = 60.0

@@ -1,8 +1,8 @@
-"""The MQTT sink: what a pack says to a broker that may come and go, and what it hears from there.
+"""The MQTT sink: publishes a pack to a broker that may be away, and receives requests.
 
 ``publish`` puts what must reach the broker in the outbox, and the snapshot in a slot for one; tasks take them from
-there when the broker does. The loop never waits. What is said stands in ``messages``, what may be asked in ``requests``,
-how a broker is reached in ``link``.
+there when the broker does. The loop never waits. ``messages`` builds the messages, ``requests`` handles requests,
+``link`` connects.
 """
 
 import asyncio
@@ -152,7 +152,8 @@ class MqttSink:
     async def _subscribe(self, connection: Connection) -> None:
         """Subscribe, and say what the broker refuses.
 
-        At QoS 0: Mosquitto counts what it keeps back as too long among the messages in flight, where at QoS 1 it stays.
+        Subscribe at QoS 0: Mosquitto counts a message that it withholds as too long among the messages in flight,
+        where it stays at QoS 1.
         """
         availabilities = [self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)]
         refused = await connection.subscribe(self._topic("request/+"), [*availabilities, self._birth_topic])
@@ -165,7 +166,7 @@ class MqttSink:
             self._refusals.record_result(message, await connection.publish(message))
 
     async def _send(self, connection: Connection) -> None:
-        """Send what is live until the sink closes, then say goodbye."""
+        """Send live messages until the sink closes, then the offline messages."""
         self._wake.set()
         while True:
             await self._wake.wait()

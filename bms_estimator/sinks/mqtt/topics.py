@@ -1,7 +1,7 @@
 """Topics of all payloads, and their common version.
 
 ``PAYLOAD_VERSION`` goes up by one when a topic or a field vanishes, or a field gets another type, unit or meaning: what a
-reader relied on. What is added does not raise it: a reader passes over what it does not know.
+reader relied on. An addition does not increase it: readers ignore unknown fields.
 ``tests/sinks/mqtt/test_payloads.py`` remembers every field and its type.
 """
 

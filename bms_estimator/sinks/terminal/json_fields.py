@@ -1,4 +1,4 @@
-"""A payload's fields, each of the kind that is asked for: another version, or anybody else, may publish anything. Pure."""
+"""Fields of a payload, each with the requested type: other versions or publishers may send anything. Pure."""
 
 from collections.abc import Iterator
 

@@ -1,7 +1,7 @@
 """Views of published payloads for a terminal: pure functions from payloads to renderables.
 
 A large terminal gets two columns of panels, on a smaller one everything flows in one. On a low screen the least
-important parts are left out: SOC with its band, voltage, current, alarms and what is wrong go last.
+important parts are omitted; SOC with its band, voltage, current, alarms and errors stay longest.
 """
 
 from collections.abc import Sequence
@@ -176,7 +176,7 @@ def _header(scene: ScreenState, *, wide: bool) -> RenderableType:
 
 
 def _soc(state: JsonFields, true_soc: float | None) -> FlowLayout:
-    """Return the estimate with its band, and the ground truth beside it where known."""
+    """Return the estimate with its band, and the ground truth if known."""
     soc = state.number("soc")
     texts = [
         Text.assemble(("SOC ", "dim"), (f"{_number(soc, '.2%')}{band_text(state, '%')}", "bold"), (" (2 std)", "dim"))

@@ -1,4 +1,4 @@
-"""The live view of the pack that this process serves: it shows what is published, though it comes by no broker."""
+"""The live view of the pack that this process serves, without a broker."""
 
 from collections.abc import Callable, Iterable
 from typing import Self

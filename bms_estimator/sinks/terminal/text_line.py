@@ -1,4 +1,4 @@
-"""A line for what is heard of a pack, where no screen is: a file or a pipe. Pure."""
+"""One line for each message of a pack, for a file or a pipe. Pure."""
 
 from bms_estimator.mqtt.topic_cache import DeviceMessage
 from bms_estimator.sinks.terminal.json_fields import JsonFields

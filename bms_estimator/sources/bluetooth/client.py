@@ -28,7 +28,7 @@ class BleBringer(LineProducer):
         settings: Of the BMS.
 
     Raises:
-        UserError: aiobmsble knows no such BMS.
+        UserError: aiobmsble does not support this BMS.
     """
 
     def __init__(self, settings: BleSource) -> None:

@@ -1,4 +1,4 @@
-"""A BMS over Bluetooth: what its sample says, and whether this Python can ask it. Does no I/O."""
+"""A BMS over Bluetooth: its samples, and a check of the Python version. Does no I/O."""
 
 import sys
 
@@ -15,7 +15,7 @@ def bringer(settings: Settings) -> LineProducer:
     """Make the line producer of ``[source]``.
 
     Raises:
-        UserError: This Python is too old, or aiobmsble knows no such BMS.
+        UserError: This Python is too old, or aiobmsble does not support this BMS.
         ModuleNotFoundError: It is not installed.
     """
     assert isinstance(settings.source, BleSource)  # noqa: S101 - as KINDS has it

@@ -12,9 +12,9 @@ File format, version 1, numbers little-endian::
              bytes
              u16      CRC-16/CCITT-FALSE of the record up to here
 
-Records follow to the end of the file, one for each read of the line. The file is only ever appended to, each record in
-one write that goes to the kernel at once: whatever kills the recorder, all whole records are there and the rest of a
-cut one is ignored. A file whose name ends in .gz is read as gzip.
+Records follow to the end of the file, one for each read of the line. The file is only appended to, one system call
+for each record. A killed recorder leaves all complete records, and an incomplete last one is ignored. A file whose
+name ends in .gz is read as gzip.
 """
 
 import binascii

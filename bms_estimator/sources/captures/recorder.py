@@ -1,4 +1,4 @@
-"""A recording beside the estimate: who hears the line never waits for a disk."""
+"""Recording beside the estimate: the reader of the source never waits for the disk."""
 
 import errno
 import queue

@@ -126,7 +126,7 @@ class Replay:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The decoder's; of a table, how many rows came, and temperatures that are none."""
+        """The decoder's; number of rows of a table, and invalid temperatures."""
         if self._decoder:
             return self._decoder.counters
         return {"frames_received": self.samples, "implausible": self.capture.implausible}
@@ -166,7 +166,7 @@ class Replay:
         return self._decoder.cells if self._decoder else NO_CELLS
 
     async def _paced(self, speed: float) -> AsyncIterator[SampleBlock]:
-        """Each sample once its time has come; the first comes at once."""
+        """Each sample once its time has come; the first is immediate."""
         start_s, last_s, elapsed_s = self._monotonic(), math.nan, 0.0
         for block in self.capture:
             due_s = elapsed_s + _elapsed(block["time_s"], last_s)
@@ -209,7 +209,7 @@ def open_capture(
         path: The file.
         sensor: How to decode raw bytes, and what the current of a table calls positive unless its format lays that
             down; None: as the header of raw bytes says, and discharge.
-        current_sign: What its current calls positive, whatever ``sensor``, header and format say.
+        current_sign: Direction of positive current, which overrides ``sensor``, header and format.
 
     Raises:
         UserError: No such file, or it is neither.
@@ -230,8 +230,8 @@ def load_capture(source: str | Path | ColumnTable, *, current_sign: CurrentSign 
     Args:
         source: Path of a raw capture or of a table (CSV, gzipped CSV, Parquet), or a table in memory: a DataFrame, a
             dict of arrays. A table has our columns or the Battery Data Format's.
-        current_sign: What its current calls positive, ``discharge_positive`` or ``charge_positive``; None: as its
-            format says, else discharge.
+        current_sign: What its current calls positive, ``discharge_positive`` or ``charge_positive``; None: that of
+            the format, otherwise discharge.
 
     Returns:
         ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor) and

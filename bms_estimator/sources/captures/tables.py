@@ -1,6 +1,7 @@
 """Captures as tables: CSV, gzipped CSV and Parquet, read in blocks so that length does not cost memory.
 
-Two spellings of the columns are known: ours, and that of the Battery Data Format, which counts charge positive.
+Two spellings of the columns are supported: this project's, and that of the Battery Data Format, which is positive on
+charge.
 """
 
 import csv

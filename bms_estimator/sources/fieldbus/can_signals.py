@@ -152,7 +152,7 @@ class CanMap:
         """Look at the frame that holds ``signal``.
 
         Raises:
-            UserError: The DBC file does not know it, or knows several.
+            UserError: The DBC file does not contain it, or several times.
         """
         if signal.id is not None:
             self._frames.setdefault(FrameId(signal.id, signal.extended), _Frame()).signals.append((key, signal))

@@ -22,7 +22,7 @@ from bms_estimator.sources.line_source import LineProducer, SourceUnavailableErr
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 
 MOST_WAITING = 2000
-"""Messages that wait to be read: a broker hands out at once all that it has kept of a wildcard."""
+"""Maximum number of unread messages: a broker sends all retained messages of a wildcard at once."""
 MOST_BYTES = 65_536
 """Maximum size of a battery's message [bytes]."""
 
@@ -30,7 +30,7 @@ log = structlog.get_logger(__name__)
 
 
 class MqttReports(LineProducer):
-    """Subscribes, asks where the publisher has to be asked, and puts samples together.
+    """Subscribes, polls the publisher if necessary, and assembles samples.
 
     Args:
         settings: Topics and paths.
@@ -79,7 +79,7 @@ class MqttReports(LineProducer):
         """Lines as samples are complete; each time the next broker is tried.
 
         Raises:
-            SourceUnavailableError: The broker cannot be reached, was lost, or does not let us read.
+            SourceUnavailableError: The broker cannot be reached, was lost, or denies the subscription.
         """
         self._broker = next(self._brokers)
         try:

@@ -18,7 +18,7 @@ CELL = re.compile(r"\{cell\}")
 
 
 class InvalidValueError(Exception):
-    """A payload does not tell the quantity; the message says what it tells."""
+    """A payload does not tell the quantity; the message gives the reason."""
 
     kind = "no_number"
     """Under which it is counted."""

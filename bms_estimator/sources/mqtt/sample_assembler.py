@@ -34,8 +34,8 @@ class _TimestampedValue(NamedTuple):
 class SampleAssembler:
     """Takes messages, gives lines.
 
-    A sample is complete when voltage and current have come again, or one of them has and the other has not within
-    ``settle_s``: who publishes changes only says nothing of what is as it was. That one counts for ``max_age_s``.
+    A sample is complete when voltage and current have arrived, or one of them has and the other has not within
+    ``settle_s``: some publishers send only changes. That one counts for ``max_age_s``.
     What the broker had kept from earlier is never taken: its age is unknown.
     """
 
@@ -147,7 +147,7 @@ class SampleAssembler:
         )
 
     def _put(self, way: _TopicBinding, payload: bytes, cell: int | None, now_s: float) -> None:
-        """Keep what a payload tells.
+        """Store the values of a payload.
 
         Raises:
             InvalidValueError: Nothing.

@@ -1,6 +1,6 @@
 """Check that the board on the line is the pack's: the configured or stored one, or the first one of this run.
 
-Another board has another divider: its voltages would be wrong by several percent, and nothing else would tell.
+Another board has another divider: its voltages would be wrong by several percent, without any other sign.
 """
 
 import math
@@ -32,7 +32,8 @@ class BoardCheck:
 
     Args:
         make: A decoder that hears them meanwhile.
-        serial: Of the pack's board, as the settings have it; empty: as remembered, else of the first board that comes.
+        serial: Of the pack's board, as the settings have it; empty: the stored one, otherwise that of the first
+            board.
         memory: What outlives a restart; None: nothing does.
     """
 
@@ -45,7 +46,7 @@ class BoardCheck:
         self._nameless = self._looking = self._keeping = self._failed = self._refused = False
         self._tried_s = -math.inf
         self.pending_protocol: DeviceProtocol | None = None
-        """Decoder of a board that is not known yet."""
+        """Decoder of a pending board."""
         self._held = deque[Chunk]()
         self.unadmitted_bytes = 0
         """Bytes of refused boards, of ports lost before their board was known, and of chunks beyond the limit."""
@@ -105,7 +106,7 @@ class BoardCheck:
         """Accept samples of ``board`` as the pack's from now on; log and store what changed.
 
         Args:
-            board: What it says of itself.
+            board: Its reported properties.
             now_s: Monotonic clock [s].
         """
         if not board:

@@ -1,4 +1,4 @@
-"""Asks whoever is on a serial port, one thing at a time: who is there, and a board for its hello and to keep a setting."""
+"""Identifies the device on a serial port, and requests a board's hello and settings."""
 
 import itertools
 import time
@@ -104,7 +104,9 @@ def _prober(protocol: str) -> DeviceProtocol:
 
 
 def _ask_in_turns(line: "serial.Serial", decoders: Mapping[str, DeviceProtocol], patience_s: float) -> str | None:
-    """Have all hear, and one of them ask at a time. Returns the protocol of the first that knows who is there.
+    """Pass received bytes to all protocols, and let one of them poll at a time.
+
+    Returns the first protocol that identifies the device.
 
     Raises:
         OSError: The port is lost.
@@ -157,7 +159,7 @@ class BoardClient:
         """Return the board's hello after the last command.
 
         Raises:
-            UserError: No board answers; the message says what is there instead.
+            UserError: No board answers; the message describes the device found.
         """
         return self._ask([self._board, self._text], lambda: self._board.hello)
 
@@ -237,7 +239,7 @@ def _converse(
 
 
 def _silence(decoders: Sequence[DeviceProtocol]) -> str:
-    """Why none of them knows who is there."""
+    """Why no protocol identifies the device."""
     if not decoders[0].counters["bytes_received"]:
         return "silent"
     return next((decoder.fault for decoder in decoders if decoder.fault), "no board answers")

@@ -41,7 +41,8 @@ class NoPortError(Exception):
 class PortBusyError(NoPortError):
     """Another process has the port at ``path`` open.
 
-    Its text names who: that is looked for in all processes, milliseconds long, whenever the text is asked for.
+    Its text names the process that holds the port. The search through all processes takes milliseconds, so it runs
+    only when the text is used.
     """
 
     def __init__(self, path: str) -> None:

@@ -26,7 +26,7 @@ log = structlog.get_logger(__name__)
 
 
 class SerialPort:
-    """A port, its bytes as they come, and what is sent.
+    """A port with its received and sent bytes.
 
     Arrival times are the wall clock at start plus a clock that never steps since; it goes on while the machine sleeps.
 
@@ -106,7 +106,7 @@ class SerialPort:
             self._port = None
 
     def finish(self) -> None:
-        """Let who reads come to an end."""
+        """Let the reader come to an end."""
         self._reads.put_nowait(None)
 
     async def read(self) -> Chunk | None:

@@ -188,7 +188,7 @@ class SerialSource:
         return self._door.pending_protocol or self._decoder
 
     def _send_due(self) -> None:
-        """Send what is due to the device that has been heard last, if it is the one on the port now."""
+        """Send pending commands to the last device, if it is the one on the port now."""
         if self._openings == self._line.openings and not self._line.lost.is_set():
             self._line.send(self._listener.next_output(self._line.now_s))
 
@@ -295,7 +295,7 @@ class SerialSource:
             self._faults.check(counters, now_s)
 
     def _say_or_leave(self, message: str) -> None:
-        """Say why no samples come, and look elsewhere where the board only might be."""
+        """Report why no samples arrive, and try other ports if the board may be elsewhere."""
         if self._where.is_preferred:
             self._say(message)
         else:
@@ -312,7 +312,7 @@ class SerialSource:
                     return
 
     def _say(self, message: str) -> None:
-        """Say why no samples come, once for each reason."""
+        """Report why no samples arrive, once for each reason."""
         self._tended_s = self._monotonic()
         if message != self._message:
             log.warning("no samples", reason=message)
