@@ -45,7 +45,7 @@ COMPILED_IN = (
         )
     ),
 )
-"""Files whose content is compiled into kernels: kernels, frame decoding and the constants that they use."""
+"""Files whose content is compiled into kernels: kernels, frame decoding and their constants."""
 
 
 def _cache_folder() -> Path | None:
@@ -74,7 +74,7 @@ def _cache_folder() -> Path | None:
 
 @contextlib.contextmanager
 def _go_on(cache: Any) -> Iterator[None]:
-    """Around each use of a kernel's files: whatever is wrong with them, it costs the compilation only."""
+    """Context of each use of a kernel's files: any error costs only a compilation."""
     try:
         yield
     except OSError as error:

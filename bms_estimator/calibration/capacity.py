@@ -48,7 +48,7 @@ opposite sign after a charge."""
 
 @dataclass(frozen=True)
 class Anchor:
-    """A rest that tells the SOC.
+    """A rest whose voltage gives the SOC.
 
     Attributes:
         capture: Where it is.
@@ -84,7 +84,7 @@ class Capacity:
     Attributes:
         capacity_ah: [Ah].
         std_ah: Its standard deviation [Ah].
-        offset_a: Offset of the current sensor, as far as the anchors tell [A].
+        offset_a: Offset of the current sensor, if the anchors determine it [A].
         offset_std_a: Of that [A].
         anchors: Used.
         residual: Of each anchor, SOC by its voltage less that by the charge.
@@ -105,11 +105,12 @@ def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std
 
     Args:
         captures: Of the same cell, within weeks.
-        cell: Its open-circuit voltage counts, with its error; its capacity for what is small only.
+        cell: Its open-circuit voltage counts, with its error; its capacity defines small currents only.
         offset_std_a: Standard deviation of the offset of the current sensor [A]; None: as the identifier takes it.
 
     Raises:
-        UserError: No two anchors that are apart, and why is said for each rest; or sign of the current, curve and captures
+        UserError: No two anchors are far enough apart, with the reason for each rest; or sign of the current, curve
+            and captures
             do not go together; or two captures are the same.
     """
     _check_apart(captures)

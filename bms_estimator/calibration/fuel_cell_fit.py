@@ -76,7 +76,7 @@ class FuelCellFit:
     Attributes:
         model: The stack with its parameters, and their errors in ``std``.
         rms_v: By the name of each source, what the fit leaves of its voltage [V].
-        not_told: Why a parameter kept the value of the file, by its key in ``[fuel_cell]``.
+        not_told: Reason why a parameter kept the value of the file, by its key in ``[fuel_cell]``.
     """
 
     model: FuelCellModel
@@ -92,7 +92,7 @@ def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFi
         start: Start of the search, and values of parameters that the data do not determine.
 
     Raises:
-        UserError: The data tell of no parameter.
+        UserError: The data determine no parameter.
     """
     file, told, not_told = start.a, list(range(len(NAMES))), dict[Parameter, str]()
     while told:
@@ -143,7 +143,7 @@ def _fit(sources: Sequence[Source], file: Floats, told: list[int]) -> tuple[Floa
 
 
 def _blind(jacobian: Floats) -> Floats:
-    """Variance without end along what no datum tells of: a pseudoinverse alone has it as zero."""
+    """Unbounded variance in directions that no datum determines; a pseudoinverse alone gives zero."""
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     unseen: Floats = vectors[:, values <= 1e-10 * values.max()]
     blind: Floats = 1e6 * unseen @ unseen.T

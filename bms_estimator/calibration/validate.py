@@ -49,7 +49,7 @@ class Validation:
         final_soc: SOC at the last sample, counted.
         all: Over all samples.
         above: Over the samples at SOC above ``LOW_SOC``.
-        resting: Of these, those without current: the open-circuit voltage's error, and what has not relaxed.
+        resting: Those without current: error of the open-circuit voltage, and remaining relaxation.
         loaded: Of these, those with current.
         extra_ohm: Series resistance that would make the error over ``above`` least: contacts, temperature, age [ohm].
         without_extra_ohm: The error over ``above`` with that resistance.
@@ -79,12 +79,12 @@ class Validation:
 def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = None) -> Validation:
     """Simulate a capture's voltage from its current alone and compare.
 
-    The ladder of the cell file counts, at the capture's temperature; without one (2.2)-(2.9). Where C_ts, C_tl turn
-    negative (below delta1, delta2) they are held just above 0, so that the simulation goes on.
+    The ladder of the cell file counts, at the capture's temperature; without one (2.2)-(2.9). Negative C_ts, C_tl
+    (below delta1, delta2) are replaced with a small positive value, so that the simulation continues.
 
     Args:
         capture: Raw samples, rows of dtype ``SAMPLE``; it should start from rest.
-        cell: What is validated.
+        cell: Cell to validate.
         initial_soc: SOC 0..1 at the first good sample; None: from the voltage of the first rest.
 
     Raises:

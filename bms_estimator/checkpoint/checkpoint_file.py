@@ -1,4 +1,4 @@
-"""Checkpoints: the estimator's state on disk, taken up again only when it belongs to the same pack and is sane.
+"""Checkpoints: the estimator's state on disk, restored only if it is valid and belongs to the same pack.
 
 Each meaning of a state (``pack_identity``) has its own file with named fields. Edited settings and versions with
 other fields therefore lose nothing.
@@ -36,15 +36,15 @@ DAY_S = 86400.0
 LONGEST_FILE = 1 << 20
 """Maximum size of a checkpoint file [bytes]; usual ones have about 100 kB."""
 KEPT = 8
-"""Number of files of one pack that are kept, those saved last."""
+"""Number of checkpoint files of one pack; older ones are deleted."""
 REFUSED = "refused: "
 """Prefix of the reason for rejecting a file."""
 LATER = 4
-"""Number of files of later formats that are kept for a return to the version that wrote them."""
+"""Number of stored files of later formats, for a return to their version."""
 _OF_LEDGER = "restarts", "total", "clean", "alarms"
-"""Names in the file of what is in the ledger."""
+"""Field names of the counters in the file."""
 MOST = 1e15
-"""No counter comes so far, nor do seconds: 30,000 years of 1,000 samples a second."""
+"""Maximum plausible count: 30,000 years at 1,000 samples a second."""
 
 log = structlog.get_logger(__name__)
 
@@ -55,9 +55,9 @@ class RunCounters:
 
     Attributes:
         restarts: Starts that found a checkpoint.
-        total: What is counted over restarts.
+        total: Totals over restarts.
         clean: The last of them has ended by itself; False while it runs.
-        alarms: Those that outlive a restart, as ``AlarmEvaluator.kept``.
+        alarms: Alarms over restarts, as ``AlarmEvaluator.kept``.
     """
 
     restarts: int
@@ -77,7 +77,7 @@ class CheckpointContent:
     ledger: RunCounters
     """Counters with this start added; zero if the file was of another pack, or could not be read."""
     reason: str
-    """Why it is not taken up; empty when it may be."""
+    """Reason for the rejection; empty when it may be."""
 
 
 class CheckpointFile:
@@ -161,11 +161,11 @@ class CheckpointFile:
             return CheckpointContent({}, 0.0, new, f"{REFUSED}damaged, perhaps by a power cut ({type(error).__name__})")
 
     def quarantine(self) -> str:
-        """Move a rejected file out of the way of the next save. Returns what was done, for people.
+        """Move a rejected file out of the way of the next save. Returns a description for people.
 
         A file of a later format is valid and replaces none, so that each version finds its own file after a
-        downgrade. It is
-        not taken up unasked: what this version saves meanwhile is newer, though it may have learned less.
+        downgrade. It is not restored automatically: this version's later files are newer, though it may have learned
+        less.
         """
         aside = self.path.with_name(f"{self._name}.refused.npz")
         if self._later:
@@ -216,7 +216,7 @@ class CheckpointFile:
 
 
 class _RefusedError(Exception):
-    """Why a checkpoint is not taken up, and what is counted on nevertheless."""
+    """Reason for rejecting a checkpoint, and counters that continue anyway."""
 
     def __init__(self, reason: str, ledger: RunCounters | None = None) -> None:
         super().__init__(reason)

@@ -1,4 +1,4 @@
-"""Identity of a checkpoint: the pack and the settings whose state it holds."""
+"""Identity of a checkpoint: pack and settings of its state."""
 
 import hashlib
 from collections.abc import Iterator, Mapping

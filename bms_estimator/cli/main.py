@@ -70,7 +70,7 @@ EXTRAS = {
 }
 """Optional package -> the extra that brings it."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""Errors of a full or broken disk. Space may come back, so that systemd should restart a service that ends with one."""
+"""Errors of a full or broken disk. Space may be freed, so systemd should restart a service that ends with one."""
 
 
 class _Commands(LazyGroup):

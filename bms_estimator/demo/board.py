@@ -1,4 +1,4 @@
-"""The demo's board: the firmware in its simulator, or its stand-in in Python."""
+"""The demo's board: the firmware in its simulator, or a simulation in Python."""
 
 import asyncio
 from collections.abc import AsyncIterator, Coroutine
@@ -24,7 +24,7 @@ class Board(NamedTuple):
 
 
 def find_build(given: Path | None) -> Path | None:
-    """Folder of the built firmware; None where it is not built and none was asked for.
+    """Folder of the built firmware; None if it is not built and was not requested.
 
     Raises:
         UserError: Nothing is built in the folder that was given.
@@ -43,7 +43,7 @@ async def running_board(build: Path | None, truth: TrueSoc, *, rate_hz: int, spe
 
     Args:
         build: Folder of the built firmware.
-        truth: What is at the board's pins.
+        truth: The simulated pack.
         rate_hz: Samples per second of its time.
         speed: Its seconds per second.
     """

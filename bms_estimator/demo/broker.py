@@ -26,7 +26,7 @@ ANONYMOUS = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymo
 MQTT_5 = b"MQTT\x05"
 """Bytes of an MQTT 5 client's CONNECT after its length."""
 UNSUPPORTED_VERSION = b"\x20\x02\x00\x01"
-"""CONNACK of a broker that does not know the client's version."""
+"""CONNACK for an unsupported protocol version."""
 
 
 class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
@@ -69,7 +69,7 @@ class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
 
 
 class _Again(StreamReaderAdapter):  # type: ignore[misc]  # as above
-    """A reader whose first bytes have been read already."""
+    """A reader whose first bytes were already read."""
 
     def __init__(self, start: bytes, reader: asyncio.StreamReader) -> None:
         super().__init__(reader)
@@ -88,7 +88,7 @@ class DemoBroker:
         port: TCP port; None: 1883 when it is free, else any that is.
 
     Raises:
-        UserError: The port asked for is taken.
+        UserError: The requested port is in use.
     """
 
     def __init__(self, port: int | None = None) -> None:
@@ -114,7 +114,7 @@ class DemoBroker:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Part from all clients, once they have what came: it would be dropped."""
+        """Disconnect all clients after their queued messages, which would otherwise be dropped."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(DELIVERY_S):
                 await self._stand_idle()
@@ -132,7 +132,7 @@ def choose_port(port: int | None, usual: int) -> int:
     """Return the port to listen on: the requested one, otherwise the usual one, otherwise a free one.
 
     Raises:
-        UserError: The port asked for is taken.
+        UserError: The requested port is in use.
     """
     if port is not None:
         if not _free(port):

@@ -60,7 +60,7 @@ async def run_demo(
         opened: Called with the address of the live page once it is served.
 
     Returns:
-        What came of it, in a line.
+        A summary in one line.
     """
     stop = stop_on_signal()
     cell = load_cell(CELL)

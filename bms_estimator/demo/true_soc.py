@@ -18,7 +18,7 @@ TAIL_BYTES = 256
 
 
 class TrueSoc:
-    """A pack's signal for a board, and a tap on the board's line: the board's clock in a frame says when it was taken.
+    """A pack's signal for a board, and a tap on the board's line: the clock in a frame gives the time of the sample.
 
     Args:
         pack: Read at times that may run ahead of the board's, as a simulator reads from a pipe.

@@ -11,7 +11,7 @@ MOST_SAMPLES = 7_000
 
 
 class ReadyBlock(NamedTuple):
-    """Samples of a block, and when the last of them came."""
+    """Samples of a block, and the arrival time of the last one."""
 
     arrival_s: float
     """Wall clock [s since 1970]."""
@@ -19,7 +19,7 @@ class ReadyBlock(NamedTuple):
 
 
 class Batcher:
-    """Cuts what comes into blocks of a length.
+    """Divides samples into blocks of one duration.
 
     Args:
         block_s: A block's first sample and that of the next one are at least so far apart [s].

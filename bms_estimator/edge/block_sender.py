@@ -52,18 +52,18 @@ class BlockSender:
     Args:
         settings: Where they go.
         pack: Name of the pack.
-        folder: Where blocks are kept, in ``<pack>.edge.sqlite``.
+        folder: Folder of the blocks, in ``<pack>.edge.sqlite``.
         connect: Makes a connection; over TCP when left out.
         clock: Its wall clock dates samples.
-        steady: A clock that never steps, and goes on while the machine sleeps [s].
+        steady: A clock that never steps and continues during suspend [s].
         most_samples: Of a block.
         first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
         retry_s: Before a disk that failed is tried again [s].
-        handover_s: At the end, how long what is not sent may still take [s].
+        handover_s: Time for sending the remaining blocks at the end [s].
 
     Attributes:
         delivery: What became of the blocks.
-        unread: What came from workers, or pretended to, and could not be read.
+        unread: Messages on the workers' topic that could not be read.
 
     Raises:
         UserError: A URL or a file of ``settings`` cannot be used.
@@ -105,7 +105,7 @@ class BlockSender:
         self._stack = contextlib.AsyncExitStack()
 
     def take(self, samples: SampleBlock) -> None:
-        """Take samples that have just come, their times by the source's clock; returns at once."""
+        """Take samples that have just arrived, with times by the source's clock; returns at once."""
         if self._times is None:
             raise RuntimeError("an edge takes samples within its context")
         if self._task is not None and self._task.done():
@@ -141,7 +141,7 @@ class BlockSender:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Send the block that is open, too; what is not sent in time the next run sends."""
+        """Send the block that is open, too; the next run sends the rest."""
         self._end_block()
         if self._task is not None:
             self._link.closing.set()
@@ -166,7 +166,7 @@ class BlockSender:
         self._watch_open_block()
 
     async def _serve(self, connection: Connection) -> None:
-        """Send and hear until the connection is lost or the edge closes."""
+        """Send and receive until the connection is lost or the edge closes."""
         self._refusals.begin()
         try:
             refused = await connection.subscribe(None, [self._hear_topic])

@@ -1,7 +1,7 @@
 """Blocks of an edge: on disk until a worker has confirmed them, returned in order, and again on request.
 
 The event loop never waits for the disk. Blocks that cannot be written wait in memory without a number. Nothing is
-sent that a restart would not know, since a number could otherwise be used twice.
+sent without a number on disk, since a restart could otherwise use the number again.
 """
 
 import asyncio
@@ -27,7 +27,8 @@ MOST_WAITING = 500_000
 RETRY_S = 1.0
 """Retry interval of a disk operation that failed [s]; ``Database`` avoids a disk that has failed."""
 RESEND_S = 30.0
-"""Minimum interval between two resends of a block [s]: a worker that lags asks for it again before it can have it."""
+"""Minimum interval between two resends of a block [s]: a worker that lags repeats its request before the block can
+arrive."""
 
 log = structlog.get_logger(__name__)
 
@@ -36,9 +37,9 @@ class BlockStore:
     """Keeps blocks in order until a worker has them, as ``mqtt.queue_sender.MessageQueue``.
 
     Args:
-        database: With ``EDGE_TABLES``, synced at each transaction; opened and closed by who made it.
+        database: With ``EDGE_TABLES``, synced at each transaction; opened and closed by its owner.
         topic: Where blocks are published.
-        most_bytes: Of blocks on disk; of more the oldest goes.
+        most_bytes: Of blocks on disk; beyond it the oldest is dropped.
         wall: Wall clock [s since 1970].
         resend_s: Between two times that the same block is sent again on request [s].
 
@@ -84,7 +85,7 @@ class BlockStore:
 
     @property
     def kept(self) -> int:
-        """Blocks that no worker has said to be safe."""
+        """Blocks that no worker has confirmed."""
         return len(self._waiting) + (self._settled.kept.next - self.oldest if self._settled else 0)
 
     @property

@@ -32,7 +32,7 @@ EDGE_TABLES = (
 
 
 class StoreState(NamedTuple):
-    """A store and what is in it."""
+    """A store and its content."""
 
     made_s: int
     """Creation time [s since 1970]: whole seconds, so that sample times relative to it are exact."""
@@ -53,14 +53,14 @@ class StoreResult(NamedTuple):
 
     kept: StoreState
     oldest: int
-    """Number of the oldest block; ``kept.next`` without one."""
+    """Number of the oldest block; ``kept.next`` without a store."""
     dropped: int
     """Blocks that had to make room."""
 
 
 @dataclass(frozen=True)
 class StoreTransaction:
-    """Put blocks, forget what is safe, make room; may be done twice.
+    """Insert blocks, delete confirmed ones, make room; may be done twice.
 
     Raises:
         sqlite3.Error: As the disk has it.
@@ -73,7 +73,7 @@ class StoreTransaction:
     safe: int
     """Blocks below this number are forgotten."""
     known_s: int
-    """Creation time of the store that this process knows [s since 1970]; 0: none yet. An earlier store is not valid."""
+    """Creation time of the store of this process [s since 1970]; 0: none yet. An earlier store is not valid."""
     after_s: int
     """A store that was not created after this time is not valid, and a new one is begun [s since 1970]."""
     most_bytes: int

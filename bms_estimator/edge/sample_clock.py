@@ -14,8 +14,7 @@ STEP_S = 10.0
 SLEW = 0.01
 """Relative rate at which an offset of a source's clock below that is corrected: no resonator is as wrong."""
 WINDOW_S = 600.0
-"""Window of the smallest delay [s]: a sample comes late and never early, so that the smallest delay shows a clock's
-lag."""
+"""Window of the smallest delay [s]: samples are late and never early, so the smallest delay shows a clock's lag."""
 GRID = 2.0**20
 """Offsets are multiples of 1/GRID, so that a constant period stays constant, which compresses best."""
 
@@ -24,8 +23,8 @@ class SampleClock:
     """Seconds since 1970 that never decrease, even if the wall clock does.
 
     Between samples counts the source's clock. The host gives its start by the wall clock, and its corrections by the
-    monotonic clock. A wall clock that is set ahead is followed, as of a machine that
-    has come up without knowing the time: that was a gap. One that is set back is not.
+    monotonic clock. A wall clock that is set ahead is followed, as on a machine that starts without the time; the
+    step is a gap. One that is set back is not.
 
     Args:
         last_s: Of the last sample that was placed, in an earlier run, too [s since 1970]; none: minus infinity.
@@ -44,7 +43,7 @@ class SampleClock:
         self._least_late_s, self._window_s = math.inf, 0.0  # of the present window, and when it began
 
     def go_on_from(self, time_s: float) -> None:
-        """Place nothing before a time that is later than all that was placed, and what comes now there [s since 1970]."""
+        """Place nothing before a time later than all placed samples, and the next sample there [s since 1970]."""
         if time_s > self._last_s:
             self._last_s, self._lead_s, self._told_s = time_s, math.nan, math.nan
 
@@ -52,9 +51,9 @@ class SampleClock:
         """Return timestamps of samples that have just arrived [s since 1970].
 
         Args:
-            told_s: By the source's clock [s], shape (n,); what is not finite counts as the sample before.
+            told_s: By the source's clock [s], shape (n,); a non-finite time counts as that of the previous sample.
             wall_s: Wall clock now [s since 1970].
-            steady_s: A clock that never steps, and goes on while the machine sleeps [s].
+            steady_s: A clock that never steps and continues during suspend [s].
         """
         now_s = self._now(wall_s, steady_s)
         told_s = _finite(told_s, self._told_s)

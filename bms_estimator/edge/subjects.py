@@ -78,4 +78,4 @@ class BlockRequest(BaseModel):
     store: Annotated[int, Field(ge=0, lt=2**63)]
     number: Annotated[int, Field(ge=1, le=2**63)]
     resend: bool
-    """A later one came first: send this one, and all after it, again."""
+    """A later block arrived first: send this one and all after it again."""

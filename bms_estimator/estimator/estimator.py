@@ -35,14 +35,14 @@ class Estimator:
     ``run`` on a block and ``step`` on each of its samples leave the same state to the last bit.
 
     Args:
-        cell: The pack as one two-terminal object (``CellModel.pack``). A fuel cell has no SOC (NaN), and its parameters
-            are always learned, whatever the law that is set.
+        cell: The pack as one two-terminal object (``CellModel.pack``). A fuel cell has no SOC (NaN), and its
+            parameters are always learned, under any law.
         observer: The adaptive observer's settings.
         identifier: The identifier's settings; None: off, the thesis's method alone.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
         initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
-        sampling: What the source tells of the current, and how often; that of a board when left out.
+        sampling: Resolution and period of the source; that of a board when left out.
 
     Attributes:
         record: Shape (1,), dtype ``ESTIMATOR_STATE``: all there is. It can be copied, saved, compared and put back.

@@ -29,7 +29,7 @@ COUNT_ERROR_SOC = 0.004
 BEYOND_BRANCHES = 0.2
 """Two branches leave out diffusion that is slower: its resistance, as a part of theirs."""
 BRANCHES_STD = 0.35
-"""Relative std of resistances that come from two branches."""
+"""Relative std of resistances derived from two RC pairs."""
 BIAS_OF_STD = 0.15
 """Fraction of the resistances' relative std that becomes ``bias_relative``, because uncertain resistances are wrong
 in their ratios, too."""
@@ -60,7 +60,7 @@ def filter_settings(
         identifier: Its ``[identifier]`` section.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
-        sampling: What the source tells of the current, and how often.
+        sampling: Resolution and period of the source.
 
     Returns:
         Shape (1,), dtype ``EKF_SETTINGS``.

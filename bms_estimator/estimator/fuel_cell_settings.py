@@ -12,7 +12,7 @@ from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
 from bms_estimator.model.fuel_cell import FuelCellModel
 
 MEMORY_S = 60.0
-"""Water and gas of a stack change within a minute: what was before is of another one [s]."""
+"""Memory of a stack's law [s]: water and gas change within a minute."""
 SETTLE_S = 5.0
 """Time in which double layer and oxygen forget an unmeasured load [s]."""
 FACTORS = {

@@ -20,7 +20,7 @@ from bms_estimator.model.cell import CellModel, TableOcv
 WIDEST_CAPACITY_STD = 0.3
 """Maximum std that a cell file may hold."""
 EVEN = tuple(np.round(np.linspace(0.0, 1.0, 101), 2).tolist())
-"""SOCs of a table that comes from (2.10)."""
+"""SOCs of a table computed from (2.10)."""
 LEAST_RISE_V = 1e-6
 """Minimum rise of the OCV between two SOCs of its table [V]."""
 

@@ -13,7 +13,7 @@ from bms_estimator.settings.observer import ObserverSettings
 MEMORY_S = 3600.0
 """Under load data are forgotten with this time constant [s]."""
 OFFSET_S = 600.0
-"""The injection takes up an error of the open-circuit voltage with this time constant [s]."""
+"""The injection absorbs an error of the open-circuit voltage with this time constant [s]."""
 SETTLE_S = 1200.0
 """Settling time after an unmeasured gap [s]: at least three time constants of the slow branch."""
 RATE_HZ = 1.0 / 60.0

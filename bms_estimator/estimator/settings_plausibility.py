@@ -23,7 +23,7 @@ CONVERTER_STEPS = 1024
 
 
 def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
-    """One line for each setting that cannot be, with what it may have been meant to be; empty where all may be.
+    """One line for each implausible setting, with a likely intention; empty where all may be.
 
     Args:
         settings: The pack's.

@@ -24,7 +24,7 @@ LOCK_FRACTION = 0.02
 GAP_S = 5.0
 """A step longer than this counts as a gap [s], or of a slow source one longer than ``PERIODS``."""
 IMPROVED = range(1, 13)
-"""Parameters that the improved method adapts (Algorithm 1); a13..a15 come from (4.2)."""
+"""Parameters that the improved method adapts (Algorithm 1); a13..a15 by (4.2)."""
 
 
 def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -59,7 +59,7 @@ def estimator_settings(
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
         initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
-        sampling: What the source tells of the current, and how often.
+        sampling: Resolution and period of the source.
 
     Returns:
         Shape (1,), dtype ``ESTIMATOR_SETTINGS``.

@@ -16,7 +16,7 @@ class Condition:
 
 
 def lemma_conditions(cell: CellModel) -> list[Condition]:
-    """Check what Lemma 4.1.1 asks of the bounds, weights and initial values of (a7, a9) and (a10, a12).
+    """Check the conditions of Lemma 4.1.1 on bounds, weights and initial values of (a7, a9) and (a10, a12).
 
     A capacitance that is positive over the whole of SOC 0..1 at both ends of the adaptation needs no condition;
     ``failed_conditions`` leaves it out.

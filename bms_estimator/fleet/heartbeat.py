@@ -33,7 +33,7 @@ class Heartbeat(BaseModel):
     counters: dict[str, int] = Field(default_factory=dict)
     """Counters of the partitions by name: resends, gaps, lost blocks, damaged blocks and others."""
     unknown_count: int = 0
-    """Packs that the table does not know."""
+    """Packs that are missing in the table."""
     unknown: tuple[str, ...] = ()
     """The first few of them."""
     waiting: int = 0

@@ -1,4 +1,4 @@
-"""One hour of a pack in one row: measurements, and estimates at its end. What a fleet is asked about."""
+"""One hour of a pack in one row: measurements, and estimates at its end. The rows that fleet queries use."""
 
 from typing import Annotated
 

@@ -38,7 +38,7 @@ class _Listener(event.Listener):
         self._waiting, self._all, self._tell = kernels, len(kernels), tell
 
     def on_start(self, event: event.Event) -> None:
-        """Count a kernel of this package; inner functions come after their callers."""
+        """Count a kernel of this package; inner functions follow their callers."""
         kernel = event.data["dispatcher"].py_func
         if kernel in self._waiting:  # a kernel is compiled for each type of argument
             self._waiting.remove(kernel)

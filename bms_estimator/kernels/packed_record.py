@@ -1,6 +1,7 @@
-"""A record without what need not be kept: words of 8 bytes that are 0, or the same on both sides of a diagonal.
+"""A record without redundant words: words of 8 bytes that are 0, or equal on both sides of a diagonal.
 
-Packed are a bitmap with one bit for each word, the lowest first, and the words whose bit is set. What the others are
+The packed form is a bitmap with one bit for each word, the lowest first, and the words whose bit is set. What the
+others are
 follows from ``mirror``, which is of the layout alone: a word that mirrors an earlier one is as that, any other is 0. No
 bit of a record is lost, symmetric or not.
 """
@@ -72,7 +73,7 @@ def room(words: int) -> Words:
 
 @njit(cache=True)
 def pack(words: Words, mirror: Mirror, out: Words) -> int:
-    """Write a record to ``out`` without what need not be kept.
+    """Write a record to ``out`` without redundant words.
 
     Args:
         words: Shape (n,).

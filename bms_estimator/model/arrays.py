@@ -7,6 +7,6 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Record = Any
-"""An element of a structured array inside a kernel: numba knows its fields, the type checker does not."""
+"""An element of a structured array inside a kernel: numba resolves its fields, the type checker does not."""
 Records = NDArray[np.void]
 """A structured array."""

@@ -308,7 +308,7 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
 
     Args:
         name_or_path: As in ``generic_cells`` or ``shipped_cells``, else a path.
-        capacity_ah: What it holds [Ah]. A generic cell needs it and is scaled by it: resistances go down and
+        capacity_ah: Capacity [Ah]. A generic cell needs it and is scaled by it: resistances go down and
             capacitances up with it. In any other it replaces the capacity alone: there it is the cell's own, faded
             with age or measured better, and its resistances were measured on it.
 

@@ -21,7 +21,7 @@ def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None
     Args:
         path: Overwritten if it exists.
         cell: Numbers are rounded to ``DIGITS`` significant ones.
-        remarks: Where the values come from, one line each, for the head of the file.
+        remarks: Origin of the values, one line each, for the head of the file.
 
     Raises:
         UserError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""Columns by name: what a capture holds, and what an estimate of it comes to. The unit stands in each name."""
+"""Columns by name: those of a capture, and those of its estimates. Names contain the unit."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Reading a TOML file into a pydantic model, with errors that name file, key, value and what is allowed."""
+"""Reading a TOML file into a pydantic model, with errors that name file, key, value and constraint."""
 
 import re
 import tomllib
@@ -190,7 +190,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def without_secrets(text: str) -> str:
-    """Text of a URL, or of several, without what stands before the last @: a name and a password, however it is written."""
+    """Text of a URL, or of several, without everything before the last @, which may contain a name and a password."""
     return re.sub(r".*@", "***@", text, flags=re.DOTALL)
 
 
@@ -198,7 +198,7 @@ def write_text(path: Path, text: str, *, make_folder: bool = False) -> None:
     """Write a file in UTF-8.
 
     Args:
-        path: Whatever is there.
+        path: Any existing file.
         text: All of it.
         make_folder: True to create a missing folder.
 

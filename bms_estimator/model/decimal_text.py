@@ -27,7 +27,7 @@ def number(text: str) -> float:
 
 
 def measured(text: str) -> float:
-    """Parse a number as ``number`` does; NaN for a word that stands for a missing one.
+    """Parse a number as ``number`` does; NaN for a word that means a missing value.
 
     Raises:
         ValueError: It is neither.

@@ -2,4 +2,7 @@
 
 
 class UserError(Exception):
-    """Something outside the program is wrong: a file, a value, a device. The message says what, where and how to mend it."""
+    """Invalid input, setting or device.
+
+    The message says what is wrong, where, and what to do.
+    """

@@ -67,7 +67,7 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
 
 
 def _alarms(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Found]:
-    """Yield raised and ended alarms. One that ended and came again in between has another ``since``.
+    """Yield raised and ended alarms. One that ended and was raised again in between has another ``since``.
 
     An alarm raised before the start was reported by the run before.
     """
@@ -106,7 +106,7 @@ def _sensor(was: Health | None, health: Health) -> Iterator[_Found]:
 
 
 def _suspicions(was: list[str], now: list[str]) -> Iterator[_Found]:
-    """Yield suspicions that came and went; numbers in their sentences may change meanwhile."""
+    """Yield suspicions that began and ended; numbers in their sentences may change meanwhile."""
     before, after = ({_kind(sentence): sentence for sentence in sentences} for sentences in (was, now))
     for kind, sentence in after.items():
         if kind not in before:

@@ -37,7 +37,7 @@ Parameter = Literal[
 
 
 class FuelCell(Strict):
-    """Losses of a stack, of all its cells in series, and what it is fed with."""
+    """Losses of a stack, of all its cells in series, and its gas supply."""
 
     r_ohm: Positive = Field(description="membrane and contacts")
     tafel_slope_v: Positive = Field(description="growth of the activation loss when the current grows e times")
@@ -86,7 +86,7 @@ class FuelCellModel(Strict):
         """Return the same stack with other parameters.
 
         Args:
-            a: As the property ``a``; what stands for conditions is not looked at.
+            a: As the property ``a``; conditions are ignored.
             std: Relative standard deviations of those that were identified.
         """
         r_ohm, tafel_v, activation_v, c_dl, b, limit, internal = (float(f"{value:.6g}") for value in a[1:8])

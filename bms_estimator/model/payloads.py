@@ -14,7 +14,7 @@ FRESH_PERIODS = 3
 period."""
 
 PAYLOAD_VERSION = 1
-"""Version of all payloads; ``sinks/mqtt/topics.py`` says when it is raised."""
+"""Version of all payloads; ``sinks/mqtt/topics.py`` defines when it increases."""
 
 
 class Payload(BaseModel):

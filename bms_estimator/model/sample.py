@@ -34,7 +34,7 @@ NO_CELLS: CellBlock = np.empty((0, 0))
 """Cell voltages of a block without any, of any length."""
 
 LEAST_C, MOST_C = -60.0, 200.0
-"""No sensor on a pack or a stack says anything beyond [degC]."""
+"""Maximum plausible temperature of a pack or stack [degC]."""
 LEAST_CELL_V, MOST_CELL_V = -5.0, 10.0
 """No single cell has a voltage beyond, be it reversed [V]."""
 
@@ -50,7 +50,7 @@ class SampleStatus(IntFlag):
 
 
 def forget_beyond(values: NDArray[np.float64], least: float, most: float) -> int:
-    """Make NaN, in place, what is outside ``least``..``most``. Returns how many there were."""
+    """Replace, in place, values outside ``least``..``most`` with NaN. Returns how many there were."""
     beyond = (values < least) | (values > most)
     values[beyond] = np.nan
     return int(np.count_nonzero(beyond))

@@ -1,1 +1,1 @@
-"""MQTT client: connect, negotiate, reconnect, queue, subscribe. It knows no payload."""
+"""MQTT client: connect, negotiate, reconnect, queue, subscribe. It does not depend on payloads."""

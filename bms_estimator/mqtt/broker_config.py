@@ -55,7 +55,7 @@ def tls_context(settings: MqttSettings) -> ssl.SSLContext:
     """Whom to trust and what to show, reloaded, because certificates are replaced while the service runs.
 
     Raises:
-        UserError: A file cannot be read, or is not what it should be.
+        UserError: A file cannot be read, or is invalid.
     """
     try:
         context = ssl.create_default_context(cafile=settings.ca_file)
@@ -103,7 +103,7 @@ def _broker(address: str) -> Broker:
 
 
 def _show(context: ssl.SSLContext, settings: MqttSettings, cert_file: Path) -> None:
-    """Show a certificate of our own; without a key file its key stands in the same file.
+    """Show a certificate of our own; without a key file the key is in the same file.
 
     Raises:
         UserError: A file cannot be read, or the two do not belong together.
@@ -126,7 +126,7 @@ def _show(context: ssl.SSLContext, settings: MqttSettings, cert_file: Path) -> N
 
 
 def _refuse_password() -> str:
-    """Asked for when a key is encrypted.
+    """Refuse an encrypted key, whose password cannot be entered.
 
     Raises:
         UserError: Always.

@@ -162,7 +162,7 @@ class Client(aiomqtt.Client):
         self._client.disconnect()
 
     def drop_connection(self) -> None:
-        """Close the line without a word: once the broker has read what is on it, it publishes the will."""
+        """Close the connection without DISCONNECT, so that the broker publishes the will."""
         line: Any = self._client.socket()  # of a protocol of paho's, which leaves out what all sockets have
         if line is not None:
             with contextlib.suppress(OSError):
@@ -269,7 +269,7 @@ def refusal(error: aiomqtt.MqttError) -> str:
 
 
 def should_retry_with_v311(error: aiomqtt.MqttError) -> bool:
-    """Return True if a refusal of MQTT 5 may come from a broker with MQTT 3.1.1 only."""
+    """Return True if a rejection of MQTT 5 may come from a broker with MQTT 3.1.1 only."""
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
         return error.rc.value == UNSUPPORTED_VERSION
     return isinstance(error, ClosedError) and not str(error).startswith(TLS_ALERT)

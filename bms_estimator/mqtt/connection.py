@@ -10,11 +10,14 @@ from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING
 
 
 class BrokerConnectionError(Exception):
-    """The broker cannot be reached, refuses the connection, or the connection is lost; the message says why."""
+    """The broker cannot be reached, refuses the connection, or the connection is lost.
+
+    The message gives the reason.
+    """
 
 
 class ReceivedMessage(NamedTuple):
-    """A message that came."""
+    """A received message."""
 
     topic: str
     payload: bytes
@@ -69,7 +72,7 @@ class Connection(Protocol):
         Messages of several tasks are sent in the order of their calls.
 
         Returns:
-            The broker's refusal, where it does and says so.
+            The broker's rejection, if it reports one.
         """
 
     async def receive(self) -> ReceivedMessage:

@@ -14,7 +14,8 @@ class DeliveryStats:
     waiting: int = 0
     """States and events that the broker has not acknowledged yet."""
     store_trouble: Callable[[], str] = field(default=str, compare=False)
-    """Why the disk does not keep what waits, nor the history; empty when it does, or nothing is to be kept."""
+    """Why the disk does not keep what waits, nor the history; empty if it can be written, or nothing is to be
+    stored."""
     losses: int = 0
     """Connections to a broker that were lost."""
     trouble: str | None = None

@@ -1,4 +1,4 @@
-"""Topics that the broker denies, for good or for now."""
+"""Topics that the broker denies, permanently or temporarily."""
 
 import asyncio
 from collections.abc import Callable
@@ -18,7 +18,7 @@ class DeniedTopics:
 
     Args:
         delivery: The topics are named there.
-        say_again: Has all that is retained said once more.
+        say_again: Sends all retained messages again.
         first_delay_s: From a refusal for now to that; doubles with each time [s].
     """
 
@@ -38,7 +38,7 @@ class DeniedTopics:
         self._pauses.reset()
 
     def end(self) -> None:
-        """Nothing is said again."""
+        """Cancel pending repeats."""
         if self._again is not None:
             self._again.cancel()
             self._again = None

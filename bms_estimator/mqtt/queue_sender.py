@@ -47,8 +47,8 @@ class QueueSender:
     Args:
         outbox: What keeps them.
         delivery: It is counted there what waits and what never arrives.
-        refusals: Hears how the broker answers.
-        first_delay_s: Before what is refused for now is tried again; doubles with each time [s].
+        refusals: Receives the broker's results.
+        first_delay_s: Delay before a temporarily rejected message is retried; doubles with each time [s].
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class QueueSender:
         self._outbox.rewind()
 
     async def _try_oldest(self, connection: Connection) -> None:
-        """Try the oldest alone, so that nothing overtakes it, until the broker takes one or refuses it for good."""
+        """Retry the oldest message alone, so that none overtakes it, until the broker accepts or drops one."""
         while True:
             await asyncio.sleep(self._pauses.next_s())
             for oldest in await self._outbox.take(1):

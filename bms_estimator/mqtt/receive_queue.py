@@ -16,7 +16,7 @@ class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):
     """Queue of received messages, bounded in number and bytes; lost messages are logged at intervals.
 
     Args:
-        lose: Hears why and on which topic a message is lost.
+        lose: Called with reason and topic of each lost message.
         most_bytes: Of a message with its topic.
         maxsize: Messages.
     """
@@ -26,7 +26,7 @@ class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):
         self._lose, self._most_bytes = lose, most_bytes
 
     def put_nowait(self, item: aiomqtt.Message) -> None:
-        """Take a message, or say that it is lost."""
+        """Take a message, or report its loss."""
         topic = item.topic.value
         if len(topic) + len(item.payload) > self._most_bytes:
             self._lose("too_long", topic)

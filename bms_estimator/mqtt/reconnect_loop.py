@@ -77,7 +77,7 @@ class ReconnectLoop:
         return since_s is not None and loop.time() - since_s >= MIN_CONNECTION_S
 
     def _say(self, broker: Broker, event: str, errors: BaseException) -> None:
-        """Log why; a broker that is away for days says the same each half minute."""
+        """Log why; an absent broker would give the same line each half minute for days."""
         while isinstance(errors, BaseExceptionGroup):
             errors = errors.exceptions[0]
         reason, now_s = str(errors), asyncio.get_running_loop().time()

@@ -21,7 +21,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 MOST_WAITING = 2000
 """Messages that wait to be read: a broker sends all that is retained at once, some twenty of each device."""
 MOST_BYTES = 65_536
-"""Nothing of ours is longer: ``schema`` is a quarter of it."""
+"""Maximum length of a message: ``schema`` has a quarter of it."""
 REASONS = {"too_long": f"longer than {MOST_BYTES} bytes", "overflow": "faster than they are read"}
 LOG_S = 60.0
 """Minimum time between two log lines on dropped messages [s]."""
@@ -33,12 +33,12 @@ log = structlog.get_logger(__name__)
 
 
 class Subscriber:
-    """Hears ``<base_topic>/#`` while the context lasts.
+    """Receives ``<base_topic>/#`` within the context.
 
     Args:
         settings: The brokers, and what opens their doors.
         heard: Called with each message of a device after it is stored.
-        linked: Called when the broker was reached, and when it is lost; ``lost_since`` says which.
+        linked: Called when the broker was reached, and when it is lost; ``lost_since`` tells them apart.
         connect: Makes a connection; over TCP when left out.
         left_out: Called with the name of a device that is not stored, because there are too many.
         clock: The clocks.
@@ -71,7 +71,7 @@ class Subscriber:
         self._task: asyncio.Task[None] | None = None
         self._loss_logged_s: float | None = None
         self.lost_messages = 0
-        """Number of messages that were too long or came faster than they were read."""
+        """Number of messages that were too long or arrived too fast."""
 
     @property
     def devices(self) -> Mapping[str, DeviceTopics]:
@@ -120,7 +120,7 @@ class Subscriber:
             await self._task
 
     async def _serve(self, connection: Connection) -> None:
-        """Hear until the connection is lost or the subscriber closes."""
+        """Receive until the connection is lost or the subscriber closes."""
         for topic, why in (await connection.subscribe(self._topic, [])).items():
             raise BrokerConnectionError(f"not allowed to read {topic}: {why}")
         self._say_link(None)

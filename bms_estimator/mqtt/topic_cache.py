@@ -1,6 +1,6 @@
 """Last publications of devices by topic: from messages to values. Pure: no connection, no clock.
 
-Whoever may publish may put anything there, so all that is kept is bounded, and a payload of any kind has its place.
+Any client may publish anything, so the memory is bounded and payloads of any kind are accepted.
 """
 
 import json
@@ -23,7 +23,7 @@ MAX_HIDDEN = 10_000
 SILENT_S = 30.0
 """A new device replaces the one that has been silent longest, if that is at least this [s]. A raised alarm does not wait."""
 ASKED = ("request", "response")
-"""First part of topics that do not say how a device is."""
+"""First level of topics without device state."""
 ALARM = "alarm/"
 """Prefix of alarm topics."""
 
@@ -83,11 +83,11 @@ class TopicCache:
 
         Args:
             topic: In full.
-            payload: As it came; empty: the topic holds nothing any more.
-            now_s: When it came, seconds since 1970.
+            payload: Received payload; empty: the topic holds nothing any more.
+            now_s: Arrival time, seconds since 1970.
 
         Returns:
-            The received message; None where it is nothing of a device, or more than is kept.
+            The received message; None for a topic without a device, or beyond the limits.
         """
         name, _, rest = topic.removeprefix(self._root).partition("/")
         if not topic.startswith(self._root) or not rest or rest.split("/")[0] in ASKED:
@@ -157,7 +157,7 @@ def _finite(token: str) -> float:
     """Parse a finite number of a payload.
 
     Raises:
-        ValueError: It is NaN or infinite, which JSON does not know.
+        ValueError: It is NaN or infinite, which is invalid JSON.
     """
     number = float(token)
     if not math.isfinite(number):

@@ -1,6 +1,7 @@
 """Access control of the page by host name and token. Pure.
 
-A page that others open in the same browser may send it here under a name of theirs (DNS rebinding): so the name must be ours.
+Another page in the same browser may send requests here under its own host name (DNS rebinding), so only this server's
+names are accepted.
 """
 
 import hashlib
@@ -33,7 +34,7 @@ class AccessControl:
 
     Args:
         hosts: Host names of this server, in addition to addresses, ``localhost`` and the machine's name.
-        token: What is to be shown; None: nothing.
+        token: Required token; None: nothing.
     """
 
     def __init__(self, hosts: Iterable[str] = (), token: str | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The newest text of each key, and who reads it. No connection, no clock of its own.
+"""The newest text of each key, and its readers. No connection, no clock of its own.
 
 A slow reader is sent only the newest text of each key.
 """
@@ -80,7 +80,7 @@ class Reader:
         self.closed = False
 
     def put(self, key: str) -> None:
-        """Add a key whose text has changed."""
+        """Mark a key whose text has changed."""
         self._waiting[key] = None
         self._due.set()
 
@@ -92,7 +92,7 @@ class Reader:
     async def next(self, longest_s: float) -> str:
         """Return what waits as one JSON object of at most ``MESSAGE_BYTES``, or one text if that is longer.
 
-        The rest waits for the next call. The result is empty when nothing came in ``longest_s``, or at the end.
+        The rest waits for the next call. The result is empty after ``longest_s`` without a change, or at the end.
         """
         try:
             async with asyncio.timeout(longest_s):

@@ -19,7 +19,7 @@ ALARM = "alarm/"
 ELEMENTS_OVER_SOC = frozenset({"r_s_ohm", "r_ts_ohm", "c_ts_farad", "r_tl_ohm", "c_tl_farad"})
 RECENT_STATES = 600
 RECENT_STEP_S = 1.0
-"""Interval of the states that are kept for the curves of later visitors [s]."""
+"""Interval of the states that are stored for the curves of later visitors [s]."""
 MAX_AHEAD_S = 86_400.0
 """Maximum lead of a state's time over the wall clock [s]."""
 SET_BACK_S = 60.0
@@ -48,7 +48,7 @@ class PackTopics(LatestValues):
 
     @property
     def packs(self) -> list[str]:
-        """Names of the packs, as they came."""
+        """Names of the packs, in the order of their first message."""
         return list(self._topics)
 
     def put(self, pack: str, topic: str, value: Any) -> None:

@@ -1,4 +1,4 @@
-"""The server of the live page of packs: a hub, and what was."""
+"""The server of the live page of packs: a hub, and the history."""
 
 import asyncio
 from collections.abc import Callable
@@ -34,8 +34,8 @@ class PageServer(WebServer):
 
     Args:
         settings: Where, and to whom.
-        hub: What is shown.
-        past: What was.
+        hub: Present state of the packs.
+        past: History of the packs.
         opened: Called with its address once it is served.
         patient: An address that is taken, or not there yet, is tried again; else it is an error.
 

@@ -24,7 +24,7 @@ class PageSink:
         pages: The servers of this process.
         settings: Where it is shown.
         pack: Its name.
-        history: Where its history is kept; None: nowhere.
+        history: Location of its history; None: nowhere.
     """
 
     def __init__(self, pages: "Pages", settings: PageSettings, pack: str, history: Path | None = None) -> None:
@@ -108,7 +108,7 @@ class _Page:
         self._started: asyncio.Task[PageServer] | None = None
 
     async def start(self) -> None:
-        """Once, whoever of the packs comes first."""
+        """Once, for the first pack."""
         if self._started is None:
             self._started = asyncio.ensure_future(self._server.__aenter__())
         await asyncio.shield(self._started)

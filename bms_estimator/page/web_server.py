@@ -62,7 +62,7 @@ class WebServer:
     Args:
         settings: Where, and to whom.
         files: Static files by the path of their URL.
-        newest: What is streamed from ``/events``.
+        newest: Content of the event stream ``/events``.
         handlers: What else is answered, by path.
         opened: Called with its address once it is served.
         patient: An address that is taken, or not there yet, is tried again; else it is an error.
@@ -174,7 +174,7 @@ class WebServer:
 
     @property
     def _cookie(self) -> str:
-        """Cookies are of a host, whatever the port."""
+        """Cookies belong to a host, regardless of the port."""
         return f"bms_page_{self._listening.port}"
 
     def _let_in(self) -> web.Response:

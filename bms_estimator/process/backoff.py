@@ -14,7 +14,7 @@ LONGEST_DELAY_S = 30.0
 
 
 class Backoff:
-    """Pauses that grow, each shortened by chance so that not all clients of a broker come back together.
+    """Increasing delays with jitter, so that not all clients of a broker reconnect at the same time.
 
     Args:
         first_s: The first [s].

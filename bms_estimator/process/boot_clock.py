@@ -23,7 +23,7 @@ class BootTimestamp:
     """Timestamp that outlives the process, and maybe a reboot.
 
     Attributes:
-        wall_s: Wall clock [s since 1970]. Without a battery it stands still while the machine is off.
+        wall_s: Wall clock [s since 1970]. Without a battery the clock stops while the machine is off.
         synchronised: Whether the wall clock is known to be right.
         boot_s: Since the machine was started, its sleep included [s].
         boot: Identifier of the boot; empty if unknown.
@@ -43,14 +43,17 @@ class BootTimestamp:
 
 
 def synchronised() -> bool:
-    """Return True if the wall clock counts as set: by the kernel, or by systemd-timesyncd if the kernel may not be asked."""
+    """Return True if the wall clock counts as synchronized.
+
+    By the kernel, or by systemd-timesyncd if the kernel may not be queried.
+    """
     only_read = ctypes.create_string_buffer(TIMEX_BYTES)
     state = int(ctypes.CDLL(None).adjtimex(only_read))
     return TIMESYNCD.exists() if state < 0 else state < TIME_ERROR
 
 
 def boot_timestamp() -> BootTimestamp:
-    """Now. The unit hides /proc/sys and says in ``BMS_BOOT_ID`` which start of the machine this is."""
+    """Now. The unit hides /proc/sys and passes the boot id in ``BMS_BOOT_ID``."""
     boot = os.environ.get("BMS_BOOT_ID") or (BOOT_ID.read_text(encoding="ascii") if BOOT_ID.exists() else "")
     return BootTimestamp(
         wall_s=time.time(),

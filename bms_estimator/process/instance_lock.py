@@ -33,7 +33,7 @@ def instance_lock(folder: Path, pack: str) -> Iterator[None]:
     because two services are worse than none. A container with a network of its own has names of its own.
 
     Args:
-        folder: Where the pack's state is kept.
+        folder: Folder of the pack's state.
         pack: Its name.
 
     Raises:

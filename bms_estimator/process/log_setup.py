@@ -56,7 +56,7 @@ def set_level(pack: str, level: LogLevel) -> None:
 
 
 def _talkative(_: object, __: str, line: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
-    """Drop what is below the level.
+    """Drop lines below the level.
 
     Raises:
         structlog.DropEvent: It is.

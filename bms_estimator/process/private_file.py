@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class UnsafeFileError(Exception):
-    """The file with a private file's name is not ours."""
+    """The file in place of a private file belongs to another user."""
 
 
 def read_private(path: Path, longest: int) -> bytes:

@@ -1,4 +1,4 @@
-"""sd_notify: what systemd wants to hear, on its datagram socket."""
+"""sd_notify: status messages for systemd on its datagram socket."""
 
 import os
 import socket
@@ -12,13 +12,13 @@ CREDENTIALS = Path("/run/credentials")
 class SystemdNotifier:
     """Sends states to the socket of ``NOTIFY_SOCKET``; does nothing without one.
 
-    One process may serve several packs. Systemd knows one service: a state is sent when all of them have it, since it was
-    sent last. So it is ready with the last of them, and alive while each is.
+    One process may serve several packs. Systemd knows one service, so a state is sent when all packs have reached it
+    since it was last sent. So it is ready with the last of them, and alive while each is.
 
     Args:
         packs: Names of the packs.
         environment: Where ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC`` are looked up.
-        doing: What is done with them, for people.
+        doing: Text for people.
     """
 
     def __init__(

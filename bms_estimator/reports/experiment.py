@@ -88,5 +88,5 @@ class Experiment:
 
     @property
     def unpublished(self) -> str:
-        """Why the printed numbers cannot come out."""
+        """Reason why the printed numbers cannot result."""
         return f"The thesis's recordings are not published. Its procedure was run on {self.on}."

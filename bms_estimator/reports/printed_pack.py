@@ -76,7 +76,7 @@ def current_errors_percent() -> dict[str, float]:
 
 
 def saturated_above_soc() -> float:
-    """SOC whose E_o of Table 8 is the end of the voltage sensor's range."""
+    """SOC at which E_o of Table 8 reaches the end of the voltage sensor's range."""
     e_o = np.array([emf(x, A) for x in GRID])
     return float(np.interp(printed_values.SENSOR_RANGE_V, e_o, GRID))
 

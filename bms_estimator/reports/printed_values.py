@@ -159,7 +159,7 @@ INFERRED_WEIGHTS = {
 }
 """Table: index: the weights that its printed estimate belongs to, where those printed beside it give another (E4, E24, E32)."""
 START_MEAN_S = {"5": 328.3, "10": 36_000.0}
-"""The means (3.19) from the first sample on over these times come out as the printed estimates of Tables 5 and 10 [s]."""
+"""Durations from the first sample over which the means (3.19) equal the printed estimates of Tables 5 and 10 [s]."""
 FREE_PARAMETERS = {"5": 8, "10": 7}
 """Fitted to the estimates of Tables 5 and 10: the time of ``START_MEAN_S``; of each pair in ``INFERRED_WEIGHTS`` the sum, and
 the ratio as well unless it is the printed one (a10 to a12 of Table 5)."""

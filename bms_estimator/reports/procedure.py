@@ -1,8 +1,9 @@
 """The experimental protocol of chapter 5 on captures: steps 1 to 3, validation, SOC by interpolation.
 
-The captures are real ones, or those of the simulated pack. Each result is made when it is first asked for.
+The captures are real ones, or those of the simulated pack. Each result is computed on first use.
 
-No parameter comes from the capture that it is validated on. Step 1 takes the relaxation tests alone; step 2 the constant
+No parameter is estimated from the capture that validates it. Step 1 takes the relaxation tests alone; step 2 the
+constant
 load of the smallest current, with bounds that no capture has a part in; step 3 the constant loads up to
 0.6C and the loads of the relaxation tests, but for a constant load's own validation all others.
 """
@@ -65,7 +66,7 @@ class Capture:
 
     Attributes:
         name: What to call it.
-        kind: What it serves for.
+        kind: Purpose of the capture.
         samples: Dtype ``SAMPLE``, raw.
     """
 

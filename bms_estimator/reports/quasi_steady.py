@@ -1,7 +1,8 @@
 """Response of (3.1)-(3.3) to a constant current with true parameters: errata 15, 16 and 27.
 
-Both branches are driven by one u, where the cell's are by i/C_ts and i/C_tl. Once x2^, x3^ change slowly, u = x2^/tau_ts =
-x3^/tau_tl: they stand as tau_ts to tau_tl, the cell's as R_ts to R_tl. And u = -N e is not zero, so e is not.
+Both branches are driven by one u, where the cell's are by i/C_ts and i/C_tl. When x2^, x3^ change slowly, u =
+x2^/tau_ts = x3^/tau_tl: their ratio is tau_ts to tau_tl, the cell's R_ts to R_tl. And u = -N e is not zero, so e is
+not.
 """
 
 from dataclasses import dataclass

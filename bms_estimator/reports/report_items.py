@@ -8,7 +8,7 @@ class Reproduction(Enum):
     """Reproduction of a table or figure."""
 
     FITTED = "fitted"
-    """Comes out as printed once errata are corrected and free parameters, which the thesis does not print, are fitted to it."""
+    """Agrees with print after corrections and after fitting free parameters that the thesis does not print."""
     RECOMPUTED = "recomputed"
     """Computed from printed values, compared with nothing: the thesis prints no value of it."""
     NO_DATA = "no data printed"
@@ -58,7 +58,7 @@ class Figure:
         title: Its caption.
         svg: The plot, one ``<svg>`` element; empty for a diagram or photograph.
         verdict: What became of it.
-        reason: What it shows, where it differs from print and why.
+        reason: Content, and difference from print with its reason.
     """
 
     key: str
@@ -74,7 +74,7 @@ Item = Table | Figure
 
 
 def name(item: Item) -> str:
-    """Table 5, Figure 19; what is not in the thesis by its key alone."""
+    """Table 5, Figure 19; an item that is not in the thesis by its key alone."""
     return item.key if item.verdict is Reproduction.ADDED else f"{item.kind} {item.key}"
 
 

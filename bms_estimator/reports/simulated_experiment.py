@@ -1,9 +1,10 @@
 """A simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5, seen through the simulated sensor chain.
 
 The pack has the open-circuit voltage of Table 8, the R_s of Table 9 and, as Fig. 29 compares with, the R_ts, R_tl, C_ts,
-C_tl of Chen and Mora: they lie within the bounds of Table 10 but not at their Lemma 4.1.3 limits. Loads are the resistors of
-5.1, whose currents are not the printed ones (E21); the bulb is the resistor that draws its printed current. The voltage goes
-through a divider, the current through a +-10 A sensor; noise is half a step either way, in addition to rounding.
+C_tl of Chen and Mora: they lie within the bounds of Table 10 but not at their Lemma 4.1.3 limits. Loads are the
+resistors of 5.1, whose currents differ from the printed ones (E21); the bulb is the resistor that draws its printed
+current. The voltage passes a divider, the current a +-10 A sensor; noise is half a step either way, in addition to
+rounding.
 """
 
 from dataclasses import dataclass

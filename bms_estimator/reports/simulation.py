@@ -32,7 +32,7 @@ STEP_S = 0.01
 CURRENT_A = 0.275
 """1C of the 275 mAh cell (E12)."""
 SMALL_CURRENT_A = 0.0275
-"""C/10, for step 2: Algorithm 1 asks for a very small current; the thesis does not print the one it used."""
+"""C/10, for step 2: Algorithm 1 needs a very small current; the thesis does not print the one it used."""
 R_S_CURRENTS_A = (0.1, 0.275, 0.55)
 """Currents for (4.2) [A]; the thesis does not print its own."""
 LOWEST_SOC = 0.05
@@ -123,7 +123,7 @@ def table_5_cell() -> CellModel:
 
 
 class Simulation:
-    """All runs of the simulation part, each made when it is first asked for."""
+    """All runs of the simulation part, each computed on first use."""
 
     def __init__(self) -> None:
         self.cell = table_5_cell()

@@ -1,7 +1,8 @@
 """Claims of chapters 4 to 7 about the thesis's recordings, tested on other captures.
 
-A claim holds when what is printed is reached on more than half of the captures. Of SOC and of RC products nothing is printed
-that could be a limit; those are ours, and so is the limit 1 for the order of the dynamic and the static model.
+A claim holds if its printed value is reached on more than half of the captures. Of SOC and of RC products nothing is
+printed
+that could be a limit; those are chosen here, and so is the limit 1 for the order of the dynamic and the static model.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,8 +31,8 @@ class Result:
 
     Attributes:
         capture: Its name.
-        found: What was measured, in the claim's unit.
-        limit: What it must not exceed.
+        found: Measured value, in the claim's unit.
+        limit: Limit of the value.
     """
 
     capture: str
@@ -51,7 +52,7 @@ class Claim:
     Attributes:
         key: Mark in the tables: "mean, constant loads".
         where: Table or figure.
-        criterion: What has to be true of more than half of the captures.
+        criterion: Condition for more than half of the captures.
         results: Of each capture that the claim can be tested on.
     """
 

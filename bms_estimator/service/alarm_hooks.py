@@ -32,7 +32,7 @@ FIRST_RETRY_S = 0.5
 PublishRaw = Callable[[str, bytes], None]
 """Publishes a message on a topic."""
 SetRelay = Callable[[Relay], Awaitable[None]]
-"""Tells the board its relay's level. Raises UserError when it does not take it."""
+"""Sends the level of the board's relay. Raises UserError when it does not take it."""
 
 log = structlog.get_logger(__name__)
 
@@ -48,13 +48,13 @@ class AlarmHooks:
     """All hooks of a pack; a context manager.
 
     Args:
-        hooks: What is done, and when.
+        hooks: Configured hooks.
         device: Name of the pack.
-        say: Publishes; None: there is no broker.
+        say: Publishes a message; None: there is no broker.
         switch: Switches the relay; None: the source has none.
 
     Raises:
-        UserError: A hook needs what is not there.
+        UserError: A hook needs something that is missing.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class _Hook:
         self._raised = {name for name in raised if self.covers(name)}
 
     def close(self) -> None:
-        """No more will come."""
+        """End: no more alarms follow."""
         self._closing = True
         self._wake.set()
 
@@ -296,7 +296,10 @@ class _RelayHook(_Hook):
         return Relay(high, None if kept else silent == "high", 0 if kept else self._hook.silent_s)
 
     def on_alarm_change(self, change: Change) -> None:
-        """Follow the alarms, whatever the hook is ``on``: the level depends on whether one of them counts as raised."""
+        """Follow the alarms regardless of the hook's ``on``.
+
+        The level depends on whether one of them counts as raised.
+        """
         before = self._wanted
         job = self._job(change)
         if job is not None and self._wanted != before:
@@ -321,7 +324,7 @@ class _RelayHook(_Hook):
 
 
 def unusable(settings: Settings) -> list[str]:
-    """One line for each hook whose program is not there, and for each relay without a stated level for a silent service.
+    """One line for each hook without its program, and for each relay without a configured level for a silent service.
 
     Raises:
         UserError: A hook needs a broker or a relay that is not there.

@@ -1,4 +1,4 @@
-"""Looks for alarms while samples come, and while none does; changes are logged, and passed to a callback."""
+"""Evaluates alarms while samples arrive, and while none do; changes are logged, and passed to a callback."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from bms_estimator.telemetry.alarms import AlarmEvaluator, Change, SampleCounts
 from bms_estimator.telemetry.health import sample_counters, suspicions
 
 UNUSABLE = "not_finite", "range", "saturated"
-"""Kinds of dropped samples that tell of a fault of the sensor."""
+"""Kinds of dropped samples that indicate a sensor fault."""
 JUDGE_S, JUDGE_ROWS = 0.1, 1024
 """Interval [s] and number of samples after which samples are checked; a check of each block would take as long as the
 estimate."""

@@ -32,7 +32,7 @@ class CheckpointWriter:
         checkpoint: Where to.
         estimator: Read only.
         publisher: Gets the result.
-        tally: What is counted over restarts.
+        tally: Totals over restarts.
         restarts: Starts that found a checkpoint.
         every_s: How often is saved at least [s].
 

@@ -1,4 +1,4 @@
-"""The service of a pack whose samples are only sent, as ``bms-estimator edge`` starts it."""
+"""The service of a pack whose samples are only sent, for ``bms-estimator edge``."""
 
 import asyncio
 from pathlib import Path
@@ -36,7 +36,7 @@ async def serve_edge(
 
     Args:
         settings: The pack's settings, with ``[edge]``.
-        folder: Where blocks are kept.
+        folder: Folder of the blocks.
         stop: Set by someone else to end as a signal does.
         notifier: Is notified that the loop is ready and alive.
 

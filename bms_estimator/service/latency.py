@@ -22,7 +22,10 @@ class Latency:
         self._most_s = max(self._most_s, latency_s)
 
     def take(self) -> tuple[float, float, float] | None:
-        """Median, 99th percentile (up to a fifth too long) and longest [s] since the last call; None when nothing came."""
+        """Median, 99th percentile (up to a fifth too long) and longest [s] since the last call.
+
+        None without a sample.
+        """
         counts, most_s = self._counts, self._most_s
         self._counts, self._most_s = [0] * BINS, 0.0
         if not any(counts):

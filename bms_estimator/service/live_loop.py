@@ -65,19 +65,19 @@ async def run_estimation_loop(
     Args:
         settings: The pack's settings.
         cell: The pack as one object (``CellModel.pack``).
-        source: Where samples come from; opened and closed here.
+        source: Supplies samples; opened and closed here.
         sinks: Where snapshots go; opened and closed here.
         stop: Set to end cleanly.
         checkpoint: Where the state outlives a restart; None: it does not.
-        requests: Where this loop offers what it can answer.
+        requests: Dispatcher at which this loop registers its handlers.
         delivery: Counters of sent messages and received requests.
         current_zero: Has the board take the present current as zero; None: it cannot.
         notifier: Is notified that the loop is ready and alive.
         clock: The clocks.
-        pulse: Whether the source lives; None: it does not say.
+        pulse: Whether the source lives; None: not reported.
         recording: State of a recording; None where nothing is recorded.
-        hooks: What is done of alarms; opened and closed here.
-        edge: Gets all samples, too, as they come; None: they are sent nowhere. Opened and closed by who made it.
+        hooks: Alarm hooks; opened and closed here.
+        edge: Receives all samples as well; None: they are sent nowhere. Opened and closed by its owner.
 
     Returns:
         The estimator as the last sample left it.
@@ -167,7 +167,7 @@ async def _estimate(
 
 
 async def _keep_alive(publisher: Publisher, notifier: SystemdNotifier, name: str, clock: Clock) -> None:
-    """Publish missing samples, and notify the watchdog while samples come or the source still tries."""
+    """Publish missing samples, and notify the watchdog while samples arrive or the source still tries."""
     longest_s = notifier.watchdog_s / 3.0 or publisher.period_s
     said, online, said_s = "", False, -math.inf
     while True:
@@ -193,7 +193,7 @@ async def _measure_lag(publisher: Publisher) -> None:
 
 
 def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clock) -> tuple[RunCounters, str]:
-    """Continue from a valid checkpoint. Returns what the runs before have counted, and what was done."""
+    """Continue from a valid checkpoint. Returns the totals of earlier runs, and a description of what was done."""
     if checkpoint is None:
         return RunCounters(0, new_totals(clock.wall())), "off"
     found = checkpoint.load()
@@ -224,7 +224,7 @@ def _set_soc(estimator: Estimator, soc: float) -> float:
     """Set the SOC on request.
 
     Returns:
-        What it was.
+        The previous SOC.
 
     Raises:
         UserError: It does not exist.

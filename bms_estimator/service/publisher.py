@@ -41,7 +41,7 @@ from bms_estimator.telemetry.state import make_info_payload, make_state_payload
 log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
-"""Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
+"""Minimum interval of the payloads for parameters, health and info, at any publish rate [s]."""
 UNTENDED_S = 20.0
 """Time without a run of a source's task after which it counts as hung [s]: a missing port is tried at least each 10
 s."""
@@ -57,22 +57,22 @@ class Publisher:
         source: Its counters, message and board are read.
         sinks: Where snapshots go.
         clock: The clocks.
-        tally: What is counted over restarts; default: new totals.
+        tally: Totals over restarts; default: new totals.
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the checkpoint at start.
         delivery: Counters of sent messages and received requests.
-        pulse: Whether the source lives; None: it does not say.
+        pulse: Whether the source lives; None: not reported.
         recording: State of a recording; None where nothing is recorded.
         edge: Of raw samples on their way to a fleet; None where none are sent.
         hooks: Successes and failures of alarm hooks; None without hooks.
-        on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
+        on_alarm: Called with each alarm that is raised or cleared.
 
     Attributes:
         watch: Its alarms.
         checkpoint: Result of restoring the last checkpoint.
         disk_free_mib: Where it is [MiB].
         log_lines_lost: Since start.
-        kept: What has flowed, as the next start will find it; None: nothing will be found.
+        kept: Charge and energy as the next start will find them; None: nothing will be found.
         latest: The last estimate that there was.
         snapshot: The last snapshot.
     """
@@ -130,7 +130,7 @@ class Publisher:
 
     @property
     def wait_s(self) -> float:
-        """Return the time until a snapshot is overdue, which shows that no samples come [s]."""
+        """Return the time until a snapshot is overdue, which shows that no samples arrive [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
     def add(self, block: SampleBlock, trace: TraceBlock) -> None:

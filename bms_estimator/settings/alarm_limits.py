@@ -79,11 +79,11 @@ DIGITS = 9
 """0.1 - 0.08 is to be 0.02."""
 MOST_DISCHARGE = 5.0
 """Default maximum discharge current as a multiple of the capacity per hour; a generic cell's file accepts readings
-far above what most such cells stand for long."""
+far above the continuous limit of most such cells."""
 
 
 class _Default(NamedTuple):
-    """An alarm's limit and what it ends at, as the pack has them; None: not watched unless it is set."""
+    """An alarm's limit and clear limit for the pack; None: not watched unless it is set."""
 
     limit: float | None
     clear: float | None

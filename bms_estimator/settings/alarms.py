@@ -1,4 +1,4 @@
-"""``[alarms]`` of a pack's settings: what is watched, from where on, for how long."""
+"""``[alarms]`` of a pack's settings: limits, delays and hooks."""
 
 from string import Template
 from typing import Annotated, Any, Literal, Self, get_args

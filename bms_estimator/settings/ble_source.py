@@ -1,4 +1,4 @@
-"""A BMS that is asked over Bluetooth: ``[source]`` with ``kind = "ble"``."""
+"""A BMS that is polled over Bluetooth: ``[source]`` with ``kind = "ble"``."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self
@@ -43,7 +43,7 @@ class BleSource(PolledSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The library counts charge as positive, whatever the BMS does."""
+        """The library counts charge as positive for every BMS."""
         return {
             "current_sign": "charge_positive",
             "voltage_resolution_v": STEP_V,

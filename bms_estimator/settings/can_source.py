@@ -62,7 +62,7 @@ class Signal(Strict):
 
 
 class CellSignals(Signal):
-    """Voltages of cells: one after the other in a frame, or signals that a number tells apart."""
+    """Cell voltages: consecutive in a frame, or in numbered signals."""
 
     count: Annotated[int, Field(ge=1, le=96)] = Field(
         default=1, description="so many of the same length follow each other; or numbers from first for {} in signal"

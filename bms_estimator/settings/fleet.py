@@ -69,7 +69,7 @@ class TlsSettings(Strict):
 
 
 class TenantSettings(Strict):
-    """One who has streams, workers and packs of his own."""
+    """A tenant with separate streams, workers and packs."""
 
     raw_gb: Gigabytes | None = Field(default=None, description="as server.raw_gb, which holds when left out")
     raw_days: Annotated[float, Field(gt=0, le=3660)] | None = Field(default=None, description="as server.raw_days")

@@ -166,7 +166,7 @@ class MqttSource(PolledSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """Sign of the current and steps of what is shown, as the profile has them."""
+        """Current sign and resolution of the profile."""
         if self.profile is None:
             return {"voltage_resolution_v": 0.01}
         profile = PROFILES[self.profile]

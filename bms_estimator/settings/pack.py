@@ -1,4 +1,4 @@
-"""The settings of one pack: what ``pack.toml`` holds. Values are SI, the unit stands in the key."""
+"""The settings of one pack: what ``pack.toml`` holds. Values are in SI units, which the keys contain."""
 
 from pathlib import Path
 from typing import Annotated, Literal

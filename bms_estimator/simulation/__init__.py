@@ -1,1 +1,1 @@
-"""Boards and packs that are not there: what is at the other end of the line, for trying out, the demo and tests."""
+"""Simulated boards and packs at the other end of the line, for trials, the demo and tests."""

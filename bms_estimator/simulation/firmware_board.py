@@ -21,8 +21,8 @@ class FirmwareBoard:
 
     Args:
         build: Folder of the built firmware.
-        readings: What is at its pins: by time [s], or a file with ``time_s,current_a,voltage_v[,temperature_c]``, each
-            line held until the next.
+        readings: Signal at its pins: a function of time [s], or a file with
+            ``time_s,current_a,voltage_v[,temperature_c]``, each line held until the next.
         speed: Board seconds per second; ``math.inf``: as fast as the host reads.
         avcc_mv: Supply and reference of its converter.
         noise_lsb: Noise of its converter [steps].

@@ -1,4 +1,4 @@
-"""A BMS without hardware: answers on a pseudo-terminal when it is asked, faults at will."""
+"""A simulated BMS: responds to requests on a pseudo-terminal, with optional faults."""
 
 import math
 import random
@@ -32,11 +32,11 @@ class SimulatedBms(SimulatedMeter):
 
     Args:
         protocol: A key of ``BMS_ANSWERS``.
-        signal: What is at its terminals.
+        signal: The simulated pack.
         cells: In series.
         speed: Its seconds per second.
-        soc: What it takes for the state of charge, 0..1.
-        capacity_ah: What it takes for the capacity.
+        soc: SOC that it reports, 0..1.
+        capacity_ah: Capacity that it reports.
         seed: Of the differences between the cells, and of noise.
 
     Raises:

@@ -1,6 +1,7 @@
 """Battery monitors and batteries without hardware: they speak their makers' protocols on a pseudo-terminal.
 
-Beside ``virtual_board``, which speaks the firmware's. They round as the device does, and tell what the pack has at the time.
+Beside ``virtual_board``, which speaks the firmware's. They round as the device does, and report the pack at that
+time.
 """
 
 import asyncio
@@ -21,7 +22,7 @@ class SimulatedMeter(ABC):
     """A device on a pseudo-terminal. Open it as a context manager, then ``run`` it.
 
     Args:
-        signal: What is at its sensors.
+        signal: The simulated pack.
         speed: Its seconds per second.
     """
 
@@ -111,7 +112,7 @@ class SimulatedMeter(ABC):
 
 
 class SimulatedVeDirect(SimulatedMeter):
-    """A SmartShunt: a block each second, and one of history that tells nothing of now."""
+    """A SmartShunt: a block each second, and a history block without present values."""
 
     period_s = 1.0
 
@@ -167,7 +168,7 @@ class SimulatedPylontech(SimulatedMeter):
     """Console of one battery with a number of cells.
 
     Args:
-        signal: What is at its sensors.
+        signal: The simulated pack.
         speed: Its seconds per second.
         cells: In series.
     """

@@ -15,7 +15,7 @@ STEP_SHARE = 0.1
 STEP_S = 3.0
 """Two samples further apart do not show the ohmic step [s]."""
 LEAST_STEPS = 5
-"""Fewer steps do not tell the sign."""
+"""Fewer steps do not show the sign."""
 LONG_REST_S = 300.0
 """Length of a rest after which the voltage is near the OCV [s]."""
 SOC_OFF, VOLTAGE_OFF_V = 0.1, 0.1

@@ -13,7 +13,7 @@ from bms_estimator.model.sample import SampleBlock
 NEIGHBOURS = 2
 """Number of neighbors on each side by which a glitch is recognized."""
 LEAST_SAMPLES = 2 * NEIGHBOURS + 1
-"""A capture with fewer good samples says nothing."""
+"""Minimum number of good samples of a capture."""
 SPIKE_V = 0.03
 """A voltage off its neighbours' median by more than this, per cell, and more than the current explains, is a glitch [V]."""
 SPIKE_C = 0.1

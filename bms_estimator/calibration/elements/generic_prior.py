@@ -10,7 +10,7 @@ from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells,
 INSIDE = 0.1, 0.95
 """SOC at which curves are compared: their ends are steep."""
 RESTS_STD = 0.35
-"""Relative standard deviation of resistances that rests tell, and typical cells how they are shared."""
+"""Relative standard deviation of resistances from rests, divided as in typical cells."""
 
 
 def nearest_generic_cell(soc: Floats, ocv_v: Floats, capacity_ah: float, series_count: int) -> CellModel:

@@ -1,7 +1,7 @@
 """Identification of a cell from captures: the ladder of the filter, a1..a15 of its two branches, a better OCV.
 
-The fit is that of ``ladder_fit``. Whether it is any good is asked of the estimator itself: replays cut in mid-load, before
-and after. A capture beside which others of about its temperature were given is held back from the fit that it judges.
+The fit is that of ``ladder_fit``. The estimator judges the result: replays started in mid-load, before and after. A
+capture beside which others of about its temperature were given is held back from the fit that it judges.
 """
 
 from collections.abc import Sequence
@@ -58,9 +58,10 @@ OCV_STEP = 0.01
 LEAST_SLOPE_V = 1e-3
 """The corrected table rises at least so steeply, per cell and 1 of SOC [V]."""
 SPAN_K = 10.0
-"""Temperatures that differ by less tell nothing of activation energies and dE/dT [K]."""
+"""Minimum temperature difference that gives activation energies and dE/dT [K]."""
 FULL_V, COLD_K = 0.03, 5.0
-"""A rest in the cold, so far from 25 C, tells the SOC no better than this, per cell [V, K]: so near to full it is full."""
+"""Error of the SOC from a rest in the cold, per cell [V], and the distance from 25 C from which on it applies [K]: a
+rest this close to full counts as full."""
 LOWEST_C, HIGHEST_C = -45.0, 85.0
 """Temperatures of cells [C]."""
 PERCENTILES = (2.0, 98.0)
@@ -68,15 +69,15 @@ PERCENTILES = (2.0, 98.0)
 LADDER_STD = 0.1
 """Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
 TYPICAL_STD = 0.3
-"""A ladder less sure than this was not identified: it does not know its temperatures."""
+"""A ladder with a larger standard deviation was not identified, so its temperature range is unknown."""
 MIDDLE_SOC, SHAPE = 0.4, (0.2, 20.0)
-"""Above it is the middle; no part is taken to be smaller or larger than this over what it is there."""
+"""Above it is the middle; limits of each part relative to its value there."""
 JUDGED_SOC = 0.1
 """RMS errors are given above it."""
 COUNT_PASSES = 3
 """Fits from which the miscount of each capture is found: a knee is not linear."""
 NO_WORSE = 1.05
-"""Scores that differ by less than this factor are the same: four replays do not tell more."""
+"""Scores within this factor are equal, because four replays do not resolve more."""
 
 
 @dataclass(frozen=True)
@@ -84,12 +85,12 @@ class CaptureFit:
     """Result of the fit for one capture.
 
     Attributes:
-        name: What it is called.
+        name: Name of the capture.
         samples: How many it had.
         glitches: How many were left out as glitches.
         initial_soc: At the first sample, 0..1.
         temperature_c: Lowest and highest [C]; None without a sensor.
-        miscount: By how much more charge was moved than its samples say, relative; the SOC of the fit has it.
+        miscount: Relative charge that the samples miss; the SOC of the fit has it.
         voltage_rms_v: What the ladder leaves, each second weighing the same, SOC above 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
         score_after: The same with the identified one.
@@ -142,7 +143,7 @@ class Run:
     """Additional charge moved beyond the capture's, relative; ``soc`` includes it."""
 
     def recounted(self, more: float) -> "Run":
-        """Return a copy whose miscount is larger by ``more``."""
+        """Return a copy with the miscount increased by ``more``."""
         miscount = self.miscount + more
         moved = (self.soc - self.soc[0]) / (1.0 + self.miscount)
         return replace(self, soc=self.soc[0] + (1.0 + miscount) * moved, miscount=miscount)
@@ -170,7 +171,8 @@ def identify(
 
     Args:
         captures: Raw samples, rows of dtype ``SAMPLE``; each should start from rest.
-        cell: Capacity, limits and OCV; its ladder, if it has one, says what captures of one temperature do not.
+        cell: Capacity, limits and OCV; its ladder, if it has one, supplies what captures at one temperature do not
+            show.
         refine_ocv: Correct the open-circuit voltage as well where that makes the replays better.
         initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
         temperature_c: Of captures without a sensor; None: 25 C.
@@ -249,7 +251,7 @@ class _Candidate:
         return any(k != j and abs(mean_c[k] - mean_c[j]) < SPAN_K for k in range(len(mean_c)))
 
     def outcome(self, before: Floats, after: Floats, left_out: tuple[str, ...]) -> Identification:
-        """All there is to say."""
+        """Text of the result."""
         fits = tuple(
             CaptureFit(
                 name=run.load.name,
@@ -390,8 +392,8 @@ def _ocv_error(cell: CellModel) -> Floats:
 def _middle_error(cell: CellModel) -> Floats:
     """Return the error of the curve alone at ``EVEN`` [V], without the minimum error of the hysteresis.
 
-    Drives are discharges: they would take what is wrong of the hysteresis for an error of the curve, and charges would find
-    it twice as far away.
+    Drives are discharges: they would attribute an error of the hysteresis to the curve, and charges would see it with
+    the opposite sign.
     """
     error_v = _ocv_error(cell)
     if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:

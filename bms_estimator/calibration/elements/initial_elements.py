@@ -1,7 +1,7 @@
-"""A first idea of a cell's elements from the rests of a relaxation test: one value each, whatever the SOC.
+"""Initial elements of a cell from the rests of a relaxation test: one value each for all SOC.
 
-A fit of a whole capture starts from these. At the end of a load the voltage jumps by i R_s and then rises in two
-exponentials, whose sizes and time constants are the two RC branches: (2.2), (2.3) with i = 0.
+A fit of a whole capture starts from these. At the end of a load the voltage steps by i R_s and then rises in two
+exponentials, which give the two RC pairs: (2.2), (2.3) with i = 0.
 """
 
 from dataclasses import dataclass

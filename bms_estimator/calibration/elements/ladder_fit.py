@@ -4,7 +4,8 @@
 
 with x_0 the current, x_k the current filtered by branch k, g the Arrhenius factors of the ladder's two parts, w, s
 piecewise linear over SOC, d a correction of the open-circuit voltage (cubic spline) and u one of its growth with
-temperature. All is linear in what is sought. u also takes what a cold cell has not relaxed after half an hour: left to the
+temperature. The problem is linear in all unknowns. u also takes what a cold cell has not relaxed after half an hour:
+left to the
 slow branches, it makes the drop of a drive in the cold twice too large.
 
 What a capture weighs does not depend on how many rows it has: a row weighs the time since the row before over the time
@@ -151,7 +152,7 @@ class Prior:
         scale_ohm: Of the resistances [ohm].
         series: Cells in series.
         shapes: Shape (2, RESISTANCES, SOC_NODES.size), how the weak and the strong part of each resistance usually go along SOC.
-        weak_share: Shape (RESISTANCES, SOC_NODES.size), of each resistance; None: the captures tell.
+        weak_share: Shape (RESISTANCES, SOC_NODES.size), of each resistance; None: only the captures count.
     """
 
     ocv_error_v: Floats

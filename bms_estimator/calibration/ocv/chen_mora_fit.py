@@ -16,11 +16,11 @@ from bms_estimator.model.cell import ChenMoraOcv
 NAMES = ("a16", "a17", "a18", "a19", "a20", "a21")
 LOWER = np.array([1e-6, 5.0, 1e-6, -np.inf, -np.inf, -np.inf])
 """Least a16..a21. The thesis has all positive; the cubic of a real cell may want another sign of a19..a21, so those are
-free: the NCR18650 points fit to 9.6 mV RMS, with all positive to 10.6. Below an exponent of 5 the exponential reaches
-over all SOC, and nothing tells it from the cubic."""
+free: the NCR18650 points fit to 9.6 mV RMS, with all positive to 10.6. Below an exponent of 5 the exponential covers
+all SOC and cannot be distinguished from the cubic."""
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
-"""Above an exponent of 300 the exponential is gone at SOC 0.01. a16 is bounded by the highest point: E_o(0) is
-not far below 0 V, however steep the last points are and wherever they end."""
+"""Above an exponent of 300 the exponential is gone at SOC 0.01. a16 is bounded by the highest point: E_o(0) is not
+far below 0 V, even if the last points are steep."""
 AT_BOUND_V = 1e-5
 """An amplitude this near to its bound is at it: no converter reads so little [V]."""
 EXPONENTS = np.geomspace(5.0, 300.0, 60)

@@ -33,7 +33,7 @@ def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
     """Return the drop of the voltage below E_o(SOC) at 25 C, with dE/dT and hysteresis [V].
 
     Args:
-        cell: Its ladder counts, else its a1..a15; these know no temperature.
+        cell: Its ladder counts, else its a1..a15; these do not depend on the temperature.
         load: From rest.
         soc: Shape (n,), counted.
     """

@@ -12,8 +12,8 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 
 RELAXED_V = 0.002
-"""Systematic error of rests of a warm cell [V]: relaxation goes on for hours after the quarter of an hour that is
-extrapolated."""
+"""Systematic error of rests of a warm cell [V]: relaxation continues for hours after the extrapolated quarter of an
+hour."""
 COLD_V, DOUBLING_K = 0.012, 25.0
 """Additional error in the cold [V]: 12 mV at 0 C, 20 mV at -10 C, of rests up to an hour; relaxation takes twice as
 long for each ``DOUBLING_K``."""
@@ -102,7 +102,7 @@ def coldness(temperature_c: Floats) -> Floats:
 
 
 def joined(sources: Sequence[Points]) -> Points:
-    """Several sources as one set, in the order of SOC, numbered as they come."""
+    """Join several sources to one set, in the order of SOC, numbered by source."""
     soc = np.concatenate([one.soc for one in sources])
     order = np.argsort(soc, kind="stable")
 

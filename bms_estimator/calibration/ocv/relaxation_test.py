@@ -25,7 +25,7 @@ from bms_estimator.model.sample import SampleBlock
 SHORTEST_REST_S = 30.0
 """A shorter rest shows the ohmic step and not the relaxation [s]."""
 LARGEST_STD_V = 0.02
-"""A rest whose extrapolation is less certain than this, per cell in series, gives no point [V]."""
+"""A rest whose extrapolation is less certain than this, per cell in series, is rejected [V]."""
 LATE_FROM = 0.5
 """The extrapolation fits this latter part of a rest: the fast branch is over there."""
 SHORTEST_TAU, LONGEST_TAU, TAU_GRID = 0.05, 0.7, 40
@@ -83,7 +83,7 @@ class RelaxationTest:
     """Open-circuit voltage from the rests of a capture.
 
     Attributes:
-        name: Where it came from.
+        name: Name of the capture.
         rests: In the order of time, those good for a point only.
         rejected: Why other rests gave no point, one line each.
         glitches: Samples dropped as faults of the instrument.
@@ -105,7 +105,7 @@ class RelaxationTest:
 
     @property
     def temperature_c(self) -> float:
-        """Mean of the rests that tell it [C]; NaN without a sensor."""
+        """Mean of the rests with a temperature [C]; NaN without a sensor."""
         told = [rest.temperature_c for rest in self.rests if np.isfinite(rest.temperature_c)]
         return float(np.mean(told)) if told else float("nan")
 
@@ -166,7 +166,7 @@ def relaxation_test(
 def find_rests(
     good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], series_count: int
 ) -> tuple[list[Rest], list[str]]:
-    """Return the rests of a capture that give a point, and one line for each other rest that says why it does not.
+    """Return the usable rests of a capture as points, and a reason for each rejected rest.
 
     Args:
         good: Dtype ``SAMPLE``, without glitches.

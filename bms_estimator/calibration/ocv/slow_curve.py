@@ -1,6 +1,6 @@
-"""Slow curves: discharges and charges at a small constant current, and what they say of the open-circuit voltage.
+"""Slow curves: open-circuit voltage from discharges and charges at a small constant current.
 
-Halfway between the discharge and the charge of one cell lies its open-circuit voltage; half of what they differ by, less
+Halfway between the discharge and the charge of one cell lies its open-circuit voltage; half of their difference, less
 the ohmic part, is its hysteresis. A discharge without its charge gives the curve but for what hides in half of that.
 """
 

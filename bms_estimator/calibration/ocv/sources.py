@@ -25,9 +25,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 STARTS_ALIKE_V = 0.02
-"""Captures whose first rests differ by less start at the same SOC: a full charge ends no more alike, per cell [V]."""
+"""Captures whose first rests differ by less start at the same SOC: full charges vary by as much, per cell [V]."""
 GIVEN_V, GIVEN_COMMON_V = 1e-3, 2e-3
-"""Standard deviation of each point of a given curve, and of what it is off as a whole, per cell [V]."""
+"""Standard deviation of each point of a given curve, and of its common error, per cell [V]."""
 REST_SHARE, REST_SHARE_STD = 0.7, 0.3
 """Part of the half difference of slow curves that a rest after a discharge keeps, the other is polarisation; and its
 standard deviation: 0.4 and 0.5 seen of an NCA cell, 1.0 of an LFP cell."""
@@ -68,10 +68,10 @@ class Source:
 
     Attributes:
         name: Of its captures.
-        kind: What it was found to be, such as "38 rests".
+        kind: Recognized kind, such as "38 rests".
         points: Its points.
         temperature_c: Mean [C]; NaN where it is not known.
-        hysteresis_v: At ``GRID`` [V]; None where it does not tell.
+        hysteresis_v: At ``GRID`` [V]; None if unknown.
         notes: Remarks.
         lone: The slow curve that it is, if its other half is missing; what the branches take is still in ``points``.
     """

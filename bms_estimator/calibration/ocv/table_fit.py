@@ -46,7 +46,7 @@ LEAST_SLOPE_V = 1e-3
 CELL_V = 4.0
 """Voltage of the cell that the voltages above refer to [V]."""
 TEMPERATURE_SPAN_C = 10.0
-"""Sources that differ by less say nothing of dE/dT [K]."""
+"""Minimum temperature difference of sources for dE/dT [K]."""
 ENTROPY_V_PER_K, ENTROPY_NODES = 3.5e-4, np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
 """Size of dE/dT before anything is measured [V/K]: 0.1 to 0.5 mV/K in published entropy profiles; where it may bend."""
 DEVIATION_NODES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
@@ -62,7 +62,7 @@ STEEPEST_V = 2.0
 STD_OF_MEDIAN = 1.48
 """Standard deviation of a normal distribution over the median of its magnitude: a few bad points do not count."""
 PASSES = 4
-"""The slope f' and the size of each source's errors come from the pass before."""
+"""The slope f' and the errors of the sources are those of the previous iteration."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,9 @@ class TableFit:
         soc: Nodes from 0 to 1.
         ocv_v: Voltages at the nodes, increasing [V].
         error_v: Standard deviations of ``ocv_v`` [V].
-        per_kelvin_v: dE/dT at the nodes [V/K]; None where the temperatures of the points do not tell.
+        per_kelvin_v: dE/dT at the nodes [V/K]; None if the temperatures of the points do not determine it.
         residual_v: Shape (n,), points less curve [V].
-        deviation_v: Of each source, RMS of what it is off as a whole [V].
+        deviation_v: RMS of the common error of each source [V].
     """
 
     soc: Floats

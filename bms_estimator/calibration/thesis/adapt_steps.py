@@ -62,7 +62,7 @@ class AdaptedElements:
 def steps_2_and_3(cell: CellModel, captures: Sequence[Start], lowest_soc: float) -> AdaptedElements:
     """Adapt a1..a12 to the capture of the smallest mean current, then fit a13..a15 to all captures.
 
-    Algorithm 1 asks for a very small current; (4.2) needs several.
+    Algorithm 1 needs a very small current; (4.2) needs several.
 
     Args:
         cell: Capacity, open-circuit voltage, and the bounds of (3.18).

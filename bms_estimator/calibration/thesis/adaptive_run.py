@@ -1,7 +1,7 @@
 """Step 2: adaptive estimation of a1..a15 over a capture, Algorithm 1 and schemes 1 to 3.
 
-The observer runs over the whole capture; it stops adapting at the stability conditions (Fig. 19). Whether it
-converged, and if not why, is part of what comes out.
+The observer runs over the whole capture; it stops adapting at the stability conditions (Fig. 19). The result says
+whether it converged, and if not why.
 """
 
 import itertools
@@ -17,9 +17,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 SNAPSHOTS = 3000
-"""a_i(t) is kept this often over a run, and at each of its first samples."""
+"""Recording interval of a_i(t) over a run, after its first samples."""
 FIRST_SAMPLES = 200
-"""The first samples, over which a_i(t) runs from its initial value to its limit, are all kept."""
+"""Number of first samples, over which a_i(t) moves from its initial value to its limit, that are all recorded."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 
 SETTLED_SHARE = 0.99
-"""Share of the samples after t_int whose error must be within the bound."""
+"""Fraction of the samples after t_int whose error must be within the bound."""
 SETTLED_PARAMETER = 1e-3
 """A parameter this near to its median, relatively, has settled."""
 WINDOWS = 100

@@ -125,7 +125,7 @@ def open_circuit(cell: CellModel, soc: Floats) -> Floats:
 
 
 def static_elements(a: Floats, soc: float) -> Floats:
-    """a1..a15 of a model whose elements stay at their values at ``soc``: the static model of chapter 6."""
+    """a1..a15 of a model with constant elements, those at ``soc``: the static model of chapter 6."""
     frozen = np.array(a)
     for offset, element in ((3, r_ts), (6, r_tl), (9, c_ts), (12, c_tl), (15, r_s)):
         frozen[offset] = element(soc, a)

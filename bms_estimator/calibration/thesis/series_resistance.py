@@ -66,16 +66,16 @@ class SeriesResistanceFit:
 
     @property
     def element(self) -> Resistance:
-        """Return the ``[r_s]`` section of a cell file, whose values must be above 0."""
+        """Return the ``[r_s]`` section of a cell file with values above 0."""
         a13, a14, a15 = (max(float(a), 1e-9) for a in self.a)
         return Resistance(amplitude_ohm=a13, exponent=a14, offset_ohm=a15)
 
 
 def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
-    """R_s by (4.2) wherever current flows.
+    """R_s by (4.2) for all samples with current.
 
     Args:
-        cell: Whose open-circuit voltage holds.
+        cell: Supplies the open-circuit voltage.
         run: A capture with the x2 + x3 that frozen a1..a12 give under its current.
 
     Raises:

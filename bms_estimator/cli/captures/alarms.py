@@ -59,7 +59,7 @@ class Found:
     quiet: Sequence[str]
     """Watched, and not raised."""
     unmeasured: Sequence[str]
-    """Watched, but the capture does not hold what they look at."""
+    """Monitored alarms whose quantity the capture lacks."""
 
 
 def alarms(

@@ -40,7 +40,7 @@ class Value:
     of_start: float
     """Value in the file of --cell."""
     reason: str | None
-    """Why the data did not tell of it."""
+    """Reason why the data do not determine it."""
 
 
 def identify_fuel_cell(

@@ -75,7 +75,7 @@ async def fetched(
     """Return the blocks of a pack that the server still has.
 
     Raises:
-        UserError: It cannot be asked.
+        UserError: The server cannot be reached.
     """
     from bms_estimator.fleet.identification.block_capture import fetch  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415

@@ -122,7 +122,7 @@ def _listed(path: Path) -> list[str]:
 
 
 async def _put(found: Sequence["ReidentificationResult"], known: PackRegistry, where: ServerAddress) -> list[str]:
-    """Put new cells, and let their packs' rows name them; returns the packs whose row another has changed."""
+    """Put new cells, and let their packs' rows name them; returns the packs whose row another client has changed."""
     from bms_estimator.fleet.identification.reidentify import cell_name  # noqa: PLC0415
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.packs.pack_bucket import put, read_bucket  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""``bms-estimator fleet serve`` and ``fleet user``: the server, and who may connect to it."""
+"""``bms-estimator fleet serve`` and ``fleet user``: the server, and tokens for edges."""
 
 import asyncio
 import os
@@ -102,10 +102,10 @@ def _folder(settings: FleetSettings, given: Path | None) -> Path:
 
 
 def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, ...]:
-    """Return the addresses on which all nodes hear each other.
+    """Return the addresses of all nodes for each other.
 
     Raises:
-        UserError: What --of says cannot be, or needs keys and certificates that are not there.
+        UserError: --of is invalid, or keys and certificates are missing.
     """
     if of is None:
         if number != 1:

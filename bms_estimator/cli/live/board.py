@@ -112,7 +112,7 @@ def board(
 
 
 def _accept_next(settings: Settings, folder: Path) -> None:
-    """Have the pack's service, whose state is in ``folder``, forget its board.
+    """Make the pack's service, whose state is in ``folder``, accept the next board.
 
     Raises:
         UserError: Its settings name the board, none is known in the folder, or the file cannot be written.

@@ -1,4 +1,4 @@
-"""``bms-estimator history``: what the service kept of a pack, minute by minute."""
+"""``bms-estimator history``: the stored history of a pack, minute by minute."""
 
 import csv
 import sys

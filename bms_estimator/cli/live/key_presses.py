@@ -28,10 +28,10 @@ READ_BYTES = 1024
 
 @contextlib.contextmanager
 def keys(press: Callable[[str], None]) -> Iterator[None]:
-    """Hear keys while the context lasts; nothing where standard input is no terminal.
+    """Read key presses within the context; nothing where standard input is no terminal.
 
     Args:
-        press: Called with what is meant, one of the values of ``KEYS``.
+        press: Called with one of the values of ``KEYS``.
     """
     if not (sys.stdin and sys.stdin.isatty()):
         yield

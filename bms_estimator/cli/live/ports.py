@@ -1,4 +1,4 @@
-"""``bms-estimator ports``: which serial ports there are, and what is on them."""
+"""``bms-estimator ports``: serial ports, and the devices on them."""
 
 from contextlib import AbstractContextManager, nullcontext
 from typing import Annotated
@@ -48,6 +48,6 @@ def ports(
 
 
 def asking(port: str) -> AbstractContextManager[object]:
-    """Says on a terminal that it takes a while."""
+    """Show on a terminal that the probe takes a while."""
     console = Console(stderr=True)
     return console.status(f"asking on {port} who is there: up to 20 s") if console.is_terminal else nullcontext()

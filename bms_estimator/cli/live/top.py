@@ -80,7 +80,7 @@ async def _watch(settings: MqttSettings, log: deque[str], first: str) -> None:
 
 
 async def _show_until(stop: asyncio.Event, fresh: asyncio.Event, view: LiveView) -> None:
-    """Have drawn what comes, and what does not, until ``stop``."""
+    """Draw new messages and status changes until ``stop``."""
     stopped = asyncio.create_task(stop.wait())
     while not stopped.done():
         view.show()

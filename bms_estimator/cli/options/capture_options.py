@@ -44,7 +44,7 @@ SignOfCurrent = Annotated[
 
 
 def check_out(out: Path, read: Sequence[Path], *, force: bool) -> None:
-    """Refuse to write over a file unasked, and over what is read in any case.
+    """Refuse to overwrite a file without --force, and to overwrite the input in any case.
 
     Raises:
         UserError: ``out`` is one of ``read``, or it is a file already and ``force`` is not given.
@@ -79,5 +79,5 @@ def name_of(path: Path) -> str:
 
 
 def write_as_named(out: Path, cell: CellModel, remarks: list[str]) -> None:
-    """Write a cell file whose cell has the file's name, with ``remarks`` on top."""
+    """Write a cell file whose cell has the file's name, after ``remarks`` as comments."""
     write_cell(out, cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})}), remarks)

@@ -23,7 +23,7 @@ def show_compile_progress(say: Show | None = None) -> Iterator[None]:
     """Show meanwhile which kernel is compiled and how many there are; nothing where they are all in the cache.
 
     Args:
-        say: Takes a line now and then where stderr is no terminal; else they go there.
+        say: Receives a line at intervals if stderr is not a terminal; else they go there.
     """
     console = Console(stderr=True)
     shown = _status_line(console) if console.is_terminal else nullcontext(_now_and_then(say or _to_stderr))
@@ -66,10 +66,10 @@ def _now_and_then(say: Show) -> Show:
 
 @contextmanager
 def _interrupted_between() -> Iterator[Callable[[], None]]:
-    """Have SIGINT wait for the value to be called: the compiler loses an exception that comes while it works, and fails.
+    """Make SIGINT wait for the next kernel: an exception inside the compiler is lost, and the compiler fails.
 
     Raises:
-        KeyboardInterrupt: It came, and was not raised by the value.
+        KeyboardInterrupt: SIGINT arrived, and no kernel raised it.
     """
     came = False
 

@@ -1,4 +1,4 @@
-"""``bms-estimator asyncapi``: what is published, for programs that read it."""
+"""``bms-estimator asyncapi``: topics and payloads for programs."""
 
 import json
 from typing import Annotated

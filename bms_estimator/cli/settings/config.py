@@ -69,7 +69,7 @@ def init(
 
 
 def _probed(ports: Sequence[str]) -> Given:
-    """Return the settings for the detected device, and print what it is.
+    """Return the settings for the detected device, and print its name.
 
     Raises:
         UserError: No device, or more than one.

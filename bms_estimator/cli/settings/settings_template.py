@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": "ohm", "c": "°C"}
-"""Last part of a key -> the unit it stands for."""
+"""Last part of a key -> its unit."""
 WIDTH = 110
 HEAD = """\
 # Settings of one pack. A setting in a comment has the value shown; remove the # to change it.
@@ -25,7 +25,7 @@ Given = Mapping[str, Mapping[str, object]]
 
 
 def settings_file(model: type[BaseModel], given: Given = MappingProxyType({})) -> str:
-    """TOML text with each section of ``model``, each setting with its meaning, unit, what is allowed, and default.
+    """TOML text with each section and setting of ``model``: meaning, unit, constraint, default.
 
     Args:
         model: Of the sections.
@@ -60,7 +60,7 @@ def _value(field: FieldInfo) -> str:
 
 
 def _allowed(key: str, field: FieldInfo) -> str:
-    """``[V, at least 0]``; empty where nothing is to say."""
+    """``[V, at least 0]``; empty without constraints."""
     choices, limits = _constraints(field.annotation)
     limits += [_limit(item) for item in field.metadata if type(item) in _SIGNS]
     unit = [UNITS[key.rsplit("_", 1)[-1]]] if "_" in key and key.rsplit("_", 1)[-1] in UNITS else []

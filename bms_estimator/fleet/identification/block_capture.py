@@ -31,7 +31,7 @@ class BlockCapture:
 
     Attributes:
         damaged: Messages that were no block.
-        again: Blocks that came more than once, or of a store that is over.
+        again: Blocks that arrived more than once, or belong to a former store.
     """
 
     since_s: float = -np.inf
@@ -42,7 +42,7 @@ class BlockCapture:
     _store: int = 0
 
     def add(self, data: bytes) -> None:
-        """Take what came of the pack next."""
+        """Take the pack's next message."""
         try:
             block = decode(data)
         except BlockError:
@@ -79,8 +79,8 @@ class BlockCapture:
     def samples(self) -> Iterator[SampleBlock]:
         """All samples.
 
-        ``time_s`` is that of the first store; where another took its place it goes on by the edge's wall clock, and where
-        that had been set back from the last sample on.
+        ``time_s`` is that of the first store; a new store continues by the edge's wall clock, or from the last sample
+        if that clock was set back.
         """
         parts, rows = list[SampleBlock](), 0
         for part in self._parts():

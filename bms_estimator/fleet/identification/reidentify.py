@@ -26,7 +26,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.sampling import Sampling
 
 TRAINING = 2.0 / 3.0
-"""Part of the time whose samples identify; the others judge."""
+"""Fraction of the time whose samples identify; the others judge."""
 LEAST_S = 6 * 3600.0
 """Fewer samples are not enough to do both [s]."""
 LEAST_MOVED = 1.0
@@ -244,7 +244,7 @@ def _battery(kind: PackSpec, cell_file: str | None) -> CellModel:
 
 
 def _of_one(samples: SampleBlock, kind: PackSpec) -> SampleBlock:
-    """Return voltage and current of one cell-file object; only samples whose time increases."""
+    """Return voltage and current of one cell-file object; only samples with increasing time."""
     latest_s = np.maximum.accumulate(np.r_[-math.inf, samples["time_s"][:-1]])
     one = samples[samples["time_s"] > latest_s]
     one["voltage_v"] /= kind.series

@@ -58,7 +58,10 @@ logging.getLogger("asyncio").addFilter(lambda record: "eof_received() has no eff
 
 
 class _Transport(TcpTransport):
-    """Ends in time: after a TLS handshake that failed, or with bytes that a silent server does not read, its end never comes."""
+    """Closes within a time limit, because closing may never complete.
+
+    This happens after a failed TLS handshake, and with bytes that a silent server does not read.
+    """
 
     async def wait_closed(self) -> None:
         try:
@@ -85,7 +88,7 @@ async def connect(
     Args:
         servers: ``nats://`` or ``tls://`` and host:port; several with commas between.
         name: Of this connection, in the server's lists.
-        creds: File of the tenant's credentials, as ``fleet serve`` made it; None: the server asks for none.
+        creds: File of the tenant's credentials, as ``fleet serve`` made it; None: none are required.
         ca: Certificate of the authority that has signed the server's; None: those of the system.
         linked: Called with why there is no connection, and with None when there is one again.
 
@@ -115,7 +118,7 @@ async def connect(
 
 
 async def part(nc: Client) -> None:
-    """Close a connection, in whatever state it is."""
+    """Close a connection in any state."""
     with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
         async with asyncio.timeout(2.0 * CLOSING_S):
             await nc.close()

@@ -14,8 +14,8 @@ BEHIND_S = 0.1
 async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -> AsyncGenerator[Stored, None]:
     """All messages from one sequence to another, in their order.
 
-    The node that answers may be behind the one that leads the stream: so they end with the message ``last``, not where that
-    node knows no more.
+    The node that responds may lag behind the stream's leader, so they end with the message ``last``, not where that
+    node has no more.
 
     Args:
         nc: Connected.

@@ -43,7 +43,7 @@ async def read_stream(
         stream: Its name; it must allow direct gets.
         subject: Of the messages; may have wildcards.
         first: Sequence number from which on.
-        since_s: Wall clock at which a message was kept, from which on, in place of ``first`` [s since 1970].
+        since_s: Wall clock from which stored messages are read, in place of ``first`` [s since 1970].
 
     Raises:
         StreamError: The server does not answer, or refuses.

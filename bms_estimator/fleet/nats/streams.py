@@ -1,4 +1,4 @@
-"""Streams, buckets and consumers of one tenant, made once; asked for again, they are as they were.
+"""Streams, buckets and consumers of one tenant, made once; a repeated call changes nothing.
 
 ``RAW`` keeps what edges have sent, in partitions; each is read through a durable consumer of its own, which the server
 pins to one worker at a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object
@@ -33,7 +33,7 @@ pack's oldest block is removed."""
 MIN_PACK_BLOCKS = 60
 """Blocks of a pack that even a small ``RAW`` keeps: an hour of minute blocks."""
 DUPLICATES_S = 3600.0
-"""A summary that comes again within it, under its number, is dropped."""
+"""A repeated summary with its number within this time is dropped."""
 GROUP = "w"
 """Priority group of a consumer for workers."""
 PIN_S = 2.0
@@ -49,7 +49,7 @@ AT_ONCE = 16
 
 
 class NoAnswerError(UserError):
-    """The server says nothing; it may later."""
+    """The server does not respond; it may later."""
 
 
 async def make_streams(
@@ -66,7 +66,7 @@ async def make_streams(
         nc: Connected as the tenant.
         partitions: Of ``RAW``; it has them for ever.
         replicas: 1, or 3 in a cluster of three.
-        raw_bytes: ``RAW`` keeps no more; then the oldest goes.
+        raw_bytes: ``RAW`` keeps no more; beyond it the oldest is dropped.
         raw_age_s: Nor anything older.
 
     Raises:

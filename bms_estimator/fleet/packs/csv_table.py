@@ -25,7 +25,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 class Line(NamedTuple):
-    """A row of the table and where it stands."""
+    """A row of the table and its line number."""
 
     number: int
     kind: PackSpec

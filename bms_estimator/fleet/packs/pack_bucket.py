@@ -34,7 +34,7 @@ class Written:
 
 
 class PackBucket:
-    """The table as a worker sees it; never an error for what stands in it.
+    """The table as a worker sees it; never an error for its content.
 
     Args:
         nc: Connected as the tenant.
@@ -53,7 +53,7 @@ class PackBucket:
         self._changed: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
 
     async def refresh(self) -> set[str]:
-        """Read what has changed, the first time everything; returns the packs of which it tells.
+        """Read changes, at first everything; returns the affected packs.
 
         Raises:
             StreamError: The server does not answer, or has no such bucket.
@@ -65,7 +65,7 @@ class PackBucket:
         return changed
 
     async def _read(self, bucket: str, take: Callable[[str, bytes | None], bool]) -> None:
-        """Note which keys of a bucket have another value now: for the next one, too, should this refresh not come to its end."""
+        """Collect the changed keys of a bucket, also for the next refresh if this one fails."""
         try:
             state = (await self._nc.jetstream().stream_info(_stream(bucket))).state
         except nats.errors.Error as error:
@@ -82,7 +82,7 @@ class PackBucket:
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
         """Follow changes without end; call ``changed`` with the packs whose row or cell has changed.
 
-        What the server does not give now it is asked for again.
+        Missing values are requested again.
         """
         while True:
             await asyncio.sleep(POLL_S)
@@ -114,7 +114,7 @@ async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
 
 
 async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, remove: bool = False) -> Written:
-    """Let a bucket hold ``values``; what stands there already is not written.
+    """Let a bucket hold ``values``; unchanged values are not written.
 
     Args:
         nc: Connected.

@@ -1,4 +1,4 @@
-"""Registry of packs: rows and cell files as they come, and the settings and model of each pack.
+"""Registry of packs: rows and cell files, and the settings and model of each pack.
 
 Packs with equal rows share one settings object and one model, which are made on first use. An error in a row makes its packs
 unknown, with the reason.

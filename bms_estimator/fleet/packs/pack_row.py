@@ -1,6 +1,7 @@
 """Row of the table of packs, and the settings and model that follow from it.
 
-On the server a row stands under its pack's name as JSON without that name, so that packs of one kind have the same bytes.
+On the server the key of a row is its pack's name, and the value is JSON without the name, so that packs of one kind
+have equal bytes.
 """
 
 import tomllib
@@ -101,7 +102,7 @@ def settings_of(row: PackSpec) -> Settings:
 
 
 def known_cells() -> tuple[str, ...]:
-    """Names of all cells that come with the package."""
+    """Names of all shipped cells."""
     return (*shipped_cells(), *generic_cells(), *shipped_fuel_cells())
 
 

@@ -23,7 +23,7 @@ STEP_S = 2.0
 ASK_S = 600.0
 """Interval between two queries of the hours [s]."""
 FLEET, ANSWERS = "fleet", "answers"
-"""Keys of what is streamed."""
+"""Keys of the event stream."""
 STATIC = Path(__file__).with_name("static")
 FILES = {
     "/": File(STATIC / "fleet.html", "text/html"),
@@ -46,7 +46,7 @@ async def fleet_page(
     Args:
         server: Of the fleet.
         settings: Where the page is served.
-        hours: Folder of the hours' Parquet files, of which questions are asked; None: none are.
+        hours: Folder of the Parquet files for queries; None: none are.
         step_s: Between two pictures of the fleet [s].
 
     Yields:
@@ -91,7 +91,7 @@ async def _draw(view: FleetView, newest: LatestValues, step_s: float) -> None:
 
 
 async def _ask(hours: Path, newest: LatestValues) -> None:
-    """Questions to the hours, now and then: seconds of work for a large fleet. The process ends after the one that is asked."""
+    """Query the hours at intervals, which takes seconds for a large fleet. The process ends after the current query."""
     from bms_estimator.fleet.page.query_results import ASKED, answer  # noqa: PLC0415 - duckdb is needed for nothing else
 
     while True:

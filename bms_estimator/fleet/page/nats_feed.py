@@ -25,9 +25,9 @@ from bms_estimator.process.tasks import end
 TABLE_S = 2.0
 """Poll interval for changes of the table of packs, and retry interval [s]."""
 HOURS_S = 3900.0
-"""Summaries of an hour come once in that, and somewhat late [s]."""
+"""Interval of hourly summaries, with a delay [s]."""
 MOST_BYTES = 1 << 16
-"""Nothing of ours is longer."""
+"""Maximum length of a message."""
 MOST_REASON = 200
 """Bytes of why a pack is unknown."""
 
@@ -84,7 +84,7 @@ class FleetFeed:
             await part(self._nc)
 
     async def _run(self) -> None:
-        """Listen for ever; why that ended stands on the page."""
+        """Listen for ever; the page shows why it ended."""
         try:
             await self._listen()
         except UserError as error:
@@ -98,7 +98,7 @@ class FleetFeed:
         """Connect, which lasts until there is a server; then the library stays connected, and subscribed.
 
         Raises:
-            UserError: The address cannot be used, or the server has closed the connection for good.
+            UserError: The address cannot be used, or the server has closed the connection permanently.
         """
         server, name = self._server, "bms-estimator fleet page"
         self._nc = await connect(server.urls, name, creds=server.creds, ca=server.ca, linked=self._on_link)
@@ -137,7 +137,7 @@ class FleetFeed:
         }
 
     async def _follow_table(self, nc: Client) -> None:
-        """Know the packs that are in the table."""
+        """Register the packs in the table."""
         bucket, view = PackBucket(nc), self._view
 
         async def refresh() -> None:

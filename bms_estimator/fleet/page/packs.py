@@ -1,6 +1,6 @@
 """All packs of a fleet as its page shows them: which are alive, their distribution, which need attention. Pure.
 
-Of each pack the bytes of its newest state are kept, and the ranked values in columns; the rest is decoded on request.
+The newest state of each pack is stored as bytes, and the ranked values in columns; the rest is decoded on request.
 """
 
 import bisect
@@ -75,7 +75,7 @@ class FleetPacks:
         self._parameters: dict[str, bytes] = {}
         self._types: dict[str, int] = {UNLISTED: 0}
         self.states, self.damaged = 0, 0
-        """Heard so far; those that were no JSON object."""
+        """Received so far; those that were no JSON object."""
 
     def list_pack(self, name: str, kind: str | None) -> None:
         """Set the type of a pack in the fleet's table, such as ``lfp 16s2p``; None removes it."""
@@ -97,7 +97,7 @@ class FleetPacks:
         self._states[self._places[name]] = state
 
     def hear_parameters(self, name: str, parameters: bytes) -> None:
-        """Take what a pack has published; it is kept small, since an hour's is of some kilobytes."""
+        """Take what a pack has published; it is stored compressed, since it has some kilobytes."""
         self._row(name)
         self._parameters[name] = zlib.compress(parameters, 1)
 

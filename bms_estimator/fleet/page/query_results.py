@@ -15,7 +15,7 @@ LISTED = 20
 
 
 def answer(folder: Path, name: str) -> dict[str, Any]:
-    """Return the result of one of the queries ``ASKED``.
+    """Return the result of one of the queries in ``ASKED``.
 
     Args:
         folder: Of the hours, as ``fleet collect`` writes it.

@@ -15,10 +15,10 @@ MOST_UNKNOWN = 1000
 
 
 class FleetView:
-    """All that is known; times are of one clock that never goes back [s].
+    """All that is known; times are monotonic [s].
 
     Args:
-        partitions: How many there are, as long as the server has not said.
+        partitions: Number of partitions until the server reports it.
         now_s: The clock.
     """
 
@@ -49,7 +49,7 @@ class FleetView:
             self.damaged += 1
 
     def hear_unknown(self, name: str, why: str) -> None:
-        """Record that a worker holds blocks of a pack that it does not know."""
+        """Record that a worker holds blocks of an unknown pack."""
         self._unknown.pop(name, None)
         self._unknown[name] = why
         if len(self._unknown) > MOST_UNKNOWN:
@@ -86,7 +86,7 @@ class FleetView:
         return (self.packs.states - states) / (now_s - before_s) if now_s > before_s else None
 
     def _named_unknown(self, now_s: float) -> dict[str, Any]:
-        """Return the unknown packs that workers count; a name is kept as long as there are any."""
+        """Return the unknown packs that workers count; a name stays as long as there are any."""
         count, named = self.workers.unknown(now_s)
         if not count:
             self._unknown.clear()

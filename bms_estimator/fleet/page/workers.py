@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from bms_estimator.fleet.heartbeat import Heartbeat
 
 ALIVE_S = 5.0
-"""A worker says each second that it lives; the page is given more time than other workers, which take over after 3 s [s]."""
+"""Heartbeat interval of a worker; the page is given more time than other workers, which take over after 3 s [s]."""
 REMEMBERED_S = 300.0
 """Time for which a lost worker is listed [s]."""
 OVER_S = 10.0
@@ -43,7 +43,7 @@ class FleetWorkers:
             heard.popleft()
 
     def forget(self) -> None:
-        """Nothing was heard for a while that is no worker's fault."""
+        """Reset after a time without messages for which the workers are not responsible."""
         self._heard.clear()
 
     def unknown(self, now_s: float) -> tuple[int, list[str]]:
@@ -56,8 +56,8 @@ class FleetWorkers:
         """Return an overview of the workers.
 
         Returns:
-            ``workers`` (each: id, alive, what it holds and does), ``holders`` (of each partition the place of its worker, -1
-            without an owner), ``unheld`` and ``twice`` (partitions), ``lag_s`` (the largest).
+            ``workers`` (each: id, alive, partitions, activity), ``holders`` (index of each partition's worker, -1
+            without), ``unheld`` and ``twice`` (partitions), ``lag_s`` (the largest).
         """
         for name in [name for name, heard in self._heard.items() if heard[-1].at_s < now_s - REMEMBERED_S]:
             del self._heard[name]

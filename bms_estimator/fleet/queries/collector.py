@@ -128,7 +128,7 @@ class Collector:
             await message.term()
 
     async def _save(self, stop: asyncio.Event) -> None:
-        """Write what waits, and acknowledge it; what cannot be written comes again."""
+        """Write what waits, and acknowledge it; rows that cannot be written arrive again."""
         waiting, self._waiting = self._waiting, []
         try:
             files = await asyncio.to_thread(write, self._folder, [row for _, row in waiting])
@@ -152,7 +152,7 @@ class Collector:
 
 
 def compact_days(folder: Path, now_s: float) -> None:
-    """Make one file of the many of days that need it; what the disk refuses is said, and tried again later.
+    """Make one file of the many of days that need it; disk errors are logged, and retried later.
 
     Args:
         folder: Of the days.

@@ -63,11 +63,11 @@ class Limits:
     least_days: int = 7
     """Queries soh, failing: minimum number of days in a trend."""
     least_packs: int = 5
-    """Query outliers: minimum number of certain packs that define what is usual of their type."""
+    """Query outliers: minimum number of certain packs that define the reference of their type."""
     least_spread: float = 0.01
     """Query outliers: minimum relative std between packs of a type."""
     recent_days: int = 3
-    """Query failing: number of last days on most of which a new suspicion stands."""
+    """Query failing: number of last days, most of which must have a new suspicion."""
     silent_hours: int = 2
     """silent: no summary for longer; a living pack's newest is of the hour before."""
     most_packs: int = 10_000
@@ -101,7 +101,7 @@ def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limit
         folder: Of the days, as ``fleet collect`` writes it.
         name: Of the question.
         days: Number of last days with rows, whole days UTC; None: all.
-        limits: What is taken as given.
+        limits: Assumed limits.
 
     Raises:
         UserError: There is no such question, folder or row; a file is damaged.
@@ -164,7 +164,7 @@ def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
     """Return the files by day folder; ``days``: of the last days only.
 
     Raises:
-        UserError: There are none, or one is not whole.
+        UserError: There are none, or one is incomplete.
     """
     if not folder.is_dir():
         raise UserError(f"--folder {folder}: no such folder; `bms-estimator fleet collect --folder {folder}` fills it")

@@ -1,7 +1,7 @@
 """Hours of packs in Parquet files: ``date=YYYY-MM-DD/*.parquet``, written whole or not at all, and few.
 
-A file is written under a name that no question reads, brought to the disk, and renamed. The same row may stand in two of
-them: questions drop it. Needs pyarrow and duckdb.
+A file is written under a name that no question reads, brought to the disk, and renamed. A row may be in two of them;
+queries drop the duplicate. Needs pyarrow and duckdb.
 """
 
 import os
@@ -50,7 +50,7 @@ def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
         The files.
 
     Raises:
-        OSError: The disk takes them not; what is there is whole.
+        OSError: The disk takes them not; existing files are complete.
     """
     return write_table(folder, pa.Table.from_pylist([row.model_dump() for row in rows], schema=SCHEMA))
 

@@ -6,8 +6,8 @@
     claims.json              claims for the servers; public, equal on all nodes
     TENANT/account.nk        is the account
     TENANT/<role>.nk         signs users of that role, as ``claims.Role`` has them
-    TENANT/admin.creds ...   with which programs connect: admin, worker, reader
-    TENANT/dashboard.token   MQTT's password of who reads estimates
+    TENANT/admin.creds ...   with which programs connect: admin, worker, reader TENANT/dashboard.token MQTT password
+    of readers of estimates
 
 Private keys stay where they were made: other nodes need ``claims.json`` alone.
 """
@@ -44,7 +44,7 @@ def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: date
         now: When credentials that are made are made.
 
     Raises:
-        UserError: The folder cannot be read or written, or holds what is no key.
+        UserError: The folder cannot be read or written, or contains an invalid key.
     """
     operator, system = _key(folder / "operator.nk", OPERATOR), _key(folder / "system.nk", ACCOUNT)
     accounts = {system.public: jwt_claims.system_account(operator, system.public)}
@@ -76,7 +76,7 @@ def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: dat
 
     Args:
         folder: Of the keys.
-        tenant: Whose pack it is.
+        tenant: Tenant of the pack.
         pack: The only one that it may write.
         now: Revocation looks at it.
         expires: From when on it is refused; None: never.

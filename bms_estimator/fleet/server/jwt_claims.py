@@ -1,7 +1,7 @@
 """Claims that a server checks by signature alone: an operator, its tenants' accounts, their users.
 
-A claim is a JSON Web Token whose parts are those of https://github.com/nats-io/jwt, version 2, signed with an ed25519
-key in the writing of https://github.com/nats-io/nkeys. The permissions of a role are in the account's claims, beside
+A claim is a JSON Web Token with the parts of https://github.com/nats-io/jwt, version 2, signed with an ed25519 key in
+the encoding of https://github.com/nats-io/nkeys. The permissions of a role are in the account's claims, beside
 the public key that signs its users. A token contains only an identity, so the server needs no list of tokens.
 """
 
@@ -136,7 +136,7 @@ def user_key(signer: Key, role: Role, name: str) -> Key:
 
 
 def operator(key: Key, system: str) -> str:
-    """Claims of the operator, who signs accounts.
+    """Claims of the operator, which signs accounts.
 
     Args:
         key: Its own.
@@ -152,7 +152,7 @@ class Tenant:
     Attributes:
         name: For people.
         public: The account's public key.
-        signers: Public key of who signs the users of a role.
+        signers: Public keys that sign the users of a role.
         disk_bytes: The most that its streams take, copies on other nodes counted; None: what there is.
         revoked: Public key of a user -> its tokens that were made before [s since 1970] are refused.
     """
@@ -195,7 +195,7 @@ def user(signer: Key, account_key: str, role: Role, name: str, made: datetime, e
     Args:
         signer: That of the role.
         account_key: The account's public key.
-        role: What the user is; who bears an edge's token, is the edge.
+        role: What the user is; the bearer of an edge's token is the edge.
         name: Of the user; of an edge, its pack's.
         made: Revocation looks at it.
         expires: From when on it is refused; None: never.

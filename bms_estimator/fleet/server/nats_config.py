@@ -1,4 +1,4 @@
-"""The text of a nats-server's configuration: one node, or one of a cluster. Pure: who runs it writes the file.
+"""The text of a nats-server's configuration: one node, or one of a cluster. Pure: the caller writes the file.
 
 What the keys mean: the server's own documentation, https://docs.nats.io/running-a-nats-service/configuration.
 """
@@ -25,8 +25,8 @@ class Cluster:
     """Cluster settings of a node.
 
     Attributes:
-        listen: Where this one hears them, host:port.
-        routes: Where all are heard, host:port, this one among them.
+        listen: Address of this node for the others, host:port.
+        routes: Addresses of all nodes for each other, host:port, including this one.
     """
 
     listen: str
@@ -40,7 +40,7 @@ class Tls:
     Attributes:
         cert: The server's certificate, and what leads from it to the authority.
         key: Its private key.
-        ca: Of the authority by which nodes know each other; None: as clients do, by those of the system.
+        ca: Authority that the nodes trust; None: as clients do, by those of the system.
     """
 
     cert: Path
@@ -73,9 +73,9 @@ class Node:
         nats: Where workers connect, host:port; so are ``mqtt``, for edges, and ``monitor``.
         cluster: The other nodes; None: it is alone.
         tls: For all ports but the monitor's; None: none.
-        accounts: Who may connect; None: whoever reaches it, as one tenant.
+        accounts: Accounts of the tenants; None: whoever reaches it, as one tenant.
         partitions: Of the stream ``RAW``.
-        disk_bytes: The most that streams take; None: as the server has it, three quarters of what is free.
+        disk_bytes: The most that streams take; None: the server's default, three quarters of the free space.
         memory_bytes: As above.
         sync_s: Interval between two fsyncs [s]; None: each message before it is acknowledged.
     """
@@ -130,7 +130,7 @@ def _cluster(node: Node) -> list[str]:
 
 
 def _accounts(node: Node) -> list[str]:
-    """Return the lines with accounts and permissions; without accounts, anybody."""
+    """Return the lines with accounts and permissions; without accounts, any client may connect."""
     if node.accounts is None:
         return []
     preload = [f"  {key}: {claims}" for key, claims in node.accounts.claims.items()]

@@ -55,7 +55,7 @@ class NodeLocation:
     Attributes:
         folder: For streams and keys.
         number: From 1.
-        nodes: Where all are heard by each other, host:port; one alone has none.
+        nodes: Addresses of all nodes for each other, host:port; one alone has none.
     """
 
     folder: Path
@@ -95,7 +95,7 @@ class ServerSpec:
 
     Attributes:
         settings: Of the fleet.
-        accounts: Who may connect; None: whoever reaches it.
+        accounts: Accounts of the tenants; None: whoever reaches it.
     """
 
     settings: FleetSettings
@@ -156,7 +156,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], say: Callab
         say: Receives lines for people: addresses and created streams.
 
     Returns:
-        The server's exit code; 0 where it was asked to end.
+        The server's exit code; 0 after a requested end.
 
     Raises:
         UserError: There is no server that will do, settings cannot be, or it refuses the streams.
@@ -241,9 +241,9 @@ async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subp
 
 
 async def _make_ready(place: NodeLocation, told: ServerSpec, pid: int, say: Callable[[str], None]) -> None:
-    """Wait for the server, say where it is, then for a quorum, and make the streams of all tenants.
+    """Wait for the server, print its addresses, wait for a quorum, and create the streams of all tenants.
 
-    Not any server that answers is ours: it writes a file with its number once it listens, and then has its ports.
+    Another server may answer on the port: this one writes a file with its number once it listens on its ports.
     """
     node = node_of(place, told)
     while not list(place.folder.glob(f"*_{pid}.ports")):  # noqa: ASYNC110 - it has no other way to tell
@@ -311,7 +311,7 @@ async def connect(node: Node, credentials_file: Path | None) -> Client:
 
 
 def _own_certificate(tls: Tls) -> ssl.SSLContext:
-    """Trusts the certificate that this machine's server shows, under whatever name it is reached."""
+    """Trusts the certificate of this machine's server under any name."""
     context = ssl.create_default_context(cafile=str(tls.cert))
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
     context.check_hostname = False
@@ -349,7 +349,7 @@ def _scheme(node: Node) -> str:
 
 
 def _heard(own: str) -> str:
-    """Return the address on which a node listens for others that know it by ``own``, which may name any of its addresses."""
+    """Return the address on which a node listens for others; ``own`` may resolve to any of its addresses."""
     listen = reachable(own)
     return own if listen.loopback else f"0.0.0.0:{listen.port}"
 

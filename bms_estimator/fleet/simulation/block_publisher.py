@@ -1,6 +1,6 @@
 """Simulated edges on their way: blocks out over a few MQTT connections, and what workers await of them.
 
-A connection stands for many edges: one socket each would measure the kernel's sockets, not a fleet.
+One connection serves many edges: one socket each would measure the kernel's sockets, not a fleet.
 """
 
 import asyncio
@@ -45,7 +45,7 @@ class Report(NamedTuple):
     bytes: int
     """Size of the blocks [bytes]."""
     resends: int
-    """Asked for by workers."""
+    """Requested by workers."""
     unacknowledged: int
     lag_s: float
     """Age of the oldest complete block that was not sent [s]."""
@@ -62,7 +62,7 @@ class _Connection:
 
     Args:
         settings: The brokers, tried in turn.
-        heard: Where the payloads of ``BlockRequest`` go, with their topics; None: they are not asked for.
+        heard: Receives the payloads of ``BlockRequest`` with their topics; None: no subscription.
     """
 
     def __init__(self, settings: MqttSettings, heard: deque[tuple[str, bytes]] | None) -> None:
@@ -88,7 +88,7 @@ class _Connection:
         return self.published - self.acknowledged
 
     def publish(self, topic: str, payload: bytes) -> None:
-        """Hand over a block; it goes out when it can."""
+        """Hand over a block; it is sent later if necessary."""
         self._client.publish(topic, payload, qos=1)
         self.published += 1
 
@@ -128,9 +128,9 @@ async def run_edges(
 
     Args:
         fleet: The packs.
-        edges: What they have sent.
+        edges: Simulated edges.
         settings: Where to.
-        connections: How many stand for all.
+        connections: Number of connections for all edges.
         stop: Ends it.
         said: Receives progress messages.
         quiet_s: After the last block.
@@ -175,7 +175,7 @@ def _listen(heard: deque[tuple[str, bytes]], edges: SimulatedEdges) -> None:
 
 
 def _send(fleet: SimulatedFleet, edges: SimulatedEdges, links: list[_Connection], topics: list[str]) -> int:
-    """Send what is due and may be in flight. Returns how many bytes of blocks that was."""
+    """Send due blocks within the limit of messages in flight. Returns how many bytes of blocks that was."""
     free = min(MOST_IN_FLIGHT - link.in_flight for link in links)
     due = edges.due(time.time(), max(0, free))
     blocks = list(fleet.blocks(*due))  # all of them first: the connections' threads would take turns with this one

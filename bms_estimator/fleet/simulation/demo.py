@@ -34,7 +34,7 @@ SPEED = 10.0
 """The packs' seconds per second: their minute is over in 6 s."""
 SEED = 7
 LISTENED = 100
-"""Packs whose estimates are compared with the truth."""
+"""Number of packs whose estimates are compared with the truth."""
 SAID_S = 5.0
 """Interval between two progress lines [s]."""
 KILL_AFTER = 0.4
@@ -73,7 +73,7 @@ class DemoObserver:
 
     @property
     def alive(self) -> dict[str, Heartbeat]:
-        """Workers that were heard within ``DEAD_S``, and not killed since."""
+        """Workers with a heartbeat within ``DEAD_S`` that were not killed since."""
         now_s = time.monotonic()
         return {
             name: beat
@@ -230,7 +230,7 @@ async def _counted(nc: Client, seen: DemoObserver, processes: "Processes", stop:
 
 
 async def _listen(nc: Client, fleet: SimulatedFleet) -> DemoObserver:
-    """Hear all workers, and some packs."""
+    """Receive all heartbeats, and the estimates of some packs."""
     seen = DemoObserver({subjects.partition_of(name, subjects.PARTITIONS) for name in fleet.names})
     index = {name: i for i, name in enumerate(fleet.names)}
 
@@ -266,7 +266,7 @@ async def _connected(server: str, processes: "Processes", stop: asyncio.Event) -
 
 
 class Processes:
-    """Commands of ``fleet`` as processes; what each says is in a file of ``folder``."""
+    """Commands of ``fleet`` as processes; the output of each is in a file of ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

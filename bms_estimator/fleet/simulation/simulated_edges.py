@@ -9,7 +9,8 @@ from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFle
 from bms_estimator.model.arrays import Floats
 
 RESEND_S = 5.0
-"""Minimum interval between two resends of a block [s]: a worker that lags asks for it again before it can have it."""
+"""Minimum interval between two resends of a block [s]: a worker that lags repeats its request before the block can
+arrive."""
 
 
 class Due(NamedTuple):
@@ -18,7 +19,7 @@ class Due(NamedTuple):
     packs: Whole
     numbers: Whole
     arrival_s: Floats
-    """Wall clock at which their last samples came [s since 1970]."""
+    """Wall clock of their last samples [s since 1970]."""
 
 
 class SimulatedEdges:
@@ -63,7 +64,7 @@ class SimulatedEdges:
         return Due(packs, numbers, ready_s[packs])
 
     def hear(self, pack: str, awaits: BlockRequest, now_s: float) -> bool:
-        """Hear from a worker at ``now_s``. Returns whether the pack is one of these, and the store its."""
+        """Receive a worker's message at ``now_s``. Returns whether the pack is one of these, and the store its."""
         i = self._index.get(pack)
         if i is None or awaits.store != self._fleet.store[i]:
             return False

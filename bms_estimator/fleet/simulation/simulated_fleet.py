@@ -1,7 +1,7 @@
 """Packs that never were: what a fleet's edges would send, and the truth beside it.
 
-Nothing is kept: a block is a function of seed, pack and number, so that 100,000 packs need no disk and any block can be
-sent again. SOC is a closed form of time, so that whoever estimates can be judged at any moment.
+Nothing is stored: a block is a function of seed, pack and number, so that 100,000 packs need no disk and any block
+can be sent again. SOC is a closed form of time, so that whoever estimates can be judged at any moment.
 
 A pack swings slowly between full and empty, with a pulse each minute that takes no charge over it. Its voltage is that of
 the shipped cell's OCV and elements (2.4), with two branches of fixed time constants; capacity and resistances differ
@@ -29,7 +29,7 @@ Bits = NDArray[np.uint64]
 BLOCK_S = 60
 """Length of a block at one sample a second [s]."""
 MIDDLE_SOC, SWING_SOC = 0.52, 0.36
-"""SOC goes from 0.16 to 0.88."""
+"""SOC range is 0.16 to 0.88."""
 SLOW, QUICK, QUICKNESS = 0.75, 0.25, 3.3
 """Shares of the two oscillations of SOC, and how much faster the second is."""
 SHORTEST_S, LONGEST_S = 8 * 3600.0, 24 * 3600.0
@@ -116,7 +116,7 @@ class SimulatedFleet:
     Attributes:
         names: Of the packs.
         store: When each edge's store was made [ns since 1970], shape (packs,).
-        truth: What is to be found out.
+        truth: The true values.
     """
 
     def __init__(self, packs: int, *, seed: int, begin_ns: int, prefix: str = "sim") -> None:
@@ -261,8 +261,8 @@ def _response() -> tuple[Floats, Floats, Floats]:
     """Return the response to a pulse of 1 A [A].
 
     Returns:
-        The current in each second of its minute; what a branch of ``TAU_TS_S`` feels of it then; what it still feels at
-        the beginning of each of the minutes after.
+        The current in each second of its minute; what a branch of ``TAU_TS_S`` feels of it then; its effect at the
+        beginning of each of the following minutes.
     """
     second = np.arange(BLOCK_S)
     pulse = np.where(second < PULSE_S, 1.0, -PULSE_S / (BLOCK_S - PULSE_S))

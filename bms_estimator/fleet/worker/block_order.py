@@ -15,10 +15,11 @@ from bms_estimator.fleet.worker.pack_state import MOST_LOST
 TOLD_EACH = 10
 """Number of blocks between two confirmations to an edge that earlier blocks are safe."""
 ASKED_EACH = 5
-"""Number of early blocks between two replies to an edge that say where to resume."""
+"""Number of early blocks between two replies to an edge."""
 
 MAX_PASSED = 20
-"""Missing blocks count as lost after the first one behind them has come this many times. The edge resends them all, at least 30 s
+"""Number of repetitions of the first later block after which missing blocks count as lost. The edge resends them all,
+at least 30 s
 apart, so the server refuses the missing ones, or they are damaged on the edge's disk."""
 
 
@@ -39,7 +40,7 @@ def classify_block(d: np.void, block: Block) -> BlockOrder:
 
     Args:
         d: The pack's record of DELIVERY; updated but for ``NEXT`` itself, which ``mark_taken`` notes.
-        block: What came.
+        block: The received block.
     """
     store, number = int(d["store"]), int(d["awaited"])
     if block.store < store:
@@ -88,9 +89,9 @@ def edge_reply(order: BlockOrder, d: np.void, block: Block, *, first: bool) -> B
     """Return the reply to an edge about a block.
 
     Args:
-        order: What it was.
+        order: Order of the block.
         d: As in ``classify_block``, after the block.
-        block: What came.
+        block: The received block.
         first: Of this pack, since these partitions were taken over.
     """
     store, number = int(d["store"]), int(d["awaited"])

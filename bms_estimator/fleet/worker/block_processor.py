@@ -1,4 +1,4 @@
-"""A block of the pack on the bench: through the estimator, and what is published of it."""
+"""Estimation of a block of the pack on the bench, and its publications."""
 
 import math
 from collections import Counter
@@ -28,7 +28,7 @@ from bms_estimator.telemetry.state import make_state_payload
 LAST_WALL_S = 2.0**34
 """No wall clock shows a later time: the year 2514 [s since 1970]."""
 AT_ONCE = 4096
-"""Samples: what the estimator says of each takes 200 bytes, for each type of pack in each partition."""
+"""Samples: each estimate takes 200 bytes, for each type of pack in each partition."""
 Published = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
 """Topics ``state`` and ``parameters``, and the rows of finished hours, each with an id."""
 
@@ -39,7 +39,7 @@ class BlockProcessor:
     Args:
         record: The bench's, shape (1,), dtype ``PACK_STATE``.
         counters: Faults are counted here.
-        wall: Wall clock, for what is published [s since 1970].
+        wall: Wall clock of the publications [s since 1970].
     """
 
     def __init__(self, record: NDArray[np.void], counters: Counter[str], wall: Callable[[], float]) -> None:
@@ -104,7 +104,7 @@ class BlockProcessor:
             estimator.resume(self._unseen_s(block))
 
     def _estimate(self, block: Block, of_type: PackType, arrival_s: float) -> None:
-        """Take the samples to the estimator, and what it makes of them to hour, meter and window."""
+        """Step the samples, and pass the estimates to hour, meter and window."""
         observer, counters = self._observer, self._counters
         accepted, steps_back = int(observer["samples"]), int(observer["time_steps_back"])
         of_type.meter.continue_from(ChargeEnergy(*(float(self._flows[name]) for name in ChargeEnergy._fields)))
@@ -173,7 +173,7 @@ class BlockProcessor:
             self._delivery["clock"], self._delivery["last_s"] = block.store, known_s[-1]
 
     def _arrival_s(self, block: Block) -> float:
-        """Wall clock at the last sample's arrival, as the edge says, where that can be [s since 1970]."""
+        """Wall clock at the last sample's arrival at the edge, if plausible [s since 1970]."""
         if 0.0 <= block.arrival_s <= LAST_WALL_S:
             return block.arrival_s
         self._counters["no_arrival"] += 1

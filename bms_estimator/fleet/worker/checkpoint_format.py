@@ -1,4 +1,4 @@
-"""A partition as bytes: what a worker that takes it over goes on from.
+"""A partition as bytes, from which another worker continues.
 
 Layout, little-endian::
 
@@ -88,9 +88,9 @@ class PartitionCheckpoint:
     Attributes:
         number: Of the partition.
         sequence: Of the last message of the stream that it holds.
-        counters: By what they count.
+        counters: By name.
         packs: Packed records by pack, of this version's layout.
-        former: The same of packs that were not heard since another version.
+        former: The same for packs with a record of another version.
         deferred: Messages of packs that wait, in the order of their turns.
     """
 

@@ -28,7 +28,7 @@ from bms_estimator.fleet.nats.stored_messages import stored
 from bms_estimator.model.clock import iso_utc
 
 KEPT = 2
-"""Number of checkpoints of a partition that are kept: the last, and one before in case the last is damaged."""
+"""Number of stored checkpoints of a partition: the last, and one before in case the last is damaged."""
 PIECE_BYTES = 128 << 10
 """Size of an object's chunk, one message [bytes]."""
 _STREAM = f"OBJ_{subjects.STATES_BUCKET}"
@@ -107,7 +107,7 @@ class CheckpointStore:
         return claim
 
     async def confirm_claim(self, claim: Claim) -> Claim:
-        """Read the claim again, because the last write may have succeeded though no response came.
+        """Read the claim again, because the last write may have succeeded without a response.
 
         Raises:
             FencedError: Another worker has taken the partition over.
@@ -226,7 +226,7 @@ class CheckpointStore:
 
 
 class _Chunks(io.RawIOBase):
-    """Bytes that come in pieces, as a file."""
+    """Bytes in pieces as a file."""
 
     def __init__(self, chunks: Iterator[bytes]) -> None:
         self._chunks, self._rest = chunks, memoryview(b"")

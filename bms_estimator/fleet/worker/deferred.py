@@ -49,7 +49,7 @@ class Deferred:
         self._spans[pack] = Span(before.first if before else sequence, sequence)
 
     def next(self, is_due: Callable[[str], bool]) -> tuple[str, Span] | None:
-        """Return a pack whose turn it is and its span; the pack goes to the end of the queue. None: no pack is due."""
+        """Return the next pack and its span; the pack moves to the end of the queue. None: no pack is due."""
         pack = next(filter(is_due, self._spans), None)
         if pack is None:
             return None

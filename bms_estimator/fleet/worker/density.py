@@ -10,13 +10,15 @@ MAX_RATE_HZ = 1000.0
 MAX_SAMPLES = 20_000
 """Maximum number of samples in a block: the limit of earlier edges; later ones cut at ``MOST_SAMPLES``."""
 LONGEST_STORE_S = 2.0**33
-"""Latest plausible time stamp [s since the store was made]: a store may be made in 1970, before its machine knows the time."""
+"""Latest plausible time stamp [s since the store was created]: a store may be created in 1970 on a machine without
+the time."""
 
 
 def density_fault(samples: SampleBlock) -> str:
     """Return why a block has too many samples, in total or for its duration; empty if it has not.
 
-    ``MOST_SAMPLES`` are allowed beyond the rate: an edge's clock may stand still while a source's is corrected.
+    ``MOST_SAMPLES`` are allowed beyond the rate, because an edge's clock may stand still while a source's is
+    corrected.
     """
     if samples.size > MAX_SAMPLES:
         return f"{samples.size} samples: at most {MAX_SAMPLES}"

@@ -32,7 +32,7 @@ Sums = NDArray[np.void]
 def hour_of(block: Block) -> int:
     """Return the hour of a block by the edge's clock at its last sample [hours since 1970].
 
-    A block whose last time stamp is not finite belongs to that of its store.
+    A block without a finite last time stamp belongs to the hour of its store.
     """
     last_s = float(block.samples["time_s"][-1])
     return int((block.store / 1e9 + (last_s if math.isfinite(last_s) else 0.0)) // HOUR_S)
@@ -70,7 +70,7 @@ def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour
     """Return the row of a finished hour.
 
     Args:
-        pack: What it is, as its settings have it.
+        pack: Type of the pack, from its settings.
         hour: Hours since 1970.
         sums: Of the hour; read only.
         estimator: With the pack's state at the hour's end; read only.

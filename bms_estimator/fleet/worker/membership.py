@@ -3,7 +3,7 @@
 Rendezvous hashing (Thaler and Ravishankar, "A name-based mapping scheme for rendezvous", 1996) with bounded loads (Mirrokni,
 Thorup and Zadimoghaddam, "Consistent hashing with bounded loads", 2016): a partition belongs to the worker with the highest
 hash of the pair, unless that worker has its fair number already. Therefore few partitions move when a worker joins or leaves, and
-no worker has more than its share. The workers need not agree at each moment: the server's pin decides who owns a partition.
+no worker has more than its share. The workers need not agree at each moment: the server's pin decides.
 """
 
 import math

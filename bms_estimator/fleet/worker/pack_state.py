@@ -1,7 +1,7 @@
 """State of one pack in a worker: next block, totals, the hour's sums, the estimator's record.
 
-One record of numbers, kept packed (``kernels.packed_record``) in bytes that never change: whoever holds them has the pack as it
-was.
+One record of numbers, stored packed (``kernels.packed_record``) in immutable bytes, so that a holder keeps the pack
+unchanged.
 """
 
 from collections.abc import Mapping
@@ -56,7 +56,7 @@ PACK_STATE = np.dtype(
 
 
 class StateError(ValueError):
-    """The bytes of a pack are none."""
+    """The bytes of a pack are invalid."""
 
 
 class WorkRecord:

@@ -1,7 +1,7 @@
 """A partition: its packs' states, stepped block by block by the same kernel as everywhere.
 
 What a worker does follows from the stream's order and the table of packs alone: from any checkpoint on, the same blocks
-leave the same states to the last bit. No connection, no file; the only clock is for what is published.
+leave the same states to the last bit. No connection, no file; the only clock is that of the publications.
 """
 
 import time
@@ -41,7 +41,7 @@ class BlockResult(NamedTuple):
     """Result of a block.
 
     Attributes:
-        pack: Whose.
+        pack: Name of the pack.
         awaits: For its edge.
         state: Topic ``state``.
         parameters: Topic ``parameters``.
@@ -63,7 +63,7 @@ class Partition:
     Args:
         number: Of the partition.
         table: The packs' settings.
-        wall: Wall clock, for what is published [s since 1970].
+        wall: Wall clock of the publications [s since 1970].
 
     Attributes:
         number: The same.
@@ -118,7 +118,7 @@ class Partition:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Packs that sent something and that the table does not know."""
+        """Unknown packs with messages."""
         return tuple(pack for pack in self.deferred if not self.is_known(pack))
 
     def state(self, pack: str) -> NDArray[np.void] | None:

@@ -61,9 +61,9 @@ class PartitionLease:
         is_busy: Returns true while any partition of the worker has received messages that are not taken.
 
     Attributes:
-        consumer: What asks for messages.
+        consumer: Requests the messages.
         partition: The state; None: not taken over.
-        claim: That it is ours; None: it is not.
+        claim: Claim of this worker; None: it is not.
         hours: Summaries that the server has not acknowledged yet: (id, pack, row).
         lag_s: Largest lag since it was last reset to None [s].
         blocks: Taken here, as are ``samples``.
@@ -109,7 +109,7 @@ class PartitionLease:
 
     @property
     def is_owned(self) -> bool:
-        """True if this worker owns the partition, as far as it knows."""
+        """True if this worker owns the partition, by its own knowledge."""
         return self.partition is not None and self.claim is not None
 
     def receive(self, message: Msg) -> None:
@@ -148,7 +148,7 @@ class PartitionLease:
         """Write a checkpoint, unless the last one is as new.
 
         Raises:
-            nats.errors.Error: The server does not take it, or not in time: then the last one stands.
+            nats.errors.Error: The server rejects it, or does not respond in time: the last one remains valid.
         """
         async with self._changing:
             partition, claim = self.partition, self.claim
@@ -281,7 +281,7 @@ class PartitionLease:
             await self._catch_up(partition, (await js.get_last_msg(subjects.RAW_STREAM, subject)).seq or 0)
 
     async def _take_over(self) -> Partition:
-        """Have a state that is ours, maybe an old one."""
+        """Load the state of a claimed partition, possibly an old one."""
         await self._confirm()
         partition = self.partition
         if partition is None:
@@ -320,7 +320,7 @@ class PartitionLease:
         return Partition(self.number, self._table)
 
     async def _catch_up(self, partition: Partition, sequence: int) -> None:
-        """Take what the stream has up to a message. Only the last that each pack's messages bring goes out."""
+        """Take what the stream has up to a message. Only the last publication of each pack is sent."""
         if partition.sequence >= sequence:
             return
         latest: dict[str, BlockResult] = {}

@@ -21,7 +21,7 @@ RENEW_S = PIN_S / 4.0
 EXPIRES_S = 2.5 * RENEW_S
 """Expiry of a request [s]."""
 BATCH = 32
-"""Messages that a request asks for, unless as many wait here already."""
+"""Number of messages in a request, unless as many wait here."""
 PIN_HEADER, STATUS_HEADER = "Nats-Pin-Id", "Status"
 WRONG_PIN = "423"
 QUIET = frozenset({"404", "408", "409"})
@@ -68,14 +68,14 @@ class PinnedConsumer:
 
     @property
     def pinned(self) -> bool:
-        """True if this worker is pinned, as far as it knows."""
+        """True if this worker is pinned, by its own knowledge."""
         return bool(self._pin)
 
     async def is_pinned(self) -> bool:
         """Return True if the server has pinned it to any worker.
 
         Raises:
-            StreamError: The server does not know it.
+            StreamError: The consumer does not exist.
             nats.errors.Error: The server does not answer.
         """
         answer = json.loads((await self._nc.request(self._info, timeout=ANSWER_S)).data)
@@ -113,7 +113,7 @@ class PinnedConsumer:
         return lost
 
     async def unpin(self) -> None:
-        """Give the partition back: whoever asks for it gets it."""
+        """Release the partition to any worker that requests it."""
         pin, self._pin = self._pin, ""
         self.waiting.clear()
         if pin:

@@ -61,7 +61,7 @@ async def work(options: Options, stop: asyncio.Event) -> None:
     """Work until ``stop`` is set; then save checkpoints and release the partitions.
 
     Raises:
-        UserError: An option cannot be used, or the server has closed the connection for good.
+        UserError: An option cannot be used, or the server has closed the connection permanently.
     """
     notifier = SystemdNotifier([options.name])
     starting = asyncio.ensure_future(_start(options, notifier))
@@ -93,10 +93,10 @@ async def _start(options: Options, notifier: SystemdNotifier) -> "Worker":
 
 
 def _check(nc: Client, options: Options) -> None:
-    """Check that the connection can come back.
+    """Check that the connection can be restored.
 
     Raises:
-        UserError: The server has closed it for good.
+        UserError: The server has closed it permanently.
     """
     if nc.is_closed:
         raise UserError(f"the server {options.servers} has closed the connection: look at --creds")
@@ -155,7 +155,7 @@ class Worker:
         """Run until it is cancelled.
 
         Raises:
-            UserError: The server has closed the connection for good.
+            UserError: The server has closed the connection permanently.
         """
         await self._nc.subscribe(subjects.worker(), cb=self._hear)
         await self._nc.subscribe(f"{self._inbox}.*.*", cb=self._receive)
@@ -205,7 +205,10 @@ class Worker:
             await self._beat()
 
     async def _receive(self, message: Msg) -> None:
-        """Messages come under the stream's subject, p.<partition>.raw.<pack>; statuses under ours, <inbox>.<partition>.<pin>."""
+        """Messages arrive on the stream's subject, p.<partition>.raw.<pack>.
+
+        Statuses on the inbox, <inbox>.<partition>.<pin>.
+        """
         tokens = message.subject.split(".")
         found = self._held.get(int(tokens[-2] if message.subject.startswith(self._inbox) else tokens[1]))
         if found:
@@ -342,7 +345,7 @@ class Worker:
 
 
 async def _each(period_s: float, what: Callable[[], Awaitable[None]]) -> None:
-    """Do it again and again; what was missed is not made up for."""
+    """Do it again and again; missed calls are not repeated."""
     while True:
         await what()
         await asyncio.sleep(period_s)

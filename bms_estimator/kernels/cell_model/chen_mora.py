@@ -1,6 +1,6 @@
 """The cell of Chen and Mora: its elements over SOC and its exact response to a held current.
 
-Parameters stand at their own index: ``a[1]`` is a1, ``a[0]`` is unused. Voltages in V, currents in A
+Parameters have their own index: ``a[1]`` is a1, ``a[0]`` is unused. Voltages in V, currents in A
 (positive on discharge), resistances in ohm, capacitances in F, SOC 0..1.
 """
 
@@ -63,7 +63,7 @@ def emf(soc: float, a: Floats) -> float:
 def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
     """Open-circuit voltage [V] at ``soc`` from a grid of values and slopes (cubic Hermite).
 
-    Beyond 0..1 the end slope goes on, so that a drifting SOC still meets a finite, increasing curve.
+    Beyond 0..1 the curve continues with its end slope, so that a drifting SOC still has a finite, increasing curve.
 
     Args:
         soc: State of charge.

@@ -9,7 +9,8 @@ A stack of n cells as one two-terminal object under the current i, positive when
 
 T in K, pressures in atm, I in A: a is the loss at 1 A, and e^(-a / A) A the exchange current. v is the activation and
 concentration overpotential of the whole stack. r, A and a are of the file's temperature and follow the stack's (``load_file_constants``).
-Over a sample whose current is held, e^(-v / A) is a first-order lag of time constant A C / I: the step is exact for every length.
+At constant current over a sample, e^(-v / A) is a first-order lag with the time constant A C / I: the step is exact
+for any length.
 
 Correa et al. take v / v_inf(I) in place of the exponential. Both end at v_inf; theirs does so v_inf / A (6 to 9) times more
 slowly from the same C, because it takes the chord of Tafel's curve for its slope. A / I is what impedance measures.
@@ -143,7 +144,7 @@ def advance(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: floa
 def output(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, psi: Floats) -> float:
     """Terminal voltage y [V] at ``current_a``, and in ``psi`` its derivatives by theta, shape (8,); rest as ``advance``.
 
-    Where more than i_n flows in ``psi`` is 0: that current is wrong, and tells of no parameter.
+    If more than i_n flows in, ``psi`` is 0: that current is wrong and gives no information on parameters.
     """
     drop_v = given[R] * math.exp(theta[R]) * current_a
     for j in range(psi.shape[0]):
@@ -163,7 +164,10 @@ def steady_state(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a:
 
 @njit(cache=True)
 def write(theta: Floats, file: Floats, a: Floats) -> None:
-    """Write the parameters of theta to ``a[1]`` and later, in the order of ``NAMES``; the rest comes from the file."""
+    """Write the parameters of theta to ``a[1]`` and later, in the order of ``NAMES``.
+
+    The rest is that of the file.
+    """
     for j in range(len(NAMES)):
         a[1 + j] = file[1 + j] * math.exp(theta[j])
     for i in range(1 + len(NAMES), a.shape[0]):

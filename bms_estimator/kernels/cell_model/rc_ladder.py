@@ -1,7 +1,7 @@
 """The overpotential as a ladder: a series resistance and six RC branches of fixed, log-spaced time constants.
 
 A branch is the current filtered with its time constant, x_k [A], times its resistance R_k(SOC, T). Diffusion has no time
-constant of its own; a ladder follows it from a second to an hour, and is linear in what is to be found, the R_k.
+constant of its own; a ladder covers it from a second to an hour, and is linear in the unknown R_k.
 """
 
 import math
@@ -29,8 +29,9 @@ GRID = 41
 """Nodes of resistances, entropy and hysteresis, evenly spaced over SOC 0..1."""
 
 WEAK_SHARE = (0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57)
-"""Part of each resistance that grows as ``WEAK_J``, where captures of one temperature cannot tell: that of an 18650 NCA cell from
--10 to 33 C, mean over SOC 0.3 to 1; of an LFP cell from -15 to 25 C 0.8, 1, 0.9, 0.75, 0.7, 0.6, 0.6."""
+"""Fraction of each resistance that grows as ``WEAK_J``, if captures at one temperature do not show it: that of an
+18650 NCA cell from -10 to 33 C, mean over SOC 0.3 to 1; of an LFP cell from -15 to 25 C 0.8, 1, 0.9, 0.75, 0.7, 0.6,
+0.6."""
 WEAK_LEFT_SOC, WEAK_LEFT = (0.0, 0.1, 0.2, 0.3, 0.45), (0.45, 0.5, 0.8, 0.9, 1.0)
 """Fraction of the weak part that is left near empty, over SOC: at SOC 0.2 and 0.1 it was 0.73 and 0.14 in that cell,
 0.97 and 0.92 in the LFP cell."""

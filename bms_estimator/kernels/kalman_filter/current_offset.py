@@ -1,7 +1,8 @@
 """A sensor that shows no current while the pack rests is right: it takes a coincidence to hide an offset.
 
-What is shown is true current and offset together. That both are zero is common, that one makes up for the other is not.
-A rest that shows 50 mA tells nothing: they may be the sensor's, or those of a load that stays on. How small a current a
+The sensor shows the sum of true current and offset. That both are zero is common, that one makes up for the other is
+not.
+A rest that shows 50 mA gives no information: it may be the sensor's offset or a load. How small a current a
 sensor shows at all, behind its steps and its dead band, is seen from the smallest that it has shown.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
@@ -31,7 +32,7 @@ def track_smallest_current(s: Record, current_a: float) -> None:
 
 @njit(cache=True)
 def update_offset_at_rest(s: Record, p: Record) -> None:
-    """Each minute of rest that shows no current tells every hypothesis the offset to ``p.zero_std_c``, or to what may be hidden.
+    """Update the offset of every hypothesis after each minute of rest, to ``p.zero_std_c`` or the hidden current.
 
     What little it shows may be the sensor's or that of a load: half of it is the offset, give or take the other half.
     """

@@ -43,7 +43,8 @@ LOWEST, HIGHEST = -0.05, 1.05
 MOST_STDS = 3.0
 """Limit of ln of the resistances in multiples of their initial std."""
 LEAST_LN_Q, MOST_LN_Q = math.log(0.5), math.log(1.3)
-"""Limits of the learned over the declared capacity: age takes up to half of it, no make holds much more than it declares."""
+"""Limits of the learned relative to the declared capacity: aging takes up to half of it, and no make exceeds its
+declaration by much."""
 HOLD_NOTHING, HOLD_CAPACITY, HOLD_CELL, HOLD_CELL_AND_CURVE = range(4)
 """States that an update keeps: none; LN_Q; LN_Q, OFFSET and the learned nodes; these and CURVE."""
 OWN_R_STD = 0.5
@@ -54,7 +55,7 @@ REST_C, SMALL_C, NEARLY_FULL = 0.02, 0.4, 0.9
 CHARGE, CHARGE_C = TREND + 1, 0.04
 """The branch of 500 s, and the current in it of a charge that is no regeneration [C]."""
 VARYING_C = 0.2
-"""Standard deviation over 10 min of a load that tells resistance from capacity [C]."""
+"""Minimum standard deviation over 10 min of a load that distinguishes resistance from capacity [C]."""
 
 
 @njit(cache=True)
@@ -189,8 +190,9 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
 
     All of it linear about ``about_soc``, known to ``about_variance``: the voltage is what that line has at the filter's SOC.
 
-    v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. How the resistances,
-    and what was learned of the OCV, change with SOC is no part of H: it would take an error of theirs for one of the SOC.
+    v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. H excludes the
+    change of the resistances and of the learned OCV over SOC, because their errors would be taken for errors of the
+    SOC.
     """
     x, h, ohm, w = s.mean[q], s.h, s.ohm, s.window
     soc = about_soc + (w.charge_as - w.sum_as / w.samples) / p.capacity_as  # in the middle of the samples

@@ -1,6 +1,7 @@
 """Map of each element over SOC as identified, and the thesis's functions fitted to it.
 
-The identifier knows the elements where the cell is now. A map stores, for each SOC bin, the information-weighted mean
+The identifier estimates the elements at the present SOC. A map stores, for each SOC bin, the information-weighted
+mean
 of the estimates there. (2.5)-(2.9) are fitted to the map: one nonlinear exponent, searched; amplitude and offset,
 linear.
 """
@@ -89,7 +90,7 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
     Args:
         m: Record of ELEMENT_MAP.
         e: Row of the map, 0..4.
-        prior: Configured a1..a15 at index 1..15: stands in, weakly, where the map is empty.
+        prior: Configured a1..a15 at index 1..15: weak prior where the map is empty.
         fit: Record of ELEMENT_FIT, written.
     """
     x, y, w = fit.soc, fit.value, fit.weight

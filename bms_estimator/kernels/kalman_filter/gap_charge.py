@@ -26,7 +26,7 @@ IDLE_C = 0.1
 def initialize_load_statistics(s: Record, p: Record, current_a: float) -> None:
     """Initialize the load statistics before a load is seen, as ``initial_branch_currents`` assumes.
 
-    The first sample tells more of a load that is small than of one that is large: that may be a peak.
+    A small first sample gives more information on the load than a large one, which may be a peak.
     """
     one_c = p.capacity_as / 3600.0
     s.usual_a = p.load_mean_c * one_c
@@ -81,7 +81,7 @@ def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
 def rounding_charge_variance(s: Record, p: Record, dt_s: float, current_a: float) -> float:
     """Return the additional variance of the charge within ``dt_s`` by the steps of the current [A^2 s^2].
 
-    While the same current is shown the error stays the same: its charge has the variance (error x time)^2, whatever the time.
+    While the reported current stays the same, the error stays the same: its charge has the variance (error x time)^2.
     """
     error_a2 = p.current_step_a * p.current_step_a / 12.0  # of rounding
     if current_a == 0.0 and s.current_a == 0.0:

@@ -226,7 +226,7 @@ def reinitialize_if_biased(s: Record, p: Record) -> None:
 def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
     """Return the squared number of std by which a hypothesis considers the model wrong.
 
-    The biases take what is wrong with OCV and hysteresis, too: on a plateau that is most of it.
+    The biases also absorb errors of OCV and hysteresis, which dominate on a plateau.
     """
     bias_v, soc = s.mean[q, B_SLOW] + s.mean[q, B_FAST], s.mean[q, SOC]
     hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)

@@ -39,7 +39,7 @@ LOST_STD = 0.05
 LOST_AT_MOST = 0.4
 """No SOC is less certain than this, std."""
 SIGN_S = 300.0
-"""Memory of how the voltage goes with the current, counted while it changes [s]."""
+"""Memory of the relation between voltage and current changes, counted while the current changes [s]."""
 LEAST_EVIDENCE = 0.1
 """Share of that memory which must be filled."""
 CLIP = 5.0
@@ -51,7 +51,7 @@ OFFSET_STDS, CAPACITY_STDS = 4.0, 2.0
 PRESENT_STDS = 3.0
 """Minimum deviation of a suspicious offset or capacity in multiples of its present std."""
 TAKEN_BACK = 0.7
-"""A suspicion stands until its measure is below this part of its limit."""
+"""A suspicion ends when its measure falls below this fraction of its limit."""
 WRONG_V, WRONG_S = 0.12, 1800.0
 """Bias of one cell [V] and duration [s] that no OCV of the cell's own chemistry explains."""
 SEARCHES_S = 5.0 * 3600.0
@@ -252,7 +252,7 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     """Process a sample without using its voltage, while voltage and current do not belong together.
 
     With the wrong sign of the current the SOC errs by twice the charge, always the same way; a current that is not measured may be
-    anything common. What was learned with the wrong sign is worth nothing: the filter is initialized again afterwards.
+    anything common. Estimates learned with the wrong sign are useless, so the filter is re-initialized afterwards.
     """
     moved = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
     wrong = UNCOUNTED * moved

@@ -10,7 +10,7 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 UNLIKELY = -9.0
-"""ln of a relative weight below which a hypothesis goes."""
+"""ln of a relative weight below which a hypothesis is removed."""
 ALIKE_STDS = 0.7
 """Two hypotheses closer than this many std of SOC are one."""
 
@@ -43,7 +43,7 @@ def clear_hypothesis(s: Record, q: int) -> None:
 
 @njit(cache=True)
 def prune_and_merge(s: Record) -> None:
-    """Drop what is unlikely, and make one of neighbours that agree."""
+    """Remove unlikely hypotheses, and merge neighbors that agree."""
     top, q = s.ln_weight[s.best], 0
     while q < s.count:
         s.ln_weight[q] -= top

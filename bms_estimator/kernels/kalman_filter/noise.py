@@ -36,19 +36,20 @@ from bms_estimator.numba_cache import njit
 FLOOR_C = 0.1
 """The load counts as at least so large [C]: an idle cell is not a perfect model [1/h]."""
 INDEPENDENT_S = 30.0
-"""A sample after a longer pause tells no more [s]."""
+"""Maximum weight of a pause before a sample [s]."""
 UNSENSED_R_STD = 0.25
 """Std of ln of the resistances without a temperature sensor: 10 K in both directions."""
 WARMED_R_STD = 0.015
 """Increase of that std for each kelvin of modeled self-heating [1/K]: half of the heating may be wrong."""
 AGED_SOC = 400.0
-"""Charge over which the curve of a cell becomes another with age: 200 full cycles [SOC]."""
+"""Charge over which aging changes the curve of a cell: 200 full cycles [SOC]."""
 HYST_LEFT = 0.17
 """Std of the hysteresis h if the direction of the charge is known."""
 LOWER_HALF = 0.5
 """SOC below which a cell may be empty early."""
 STEEP_V = 1.0
-"""Slope of the OCV of a cell that is its last fall [V]; where it is less, ``curve_error_v`` says how wrong the curve is."""
+"""Slope of the OCV of a cell that is its last fall [V]; if it is smaller, ``curve_error_v`` is the error of the
+curve."""
 USUAL_LN_R = 0.25
 """Up to this ln of the resistances over those of the file, the error of the model does not grow with them."""
 OUTSIDE_K = 30.0
@@ -63,7 +64,7 @@ def extrapolation_factor(p: Record, temperature_c: float) -> float:
 
 @njit(cache=True)
 def max_known_temperature(p: Record) -> float:
-    """Above it a cell that the file does not know has smaller resistances, but nothing is surer [C]."""
+    """Above it resistances are smaller, but errors are not [C]."""
     return max(p.high_c, REFERENCE_C)
 
 
@@ -99,8 +100,8 @@ def bias_variance(s: Record, p: Record, q: int) -> float:
 
     Resistances that were found to be larger than those of the file leave a larger error.
 
-    A cold cell is empty early, and no file says well by how much: in its lower half the shift along SOC grows in the cold as
-    their weak part does, and moves the last fall of the OCV, too.
+    A cold cell is empty early, and no file predicts by how much: in its lower half the shift along SOC grows in the
+    cold as the weak part does, and also moves the knee of the OCV near empty.
     """
     soc, scale = s.mean[q, SOC], math.exp(max(s.mean[q, LN_R] - USUAL_LN_R, 0.0))
     ohm = total_resistance(s, p, soc)
@@ -119,7 +120,7 @@ def bias_variance(s: Record, p: Record, q: int) -> float:
 
 @njit(cache=True)
 def total_resistance(s: Record, p: Record, soc: float) -> float:
-    """Sum of the resistances at ``soc``, no smaller than where the file knows them [ohm]."""
+    """Sum of the resistances at ``soc``, at least that within the file's temperatures [ohm]."""
     weak, strong, most_c = s.weak, s.strong, max_known_temperature(p)
     if s.temperature_c > most_c:
         weak, strong = arrhenius(WEAK_J, most_c), arrhenius(STRONG_J, most_c)
@@ -169,15 +170,15 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
 def add_gap_noise(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
     """Add the noise of an unmeasured current that stays constant, so that it moves SOC and branches together.
 
-    It changed, too, by as much: the branches, which know the last seconds or minutes, are of another mean than the SOC. Without
-    that the voltage after the gap would tell the SOC.
+    Its change has the same size: the RC pairs, which respond to the last seconds or minutes, belong to another mean
+    than the SOC. Otherwise the voltage after the gap would determine the SOC.
 
     Args:
         p: Record of EKF_SETTINGS.
         cov: Shape (STATES, STATES), updated.
         f: Diagonal of F over that time.
         std_a: Of the current [A].
-        soc_per_a: What it takes of the SOC [1/A].
+        soc_per_a: SOC drawn per ampere [1/A].
     """
     for j in range(SOC, X + BRANCHES):
         by_j = -soc_per_a if j == SOC else 1.0 - f[j]

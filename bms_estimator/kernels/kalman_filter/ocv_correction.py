@@ -1,6 +1,6 @@
 """The OCV learned while the filter runs: the error of the curve of the cell file as states of the filter, along SOC.
 
-``learned`` of the variance of that error belongs to the curve itself: it is the same whenever the SOC comes back. It is
+The fraction ``learned`` of the variance of that error belongs to the curve itself and returns at the same SOC. It is
 blended between ``NODES`` states so that its variance stays, each in units of the curve's std there, correlated with its
 neighbours over ``ALIKE_SOC``. The rest, CURVE, is of temperature, load and history, and is another each time.
 

@@ -1,4 +1,4 @@
-"""The extended Kalman filter: state vector, settings with where each comes from, and records.
+"""The extended Kalman filter: state vector, settings with their origin, and records.
 
 The state vector, in this order (also of the rows and columns of the covariance):
 
@@ -55,7 +55,7 @@ class Noise:
     charge_error: float = 0.002
     """Q: std of SOC gained over the whole range: linearity of the current sensor."""
     r_std: float = 0.1
-    """Resistances: std of their logarithm, where the cell file says nothing."""
+    """Resistances: std of their logarithm, if the cell file has none."""
     unsensed_s: float = 3600.0
     """Time constant with which resistances follow an unknown temperature without a sensor [s]."""
     offset_c: float = 0.007

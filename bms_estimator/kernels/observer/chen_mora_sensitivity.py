@@ -1,7 +1,7 @@
 """The cell of Chen and Mora as a model that is learned: output, sensitivities, what its file gives.
 
-What is learned, theta, is the ln of an element over the cell file's at the present SOC: the shape over SOC stays the
-file's. ``x`` holds v_ts and v_tl of (2.2), (2.3) [V], and ``dx`` their derivatives by theta.
+theta is the logarithm of an element relative to the cell file's at the present SOC, so the shape over SOC stays that
+of the file. ``x`` holds v_ts and v_tl of (2.2), (2.3) [V], and ``dx`` their derivatives by theta.
 """
 
 import math
@@ -64,7 +64,7 @@ def output(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float
 
 @njit(cache=True)
 def write(theta: Floats, file: Floats, a: Floats) -> None:
-    """a1..a15 that theta stands for: amplitude and offset of an element scale with it, exponents stay."""
+    """a1..a15 for theta: amplitude and offset of an element scale with it, exponents stay."""
     scale(file, a, 1, theta[1])
     scale(file, a, 4, theta[3])
     scale(file, a, 7, theta[2] - theta[1])

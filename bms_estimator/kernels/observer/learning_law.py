@@ -13,7 +13,7 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 LEARN_EVERY_S = 0.999
-"""Theta moves no more often, nearly a second: more samples only add to what is remembered [s]."""
+"""Minimum interval between two steps of theta [s]; more samples only add to the memory."""
 FASTEST_HZ = 0.1
 """Greatest gamma k, since k only grows: theta that follows noise faster than in some 10 s is led astray by it [1/s]."""
 RESTING_C = 0.02
@@ -45,7 +45,9 @@ def reset_information(m: Record, q: Record) -> None:
 
 @njit(cache=True)
 def initialize_states_at_rest(s: Record, p: Record, voltage_v: float) -> None:
-    """Initialize the states of a cell at rest. The rest of the voltage goes to the offset and does not move the parameters.
+    """Initialize the states of a cell at rest.
+
+    The remaining voltage goes to the offset and does not move the parameters.
 
     Nothing is learned until the states would have forgotten that they were otherwise.
     """

@@ -36,7 +36,7 @@ def load_constants(model: int, given: Floats, p: Record, soc: float, temperature
 
 @njit(cache=True)
 def steady_state(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
-    """Set states and derivatives at a first sample, whose history is unknown; in place."""
+    """Set states and derivatives at a first sample with unknown history; in place."""
     if model == _CHEN_MORA:
         chen_mora_sensitivity.steady_state(x, dx, theta, given, current_a)
     elif model == _FUEL_CELL:

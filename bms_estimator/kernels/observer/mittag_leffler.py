@@ -7,7 +7,7 @@ Nussbaum function (Li & Chen, Automatica 2009). With r = lambda^(1/a) k its exac
     G_a(r) = (sin(pi a)/pi) int_0^inf e^(-r s) s^(a-1) / (s^(2a) + 2 s^a cos(pi a) + 1) ds.
 
 Substituting s^a = -cos(pi a) + sin(pi a) tan(theta) turns G into a mean of exponentials without the pole that
-nears the real axis as a goes to 3,
+approaches the real axis as a approaches 3,
 
     G_a(r) = 1/(pi a) int e^(-r s(theta)) d theta,    s(0) .. s = inf,
 

@@ -145,8 +145,8 @@ def integral_of_exponential(rate: float, dt_s: float) -> float:
 def track_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) -> None:
     """Loss of lock (E2), detected and recovered from.
 
-    Lost is lock when the error stays beyond ``lock_error_v`` for ``lock_time_s``, or gets there under a gain whose
-    sign has turned, or when the gain overflows. It is back when the error has been within for ``lock_time_s``.
+    Lock is lost if the error stays beyond ``lock_error_v`` for ``lock_time_s``, or exceeds it under a gain with the
+    wrong sign, or if the gain overflows. It is back when the error has been within for ``lock_time_s``.
     In lock, a gain that falls below ``rearm_gain`` starts again from k0 before its sign turns, where it is above
     ``rearm_gain`` at k0: N1 to N3 begin at or near 0.
     """

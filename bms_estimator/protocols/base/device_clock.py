@@ -5,7 +5,8 @@ import math
 EARLY_S = 5.0
 """Maximum time by which a sample may precede its own timestamp [s]; more shows that the clock was set."""
 STUCK_S = 10.0
-"""Duration for which a device time may stay constant while samples come; after it the device time is ignored [s]."""
+"""Duration for which a device time may stay constant while samples arrive; after it the device time is ignored
+[s]."""
 SLOWEST = 0.01
 """No device's clock is slower than the host's by more than this, relative."""
 LAG_S, LAG_STEPS = 60.0, 3
@@ -17,8 +18,9 @@ class DeviceClock:
     """Time since the first sample [s], which never decreases.
 
     Delayed samples arrive together, and their own timestamps place them. A timestamp that steps back, or lies ahead of its
-    arrival, shows that the clock was set or the device restarted: then the arrival counts. The arrival also counts while the
-    clock stands still. A slow clock, as of a sleeping device or one that sends milliseconds in place of seconds, would lose
+    arrival, shows that the clock was set or the device restarted: then the arrival counts. The arrival also counts
+    while the clock stands still. A slow clock, as of a sleeping device or one that sends milliseconds in place of
+    seconds, would lose
     charge. Its lost time is added in one step, and arrivals count from then on.
 
     Attributes:
@@ -36,8 +38,8 @@ class DeviceClock:
         """Time of a sample [s].
 
         Args:
-            arrival_s: When it came, on any clock that never steps back [s].
-            told_s: When it was measured by the device's clock, whatever that counts from [s]; NaN: it did not say.
+            arrival_s: Arrival time, on any clock that never steps back [s].
+            told_s: Time of measurement by the device's clock, with any origin [s]; NaN: not reported.
         """
         step_s, late_s = told_s - self._told_s, arrival_s - told_s
         passed_s = 0.0 if math.isnan(self._arrival_s) else max(arrival_s - self._arrival_s, 0.0)

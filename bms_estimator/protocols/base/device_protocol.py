@@ -1,4 +1,7 @@
-"""Base class of device protocols: bytes from a device to samples, and bytes that it is sent. It knows no port."""
+"""Base class of device protocols.
+
+Bytes from a device to samples, and bytes that it is sent. It does not depend on a port.
+"""
 
 import math
 from abc import ABC, abstractmethod
@@ -41,7 +44,7 @@ class DeviceProtocol(ABC):
     @property
     @abstractmethod
     def fault(self) -> str | None:
-        """Fault of the line as a whole; None while samples come."""
+        """Fault of the line as a whole; None while samples arrive."""
 
     @property
     @abstractmethod
@@ -68,8 +71,8 @@ class DeviceProtocol(ABC):
         """Decode one read of the line.
 
         Args:
-            arrival_s: When it came, on any clock that never steps back [s].
-            data: What came.
+            arrival_s: Arrival time, on any clock that never steps back [s].
+            data: Received bytes.
 
         Returns:
             Samples, shape (n,), n may be 0.
@@ -121,7 +124,7 @@ class DeviceProtocol(ABC):
 
 
 def cell_block(rows: Sequence[Sequence[float]]) -> CellBlock:
-    """Cell voltages of samples that may tell of more or fewer cells [V]."""
+    """Cell voltages of samples with different numbers of cells [V]."""
     cells = max(map(len, rows), default=0)
     if cells == 0:
         return NO_CELLS

@@ -1,4 +1,4 @@
-"""Devices that speak when they are asked, in frames with a checksum: what ``jbd``, ``daly`` and ``jk`` share."""
+"""Devices that respond to requests in frames with a checksum: common parts of ``jbd``, ``daly`` and ``jk``."""
 
 import math
 import re
@@ -27,7 +27,7 @@ FRESH_S = 3.0
 
 
 class ParseResult(Enum):
-    """Result at a possible frame start whose length is unknown."""
+    """Result at a possible frame start with unknown length."""
 
     MORE = "its beginning has not come yet"
     NOISE = "no frame of this device"
@@ -167,7 +167,10 @@ class PolledProtocol(ReadingProtocol):
         self._noise += count
 
     def _is_other(self, address: int) -> bool:
-        """Return True if a response is from another pack; without a configured address the first response selects ours."""
+        """Return True if a response is from another pack.
+
+        Without a configured address the first response selects the pack.
+        """
         if self._address is None:
             self._address = address
         if address == self._address:

@@ -46,7 +46,7 @@ _KNOWN = {
     for name in names
     for unit in _UNITS[field]
 }
-"""Name in a line: what it is, and its unit if the name holds it."""
+"""Name in a line: its quantity, and its unit if the name contains it."""
 
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 _PAIR = re.compile(
@@ -100,7 +100,7 @@ def _told(said: Iterable[Said]) -> Reading | None:
     """Return the reading of named values.
 
     Raises:
-        ValueError: A name comes twice, or has an unknown unit or the wrong number of values.
+        ValueError: A name is duplicated, or has an unknown unit or the wrong number of values.
     """
     found: dict[str, list[float]] = {}
     for name, values, unit in said:
@@ -134,7 +134,7 @@ def sample_json_line(
         current_a: As the device counts it [A]; ``sensor.current_sign`` gives the sign.
         temperature_c: None or NaN: not measured [degC].
         cells_v: Of single cells, from the first on; None or NaN: this one was not measured [V].
-        time_s: When it was measured by the device's clock, whatever that counts from; None: it does not say [s].
+        time_s: Time of measurement by the device's clock, with any origin; None: not reported [s].
 
     Raises:
         ValueError: Voltage or current is no number.

@@ -1,4 +1,4 @@
-"""Devices that tell of the pack reading by reading: what their decoders have in common."""
+"""Devices that report the pack reading by reading: common parts of their decoders."""
 
 import math
 from abc import abstractmethod
@@ -100,7 +100,7 @@ class RecentCellVoltages:
         self._arrival_s, self._cells_v = -math.inf, tuple[float, ...]()
 
     def keep(self, arrival_s: float, cells_v: Sequence[float]) -> None:
-        """Store the values that came now."""
+        """Store the received values."""
         self._arrival_s, self._cells_v = arrival_s, tuple(cells_v)
 
     def at(self, arrival_s: float) -> tuple[float, ...]:

@@ -8,6 +8,6 @@ class Relay(NamedTuple):
 
     high: bool
     high_when_silent: bool | None
-    """Level once no command of this kind has come for ``silent_s``; None: it stays as it is."""
+    """Level after ``silent_s`` without a command of this kind; None: it stays as it is."""
     silent_s: int = 0
     """0..3600."""

@@ -22,7 +22,7 @@ COMMANDS = range(0x90, 0x99)
 START, DATA_BYTES, FRAME_BYTES = 0xA5, 8, 13
 HOSTS = (0x40, 0x80)
 PACKS = range(0x01, 0x40)
-"""Addresses that answers come from."""
+"""Addresses of responses."""
 NO_CURRENT = 30000
 ZERO_C = 40
 """0 degC; 0 is a probe that is not there."""
@@ -43,7 +43,7 @@ class DalyProtocol(PolledProtocol):
     """The conversation with a Daly BMS: how many cells it has until that is known, then cells, probes, pack in each round.
 
     Args:
-        current_sign: What it calls positive; by its documentation discharge.
+        current_sign: Direction of positive current; by its documentation discharge.
         address: Of several BMS on one line, the one that is taken; None: the first that answers.
     """
 
@@ -59,7 +59,7 @@ class DalyProtocol(PolledProtocol):
 
     @property
     def description(self) -> str | None:
-        """Number of cells, once that and a sample have come."""
+        """Number of cells, once that and a sample have arrived."""
         return f"Daly BMS, {self._cells} cells" if self._told and self._cells is not None else None
 
     def on_port_opened(self) -> None:
@@ -113,7 +113,7 @@ class DalyProtocol(PolledProtocol):
         return Reading(decivolts / 10, (deciamperes - NO_CURRENT) / 10, self._mean_c(there_c), tuple(cells_v))
 
     def _joined(self, frames: Mapping[int, Sequence[float]], each: int, count: int | None) -> list[float]:
-        """Values of all frames in the order of their numbers, NaN where one did not come.
+        """Values of all frames in the order of their numbers, NaN for a missing one.
 
         Args:
             frames: By their numbers.

@@ -1,7 +1,8 @@
 """JBD, also sold as Xiaoxiang, LLT Power, Overkill Solar: UART or RS485 at 9600 baud.
 
-Question: ``DD A5 register 00 checksum 77``. Answer: ``DD register status length data checksum 77``, big-endian. The checksum is
-0x10000 less the sum of what stands before it from the third byte on. Current: 10 mA, positive on charge. By the register
+Question: ``DD A5 register 00 checksum 77``. Answer: ``DD register status length data checksum 77``, big-endian. The
+checksum is 0x10000 less the sum of all bytes before it from the third on. Current: 10 mA, positive on charge. By the
+register
 map of bms-tools ("negative values indicate discharge") and the captures of esphome-jbd-bms and aiobmsble.
 """
 
@@ -33,7 +34,7 @@ def checksum(data: bytes) -> bytes:
 
 
 def question(register: int) -> bytes:
-    """Asks for a register; changes nothing."""
+    """Build the request for a register; changes nothing."""
     return bytes((START, READ, register, 0)) + checksum(bytes((register, 0))) + bytes((END,))
 
 
@@ -41,7 +42,7 @@ class JbdProtocol(PolledProtocol):
     """The conversation with a JBD BMS: name until it is known, then cells and basic information in each round.
 
     Args:
-        current_sign: What it calls positive; by its documentation charge.
+        current_sign: Direction of positive current; by its documentation charge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
@@ -52,7 +53,7 @@ class JbdProtocol(PolledProtocol):
 
     @property
     def description(self) -> str | None:
-        """Name and number of cells, once its basic information has come."""
+        """Name and number of cells, once its basic information has arrived."""
         return None if self._cells is None else f"JBD BMS {self._model}".rstrip() + f", {self._cells} cells"
 
     def _query_variants(self) -> Sequence[Sequence[bytes]]:

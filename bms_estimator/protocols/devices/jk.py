@@ -67,7 +67,7 @@ OLD_QUESTION = old_sealed(OLD_START + bytes((0, 19, 0, 0, 0, 0, READ_ALL, 3, 0, 
 
 
 def question(address: int) -> bytes:
-    """Have a pack tell its real-time frame: to Modbus a write, which only this BMS takes for a question."""
+    """Build the request for a pack's real-time frame: a Modbus write, which only this BMS takes as a request."""
     frame = struct.pack(">BBHHBH", address, MODBUS_WRITE, REALTIME_REGISTER, 1, 2, 0)
     return frame + crc16(frame)
 
@@ -76,7 +76,7 @@ class JkProtocol(PolledProtocol):
     """The conversation with a JK-BMS.
 
     Args:
-        current_sign: What it calls positive; by its documentation charge.
+        current_sign: Direction of positive current; by its documentation charge.
         address: Of several packs on one line, the one that is taken; None: the first that answers.
     """
 
@@ -179,7 +179,7 @@ class JkProtocol(PolledProtocol):
 
 
 def _registers(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Code and content of each, up to the first that is not known; the protocol's version, which comes last, in any case."""
+    """Yield code and content of each register up to the first unknown one, and of the protocol version at the end."""
     if data[-2:-1] == bytes((VERSION,)):
         yield VERSION, data[-1:]
     at = 0

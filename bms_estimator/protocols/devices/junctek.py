@@ -1,9 +1,10 @@
 """Battery monitors of Junctek (Juntek), series KG-F, KH-F and KL-F, on their RS-485 or TTL port: lines of ASCII.
 
-Asked ``:R50=ADDRESS,2,1,``, a monitor answers ``:r50=ADDRESS,CHECKSUM,VALUE,...,``; the checksum is 1 plus the sum of the
+A monitor answers ``:R50=ADDRESS,2,1,`` with ``:r50=ADDRESS,CHECKSUM,VALUE,...,``; the checksum is 1 plus the sum of
+the
 values modulo 255 (the manuals' chapters on the protocol). Of the values: voltage [10 mV] first, current [10 mA] second,
-temperature plus 100 [degC] seventh, direction tenth: 0 discharge, 1 charge. The monitor's own display asks, too, on the
-same line: its answers are as good.
+temperature plus 100 [degC] seventh, direction tenth: 0 discharge, 1 charge. The monitor's own display polls on the
+same line; its responses are used as well.
 """
 
 import math
@@ -30,7 +31,7 @@ TOO_LONG = "bytes come that are no lines of a Junctek monitor: it has 115200 bau
 
 
 class JunctekProtocol(ReadingProtocol):
-    """Lines of a battery monitor to samples. It is asked once a second.
+    """Lines of a battery monitor to samples. It is polled once a second.
 
     Args:
         current_sign: Of the current that its direction makes positive on charge.

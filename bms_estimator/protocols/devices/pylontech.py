@@ -3,7 +3,7 @@
 Text for people: ``pwr`` prints a table of all batteries in parallel, ``bat N`` one of the cells of battery N, each
 followed by a prompt. Voltages in mV, currents in mA and positive on charge, temperatures in thousandths of a degree
 Celsius.
-There is no checksum: a table is taken that ended with the word of success, and each of whose rows can be read.
+There is no checksum: a table is accepted if it ends with the success message and each of its rows can be read.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""Boards that print text, as every hobby sketch does: ``protocols.base.reading`` says what a line may be."""
+"""Boards that print text: ``protocols.base.reading`` defines the lines."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ SHOWN_BYTES = 60
 class TextProtocol(DeviceProtocol):
     """Lines of a board to samples. It takes no commands.
 
-    Lines that say nothing are counted and skipped. Lines that tell no ``time_s`` share the time since the read before
+    Lines without values are counted and skipped. Lines without ``time_s`` divide the time since the previous read
     evenly. How the bytes are cut into reads changes no value but these times.
 
     Args:

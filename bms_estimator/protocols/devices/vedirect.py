@@ -2,8 +2,8 @@
 
 A block each second: lines of CR LF, label, tab and value, the last of them ``Checksum`` with one byte that makes the sum of all
 bytes of the block 0 modulo 256 (Victron's VE.Direct protocol and its FAQ). V in mV, I in mA and positive on charge, T in
-degrees Celsius where there is a sensor. A second block tells of history. HEX messages, ``:`` to the end of the line, may
-stand in between and belong to no checksum.
+degrees Celsius where there is a sensor. A second block contains history. HEX messages, from ``:`` to the end of the
+line, may appear in between and belong to no checksum.
 """
 
 import re

@@ -1,6 +1,6 @@
 """Rate of the board's clock by the host's: a line under the arrival times of its samples.
 
-A sample comes late by what the line, the USB bridge and the host's scheduler take, never early. Therefore only the
+A sample is late by the delay of line, USB bridge and scheduler, and never early. Therefore only the
 sample with the smallest delay in each ten seconds counts, and of those the lower hull: the line lies under all of
 them (Moon, Skelly, Towsley 1999). However many others were held up changes nothing. It moves no time stamp.
 """

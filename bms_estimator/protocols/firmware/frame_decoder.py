@@ -66,8 +66,8 @@ class FrameCounters:
     """Temperatures that no pack has: handed on as not measured."""
     resets: int = 0
     clock_jumps: int = 0
-    """Times that the board's clock was restarted by arrival: a sample came long before its timestamp, or its
-    timestamp advanced by more than arrival, sequence numbers or a gap explain."""
+    """Number of times that the board's clock was restarted by arrival: a sample arrived long before its timestamp, or
+    its timestamp advanced by more than arrival, sequence numbers or a gap explain."""
 
     def as_dict(self) -> dict[str, int]:
         """Return the counters by name."""
@@ -98,7 +98,10 @@ class FrameDecoder:
 
     @property
     def hello(self) -> Hello | None:
-        """The board's last; None before it, after a reset whose hello was lost, and where another board may be there."""
+        """The board's last.
+
+        None before it, after a reset without a hello, and while another board may be connected.
+        """
         return self._hello if self._state["boot_id"][0] >= 0 else None
 
     @property
@@ -143,7 +146,7 @@ class FrameDecoder:
 
     @property
     def fault(self) -> FrameFault | None:
-        """Fault of the line as a whole; None while frames come."""
+        """Fault of the line as a whole; None while frames arrive."""
         state = self._state[0]
         if state["bytes_received"] - state["heard_at"] > DEAF_BYTES:
             return FrameFault.TEXT if self._printable > DEAF_BYTES else FrameFault.WRONG_BAUD
@@ -168,7 +171,7 @@ class FrameDecoder:
         self._hello = None
 
     def take_acks(self) -> list[Ack]:
-        """Answers to commands that came since the last call."""
+        """Responses to commands since the last call."""
         acks, self._acks = self._acks, []
         return acks
 
@@ -176,12 +179,12 @@ class FrameDecoder:
         """Decode one read of the line.
 
         Args:
-            arrival_s: When it came, on any clock that never steps back [s].
-            data: What came.
+            arrival_s: Arrival time, on any clock that never steps back [s].
+            data: Received bytes.
 
         Returns:
             Samples, shape (n,), n may be 0. ``time_s`` is the board's clock since the first of them, unwrapped;
-            across a reset of the board it goes on by arrival.
+            across a reset of the board it continues by arrival.
         """
         block = self.feed_reads(np.array([arrival_s]), np.array([len(data)]), np.frombuffer(data, dtype=np.uint8))
         if self._state["heard_at"][0] + DEAF_BYTES < self._state["bytes_received"][0]:
@@ -194,7 +197,7 @@ class FrameDecoder:
         """Decode many reads of the line at once: the same samples as ``feed`` for each.
 
         Args:
-            arrivals_s: Shape (reads,): when each came [s].
+            arrivals_s: Shape (reads,): arrival time of each read [s].
             ends: Shape (reads,): where in ``data`` each ends.
             data: Their bytes, one behind the other.
 

@@ -276,7 +276,7 @@ def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
 
 @njit(cache=True)
 def require_new_hello(d: Record, arrival_s: float) -> None:
-    """Another board may have been wired to the open port, with another scaling: only a hello tells."""
+    """Another board with another scaling may be connected to the open port; only a hello shows it."""
     d.boot_id = -1
     d.doubted_s = arrival_s
 
@@ -378,7 +378,7 @@ def decode(
         data: Bytes of one or more reads of the line.
         begin: Start index, 0 at first.
         ends: Shape (reads,): where in ``data`` each read ends, increasing; the last is ``data.size``.
-        arrivals_s: Shape (reads,): when each read came.
+        arrivals_s: Shape (reads,): arrival time of each read.
         decoder: Shape (1,), dtype DECODER; updated.
         scaling: Shape (1,), dtype SCALING; updated.
         samples: Output, dtype SAMPLE.

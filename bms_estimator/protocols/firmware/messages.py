@@ -1,6 +1,6 @@
 """The messages of the serial line, one at a time (firmware/PROTOCOL.md): commands to the board, its hello and its acks.
 
-Samples in bulk are decoded by ``wire.framing``; this codec is for what is rare, for the virtual board and for tests.
+Samples in bulk are decoded by ``wire.framing``; this codec is for rare messages, for the virtual board and for tests.
 """
 
 import binascii
@@ -132,7 +132,7 @@ def zero_current_command() -> bytes:
 
 
 def set_serial_command(serial: int) -> bytes:
-    """Give the board a serial number, 1..2^32 - 1, for good."""
+    """Build the command to store a serial number, 1..2^32 - 1."""
     return command(MessageType.COMMAND_SET_SERIAL, struct.pack("<I", serial))
 
 

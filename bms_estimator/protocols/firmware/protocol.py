@@ -39,7 +39,7 @@ class _Told(Command):
 
 
 class BoardProtocol(DeviceProtocol):
-    """The conversation with a board. It samples by itself: before a whole frame has come it is sent nothing.
+    """The conversation with a board. It samples by itself: nothing is sent before a complete frame has arrived.
 
     Args:
         current_sign: What the board calls positive; samples are positive on discharge.
@@ -104,7 +104,7 @@ class BoardProtocol(DeviceProtocol):
             self._told.done = True
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is as ``FrameDecoder.feed`` says."""
+        """Decode one read of the line; ``time_s`` is that of ``FrameDecoder.feed``."""
         block = self._decoder.feed(arrival_s, data)
         if self._told is not None:
             self._follow(self._told)
@@ -125,7 +125,7 @@ class BoardProtocol(DeviceProtocol):
         return wanted
 
     def command(self, name: str) -> Command:
-        """``current_zero``: take the present current as zero, for good.
+        """``current_zero``: take the present current as zero, stored permanently.
 
         Raises:
             UserError: Any other.
