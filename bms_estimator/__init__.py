@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from bms_estimator.sources.captures.replay import load_capture
 
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
-"""Highlighting starts colorama, whose exit handler would wait for a terminal that nobody reads."""
+"""Highlighting starts colorama, whose exit handler would block on an unread terminal."""
 
 __all__ = ["Estimator", "__version__", "estimate", "identify", "load_capture", "load_cell", "validate"]
 
