@@ -66,7 +66,7 @@ class SimulatedPack:
 
     Args:
         cell: The pack as one object.
-        load: What it is under.
+        load: Load profile.
         soc: At time 0, 0..1; the pack is at rest then.
     """
 

@@ -65,7 +65,7 @@ _PATIENCE_S = 1.0
 _LOOK_S = 0.01
 """Interval at which a new host is looked for [s]."""
 _BOOT_S = 0.2
-"""Opening the port resets a board; it starts when the host has long thrown away what it found on the line [s]."""
+"""Opening the port resets a board; it starts after the host has discarded the old bytes on the line [s]."""
 _BURST = 256
 _BOOT_READINGS = 256
 _NEAR_MIDDLE = 0.1
@@ -101,8 +101,8 @@ class VirtualBoard:
     """A board on a pseudo-terminal. Open it as a context manager, then ``run`` it.
 
     Args:
-        signal: What is at its sensors.
-        rate_hz: Samples per second until the host asks for others.
+        signal: The simulated pack.
+        rate_hz: Samples per second until the host requests another rate.
         mode: ``text`` prints ``voltage,current,temperature`` lines and takes no commands.
         speed: Board seconds per second; ``math.inf``: as fast as the host reads.
         parts: Its parts as built.

@@ -1,6 +1,6 @@
 """Sinks of estimates: MQTT, terminal, CSV and Parquet files.
 
-All sinks are peers: async context managers whose ``publish`` neither blocks nor fails.
+All sinks are peers: async context managers with a ``publish`` that neither blocks nor fails.
 """
 
 from typing import Protocol, Self
@@ -18,4 +18,4 @@ class Sink(Protocol):
         """Start."""
 
     async def __aexit__(self, *_: object) -> None:
-        """Hand over what is pending and end."""
+        """Hand over queued messages and end."""

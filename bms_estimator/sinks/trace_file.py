@@ -141,7 +141,7 @@ def _csv_writer() -> Callable[[NDArray[np.void]], bytes]:
 
 
 def _lines(trace: NDArray[np.void]) -> bytes:
-    """Rows as CSV, floats with as many digits as tell them apart."""
+    """Rows as CSV, with enough digits to restore each float exactly."""
     columns = [map(repr, trace[name].tolist()) for name in trace.dtype.names or ()]
     return ("\n".join(map(",".join, zip(*columns, strict=True))) + "\n").encode()
 

@@ -14,7 +14,7 @@ KINDS: Mapping[str, str] = {
     "can": "fieldbus.can",
     "ble": "bluetooth.source",
 }
-"""Modules by ``source.kind``, whose ``bringer(settings)`` makes the line producer."""
+"""Modules by ``source.kind``, with a ``bringer(settings)`` that creates the line producer."""
 
 
 def make_line_producer(settings: Settings) -> LineProducer | None:

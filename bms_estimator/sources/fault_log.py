@@ -1,4 +1,4 @@
-"""Faults of a line go to the log rarely: junk may come for days."""
+"""Faults of a line are logged at a limited rate, because junk may arrive for days."""
 
 import math
 from collections.abc import Mapping
@@ -8,13 +8,14 @@ import structlog
 JUNK_LOG_S = 30.0
 """Faults are logged no more often than this [s]."""
 _NO_FAULTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects", "retained")
-"""Bytes and samples before the hello are usual where opening the port does not reset the board; so is what a broker has kept."""
+"""Bytes and samples before the hello are usual where opening the port does not reset the board; so is a retained
+message."""
 
 log = structlog.get_logger(__name__)
 
 
 class FaultLog:
-    """Says that there are new ones."""
+    """Logs new faults."""
 
     def __init__(self) -> None:
         self._logged, self._logged_s = 0, -math.inf

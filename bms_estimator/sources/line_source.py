@@ -28,7 +28,7 @@ log = structlog.get_logger(__name__)
 
 
 class SourceUnavailableError(Exception):
-    """The source cannot be reached, or was lost; the message says why. It may become available later."""
+    """The source cannot be reached, or was lost; the message gives the reason. It may become available later."""
 
 
 class LineProducer(ABC):
@@ -41,7 +41,7 @@ class LineProducer(ABC):
 
     @abstractmethod
     def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """Connect; then ``CONNECTED``, and lines as ``sample_json_line`` makes them, as they come.
+        """Connect; then ``CONNECTED``, and lines of ``sample_json_line`` as they arrive.
 
         Called again, after a pause, when it has ended or raised. It never blocks the event loop, and is closed at the end.
 
@@ -51,12 +51,12 @@ class LineProducer(ABC):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Faults of what came, by kind, since start: what could not be read or used."""
+        """Faults by kind since start: values that could not be read or used."""
         return {}
 
     @property
     def fault(self) -> str | None:
-        """Reason why no line comes though it is connected; None if unknown."""
+        """Reason why no line arrives although it is connected; None if unknown."""
         return None
 
     @property
@@ -77,8 +77,8 @@ class LineSource:
         tap: Gets the same (arrival time, line) as the decoder.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
-        first_retry_s: Before what is missing or lost is tried again; doubles with each attempt [s].
-        look_s: Interval of the check that samples come [s].
+        first_retry_s: Delay before a missing or lost device is retried; doubles with each attempt [s].
+        look_s: Interval of the check for samples [s].
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class LineSource:
 
     @property
     def message(self) -> str | None:
-        """Why no samples come; None when they do."""
+        """Reason why no samples arrive; None when they do."""
         return self._message
 
     @property
@@ -159,7 +159,7 @@ class LineSource:
             _done, tasks = await asyncio.wait(tasks, timeout=LOOK_S)
 
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:
-        """Blocks as lines come. What the tap gets is what has been yielded."""
+        """Blocks as lines arrive. The tap receives the lines of yielded blocks."""
         while (read := await self._lines.get()) is not None:
             block = self._decode(*read)
             if block.size:
@@ -192,7 +192,7 @@ class LineSource:
             self._say(f"{self._bringer.name}: {reason}; trying again")
 
     async def _pause(self) -> None:
-        """Each one is longer until a sample came."""
+        """Each one is longer until a sample arrives."""
         wait_s, self._retry_s = self._retry_s, min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
         await asyncio.sleep(wait_s)
 
@@ -216,7 +216,7 @@ class LineSource:
             await asyncio.sleep(self._look_s)
 
     def _say(self, message: str) -> None:
-        """Report why no samples arrive; in the log once for each reason, until samples come."""
+        """Report why no samples arrive; in the log once for each reason, until samples arrive."""
         if message != self._said:
             log.warning("no samples", reason=message)
         self._message = self._said = message

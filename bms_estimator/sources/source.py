@@ -15,7 +15,7 @@ class SourceHealth(NamedTuple):
     task_idle_s: float
     """Since its task last looked after the line, or tried to open it [s]."""
     block_age_s: float
-    """Since the bytes of the block that came last were read [s]."""
+    """Time since the bytes of the latest block were read [s]."""
     queued_reads: int
     """Chunks of the serial port that are waiting to be decoded."""
 
@@ -32,7 +32,7 @@ class ReadTap(Protocol):
 
 
 class Source(Protocol):
-    """An async iterator of SAMPLE blocks that knows its faults.
+    """An async iterator of SAMPLE blocks with fault counters.
 
     A serial board never ends by itself; a capture or a table ends with its last row.
     """
@@ -43,7 +43,7 @@ class Source(Protocol):
 
     @property
     def message(self) -> str | None:
-        """Why no samples come, for people; None when they do."""
+        """Reason why no samples arrive, for people; None when they do."""
 
     @property
     def board(self) -> Mapping[str, str]:

@@ -30,13 +30,13 @@ LOCKED_S = 5.0
 LOG_BYTES = 4 << 20
 """Maximum size of the write-ahead log [bytes]."""
 FREE_PAGES = 1024
-"""Number of free pages of 4 KiB that are kept for later rows."""
+"""Number of free pages of 4 KiB for later rows."""
 TRIMMED_PAGES = 4096
 """Maximum number of pages moved to shrink the file after one transaction."""
 UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT)
 """SQLite errors of a damaged file, at any time."""
 UNUSABLE_AT_OPEN = (*UNUSABLE, sqlite3.SQLITE_ERROR)
-"""SQLite errors of an unusable file while tables are checked and created: its tables are not ours."""
+"""SQLite errors of an unusable file while tables are checked and created: its tables have another schema."""
 
 Result = TypeVar("Result")
 
@@ -44,7 +44,7 @@ log = structlog.get_logger(__name__)
 
 
 class StoreError(Exception):
-    """The database cannot be used now; the text says why."""
+    """The database cannot be used now; the text gives the reason."""
 
 
 class Database:
@@ -179,7 +179,7 @@ class _File:
         return self._run(work)
 
     def _run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
-        """Open what is not open, close what has failed."""
+        """Open or close the file as necessary."""
         try:
             connection = self._opened()
             due = time.monotonic() - self._synced_s >= self._sync_s
@@ -197,7 +197,7 @@ class _File:
         return result
 
     def close(self) -> None:
-        """Close; what was not committed is undone."""
+        """Close; uncommitted changes are undone."""
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()

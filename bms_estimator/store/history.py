@@ -55,7 +55,7 @@ class History:
 
     Args:
         database: Where.
-        days: Number of days of one-minute rows that are kept.
+        days: Number of days of stored one-minute rows.
     """
 
     def __init__(self, database: Database, *, days: int) -> None:

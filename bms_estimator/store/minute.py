@@ -1,4 +1,4 @@
-"""A minute of a pack: means, extremes and sums of what was published in it. Pure."""
+"""A minute of a pack: means, extremes and sums of its publications. Pure."""
 
 import math
 from dataclasses import dataclass, field
@@ -63,7 +63,7 @@ class _Mean:
 
 @dataclass
 class MinuteAccumulator:
-    """The minute that goes on; ``time_s`` is its begin [s since 1970]."""
+    """The open minute; ``time_s`` is its begin [s since 1970]."""
 
     time_s: int
     _voltage: _Mean = field(default_factory=_Mean)

@@ -1,4 +1,4 @@
-"""Numbers in ascending order, kept as runs without a hole: a day of them is one run. Pure."""
+"""Numbers in ascending order, stored as runs without a gap: a day of them is one run. Pure."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,8 @@
 """Messages that must reach the broker: they wait here, oldest first, until it has acknowledged them.
 
-While the broker takes what comes nothing is written. While it is away, or behind, what waits goes to disk each
-``FLUSH_S``, and only a page of it stays in memory. ``kill -9`` costs at most what came since, a clean end nothing.
+While the broker accepts messages nothing is written. While it is away, or behind, queued messages are written to disk
+every ``FLUSH_S``, and only a page of them stays in memory. ``kill -9`` loses at most the messages since then, a clean
+end nothing.
 """
 
 import asyncio
@@ -55,7 +56,7 @@ class Outbox:
         return self._queue.dropped
 
     async def __aenter__(self) -> Self:
-        """Start to look after what is on disk."""
+        """Start reading the messages on disk."""
         if self._database is not None:
             self._task = asyncio.create_task(self._stay_saved(), name="outbox")
         return self
@@ -122,7 +123,7 @@ class Outbox:
         return oldest is not None and (not self.connected or (len(self._seen) == BEHIND and oldest < self._seen[0]))
 
     async def _settle(self, *, write: bool) -> None:
-        """Bring disk and memory together; without the disk memory goes on alone."""
+        """Bring disk and memory together; without the disk, memory continues alone."""
         assert self._database is not None  # noqa: S101
         queue = self._queue
         try:

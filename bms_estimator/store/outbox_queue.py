@@ -31,10 +31,10 @@ class Queue:
         dropped: Messages that found no room.
         next: The number of the next message.
         in_flight: Sent and not yet acknowledged.
-        stale: Whether something may be on disk that is not kept any more.
-        disk_state_known: True if the content of the disk is known; if not, what is in memory is written again.
-        stored: What is on disk alone.
-        skip_disk: Hand out what came last though older ones are on disk, which cannot be read.
+        stale: True if the disk may contain messages that are not queued any more.
+        disk_state_known: True if the content of the disk is known; if not, the messages in memory are written again.
+        stored: Messages on disk only.
+        skip_disk: Return the newest messages although older ones are on disk, which cannot be read.
     """
 
     most: int
@@ -134,7 +134,7 @@ class Queue:
             runs: Their numbers on disk.
 
         Returns:
-            What makes numbers on disk of ours.
+            Offset from the numbers on disk to those of the queue.
         """
         first = self._tail[0].number if self._tail else self.next
         if not runs:

@@ -46,7 +46,7 @@ class Outcome(NamedTuple):
     """Result of one transaction."""
 
     stored: NumberRanges | None
-    """Messages on disk alone before it, where it was asked."""
+    """Number of earlier messages on disk only, if requested."""
     page: list[QueuedMessage]
     """The oldest of them, without those that are damaged."""
     page_end: int

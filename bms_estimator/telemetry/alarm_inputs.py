@@ -35,7 +35,7 @@ class _Input:
     _missing_s: float | None = None
     """Time since the first sample in a row that lacks a value [s]; None: the last sample had all."""
     _back_s: float | None = None
-    """Time since the first value after a loss [s]; None: none has come."""
+    """Time since the first value after a loss [s]; None: no value yet."""
 
     def take(self, times_s: Floats, steps_s: Floats, counts: Counts, lost_s: float) -> list[float]:
         """Take the number of values in each sample. Returns the times at which it was lost or measured again [s]."""

@@ -24,8 +24,8 @@ _NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
 class Steps:
     """Times between samples. Between two samples a value is assumed to hold, unless there is a gap.
 
-    A gap is much longer than the longest step shortly before. Samples that come in bursts have one long step for each
-    burst: from the second on these are no gaps.
+    A gap is much longer than the longest step shortly before. Samples that arrive in bursts have one long step for
+    each burst: from the second on these are no gaps.
 
     Attributes:
         gap_s: Minimum length of a gap [s].

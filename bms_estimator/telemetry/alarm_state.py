@@ -1,4 +1,4 @@
-"""One alarm: hysteresis, delays, latch. Pure: it knows the time of the samples and no clock."""
+"""One alarm: hysteresis, delays, latch. Pure: it uses the time of the samples and no clock."""
 
 import math
 from dataclasses import dataclass
@@ -29,10 +29,10 @@ class AlarmTransition(NamedTuple):
 
 @dataclass
 class AlarmState:
-    """An alarm as it stands.
+    """State of an alarm.
 
     Attributes:
-        watched: What is watched.
+        watched: Definition of the alarm.
         raising: Of an alarm that is active; None of one that is not.
         cause_cleared: The cause is gone, but it is latched.
         acknowledged: True if acknowledged: the alarm ends once its cause is gone.
@@ -52,7 +52,7 @@ class AlarmState:
     """Time for which the condition of the next state has held [s]; None: it does not hold."""
 
     def take(self, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float) -> list[AlarmTransition]:
-        """Take values as they came.
+        """Take values in the order of their arrival.
 
         Args:
             times_s: Shape (n,): when, on the samples' clock [s].
@@ -113,7 +113,7 @@ class AlarmState:
         return True
 
     def _turn(self, at_s: float, value: float, wall_s: float) -> list[AlarmTransition]:
-        """Go to the next state. Returns what others need to know of it."""
+        """Go to the next state. Returns the transition for others."""
         if self.raising is None:
             return self.raise_at(at_s, RaisedAlarm(at_s + wall_s, value if math.isfinite(value) else None))
         if self.cause_cleared:  # it is back

@@ -35,7 +35,7 @@ def alarm_text(watched: AlarmDefinition, value: float | None, reasons: Sequence[
 
     Args:
         watched: The alarm.
-        value: What was measured when it was raised; None: there is no number.
+        value: Measured value when it was raised; None: there is no number.
         reasons: Other known causes.
         gone: The cause is gone, but the alarm is latched.
     """

@@ -33,7 +33,7 @@ ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 INPUTS = "inputs"
 """Key of the saved state of measured quantities, beside the alarms' names."""
 SILENCE = "silence"
-"""Key of the saved reason why no samples came."""
+"""Key of the saved reason why no samples arrived."""
 SHARE_S = 1.0
 """Minimum time over which lost and unusable samples are compared with good ones [s]."""
 
@@ -43,7 +43,7 @@ class SampleCounts(NamedTuple):
 
     good: int
     bad: int
-    """Lost on the line, damaged, or refused by the estimator for what they hold."""
+    """Lost on the line, damaged, or rejected by the estimator."""
 
 
 class Change(NamedTuple):
@@ -82,7 +82,7 @@ class AlarmEvaluator:
     """The alarms of one pack.
 
     Args:
-        watched: What is watched.
+        watched: Definitions of the alarms.
         charging_a: From this current into the pack on it is charged [A].
         gap_s: A time between samples that is shorter is no gap [s].
         inputs: Measured quantities.
@@ -90,7 +90,7 @@ class AlarmEvaluator:
 
     Attributes:
         rows: Samples that wait to be judged.
-        kept: What outlives a restart, as ``restore`` takes it.
+        kept: State over a restart, for ``restore``.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class AlarmEvaluator:
         """Judge the alarm ``hook_failed``.
 
         Args:
-            failing: Hooks whose last attempt failed, each with its reason.
+            failing: Hooks whose last run failed, each with its reason.
             passed_s: Time since the last call [s].
             now_s: Wall clock [s since 1970].
         """
@@ -185,7 +185,7 @@ class AlarmEvaluator:
         self._keep()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
-        """Acknowledge an alarm, or all. Return the acknowledged ones: those whose cause has ended end by that.
+        """Acknowledge an alarm, or all. Return the acknowledged ones; those whose cause has ended end now.
 
         Args:
             name: Which; None: all.
@@ -208,7 +208,7 @@ class AlarmEvaluator:
 
     @property
     def unwatched(self) -> tuple[AlarmName, ...]:
-        """Critical alarms that cannot be watched though what they need was measured before."""
+        """Critical alarms that cannot be monitored although their quantity was measured before."""
         return tuple(name for name in self._unwatched if self._states[name].watched.severity == "critical")
 
     def changes(self) -> list[Change]:
@@ -285,7 +285,7 @@ class AlarmEvaluator:
             self._changes.append(Change(at_s, self._alarm(self._states[name]), "watched"))
 
     def _reasons_unwatched(self) -> dict[AlarmName, str]:
-        """Reasons by alarm: no sample comes, or a quantity that it needs is lost."""
+        """Reasons by alarm: no sample arrives, or a required quantity is lost."""
         lost = self._inputs.lost
         found: dict[AlarmName, str] = {}
         for name in self._states:

@@ -41,13 +41,13 @@ class ChargeEnergy(NamedTuple):
 class ChargeEnergyMeter:
     """Counts what flows: straight between samples, nothing over a gap.
 
-    What comes is netted from one look at ``flow`` to the next: a current that is noise about zero must not count as energy
-    out and in.
+    Values are net between two readings of ``flow``, because current noise around zero must not count as energy out
+    and in.
 
     Args:
         before: Counted by the runs before.
         gap_s: A step longer than this is a gap, unless the one before was about as long [s]; as ``kernels.step.is_gap``.
-        sums: Shape (1,), dtype ``FLOW_SUMS``: what it counts in, where that outlives it.
+        sums: Shape (1,), dtype ``FLOW_SUMS``: external storage of the sums, if it is shared.
     """
 
     def __init__(self, before: ChargeEnergy, gap_s: float, sums: NDArray[np.void] | None = None) -> None:

@@ -33,7 +33,7 @@ def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parame
 
 
 def ln_covariance(estimator: Estimator) -> np.ndarray:
-    """Covariance of the ln of what is learned, shape (n, n), by the data that are remembered and the bounds.
+    """Covariance of the ln of the learned parameters, shape (n, n), from the remembered data and the bounds.
 
     Information is in V^2 s; the leakage is that of bounds that are one standard deviation wide. What the model itself lacks
     is not in it.

@@ -24,7 +24,7 @@ _SAMPLE_COUNTERS = [
 
 
 def resident_mib() -> float | None:
-    """Resident memory of this process [MiB]; None where the system does not say."""
+    """Resident memory of this process [MiB]; None if the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * _PAGE_MIB
     except OSError:
@@ -101,10 +101,10 @@ def make_health_payload(
         clock_ppm: The source's.
         total: Counted over restarts.
         unseen_s: length of the last unmeasured gap [s]; None if there was none or it is unknown.
-        loop: How long what comes in waits.
+        loop: Delays of the event loop.
         recording: The state of one; None: nothing is recorded.
         edge: Of raw samples on their way; None: none are sent.
-        hooks: Successes and failures of alarm hooks; None: there are none.
+        hooks: Successes and failures of alarm hooks; None: none.
     """
     state = record["observer"]
     return Health(

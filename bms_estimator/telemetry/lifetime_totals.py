@@ -22,7 +22,7 @@ def new_totals(now_s: float) -> Totals:
 
 
 class LifetimeTotals:
-    """Takes blocks to the estimator and adds up what they tell.
+    """Passes blocks to the estimator and adds up their results.
 
     Args:
         estimator: Its counters are of this run.

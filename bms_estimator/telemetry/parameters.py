@@ -1,4 +1,7 @@
-"""Topic ``parameters``: a1..a21 and the elements, each with its error, where it comes from, and why it is not valid."""
+"""Topic ``parameters``.
+
+A1..a21 and the elements, each with its error, its source, and the reason if it is not valid.
+"""
 
 import math
 from functools import lru_cache

@@ -72,7 +72,7 @@ class Window:
         self._arrival_s = arrival_s
 
     def take(self) -> WindowSummary | None:
-        """Summary of all since the last call, None when nothing came."""
+        """Summary since the last call, None without a sample."""
         if self._last is None:
             return None
         n, first_s, voltage, current, power, temperatures, temperature = self._sums[0].item()

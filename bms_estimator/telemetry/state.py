@@ -36,11 +36,11 @@ def make_state_payload(
     """Topic ``state``.
 
     Args:
-        window: What came since the last publication.
+        window: Summary since the last publication.
         remaining: Remaining charge and energy.
         counters: The source's.
         now_s: Wall clock [s since 1970].
-        flow: What has gone through the terminals.
+        flow: Charge and energy at the terminals.
         capacity_ah: Of the pack, rated; None of a fuel cell.
     """
     values = zip(
@@ -110,7 +110,7 @@ def make_info_payload(
     Args:
         settings: The pack's settings.
         cell: The pack as one object.
-        board: What the board said of itself.
+        board: Properties that the board reported.
         started_s: Wall clock at start [s since 1970].
         temperature_sensor: Whether the cell's temperature is measured.
     """

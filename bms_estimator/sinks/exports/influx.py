@@ -27,7 +27,7 @@ from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.line_protocol import lines
 
 MOST_WAITING = 10_000
-"""Lines that wait for a server that is away, hours of states at one a second; then the oldest goes."""
+"""Lines that wait for a server that is away, hours of states at one a second; beyond it the oldest is dropped."""
 BATCH = 1000
 """Lines in one request, a megabyte at most."""
 ANSWER_S = 10.0
@@ -118,7 +118,10 @@ class InfluxSink:
             await self._task
 
     async def _run(self) -> None:
-        """Write what has come each ``every_s``, sooner when a batch is full; after a failure wait longer each time."""
+        """Write queued points every ``every_s``, sooner when a batch is full.
+
+        After a failure wait longer each time.
+        """
         delay_s = self._settings.every_s
         while True:
             await self._wait(self._closing if self._said else self._full, delay_s)

@@ -16,7 +16,7 @@ class Unit(NamedTuple):
 
     name: str
     factor: float = 1.0
-    """Ours times this is in it."""
+    """Factor from the payload's unit to this one."""
 
 
 UNITS = {
@@ -56,7 +56,7 @@ COUNTERS = (
 LEFT_OUT = ("soc_percent", "board_time_s")
 """Fields that repeat another one, or a clock with an arbitrary origin."""
 KINDS = {"line": "what the line counted", "samples": "samples by what became of them", "requests": "requests by kind"}
-"""Fields of the health that count by kind -> what they are."""
+"""Fields of the health payload that count by kind -> their help text."""
 OWN_NAMES = {"cells_v": "cell"}
 """Lists -> what one of them is."""
 

@@ -24,7 +24,7 @@ ALARM_CLASSES = {
 }
 """Device classes of alarms other than "problem"."""
 _SEES = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
-"""An alarm that is raised stays on: what it needs may be lost after it was raised."""
+"""A raised alarm stays on, although its quantity may be lost later."""
 NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
 """All that ``[home_assistant.names]`` may name."""
 
@@ -67,7 +67,7 @@ def discovery(
     """Return the discovery message.
 
     Args:
-        settings: How the pack is to stand there.
+        settings: Settings of Home Assistant.
         described: What there is of it.
         root: Topic of the device, ``bms/<device>``.
         sample_period_s: Between two samples [s].
@@ -156,7 +156,7 @@ def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
 
 
 def _sign(root: str, positive: str) -> dict[str, str]:
-    """Return the attribute that says which sign of the current is positive."""
+    """Return the attribute with the direction of positive current."""
     template = f"{{{{ {{'positive': '{positive}'}} | tojson }}}}"
     return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
 

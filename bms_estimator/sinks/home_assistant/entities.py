@@ -95,7 +95,7 @@ OF_CELLS = {
     "cell_highest": Entity("Highest cell", None, 0, 1.0, enabled=False, state_class=None),
     "cell_highest_v": _raw("Highest cell, voltage", "V", 3, "voltage"),
 }
-"""Entities of packs whose single cells are measured."""
+"""Entities of packs with cell voltages."""
 CELL = "cell_v"
 """Names all single cells, with their number behind."""
 ELEMENTS = {

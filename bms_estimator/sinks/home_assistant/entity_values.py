@@ -1,6 +1,6 @@
 """Values for Home Assistant: a value is published when it has moved and enough time has passed.
 
-Its recorder writes a row for each. Of entities that all move all the time those that have rested longest come first.
+Its recorder writes a row for each. If all entities change constantly, those that were unchanged longest come first.
 """
 
 import math
@@ -17,7 +17,7 @@ MINUTE_S = 60.0
 PAUSE_S = 5.0
 """Interval between two messages with values [s]."""
 HEARTBEAT_S = 10.0
-"""Values that have not changed are said again, so that they do not expire [s]."""
+"""Interval at which unchanged values are repeated, so that they do not expire [s]."""
 
 
 class EntityStates(NamedTuple):
@@ -40,7 +40,7 @@ def values_to_publish(
         snapshot: The snapshot.
         described: Which entities there are.
         now_s: Monotonic clock [s].
-        sign: -1: what is positive of current and power is charging.
+        sign: -1: charging is positive for current and power.
     """
     waited_s = now_s - shown.told_s
     if snapshot.estimate is None or waited_s < PAUSE_S:

@@ -105,7 +105,7 @@ def document(base_topic: str) -> Document:
 
 
 def _schemas() -> Document:
-    """JSON schemas of all models, and of what they are made of."""
+    """JSON schemas of all models and their parts."""
     models = [(topic.model, "serialization") for topic in TOPICS.values()]
     _, made = models_json_schema(models, ref_template="#/components/schemas/{model}")  # type: ignore[arg-type]  # a literal
     schemas: Document = made["$defs"]

@@ -21,12 +21,12 @@ log = structlog.get_logger(__name__)
 
 
 class AvailabilityMonitor:
-    """Hears what the broker gives back.
+    """Receives the own messages back from the broker.
 
     Args:
         own: What the availabilities must hold now; the service's own first.
         delivery: Corrections are counted there.
-        refusals: An ``online`` that does not come back is named there.
+        refusals: Reports an ``online`` that does not come back.
         wake: Called when it is time to ``correct``.
         echo_s: Until a broker has given back ``online`` [s].
     """
@@ -51,7 +51,7 @@ class AvailabilityMonitor:
         self._forged = False
 
     def record_published(self) -> None:
-        """All has been said just now."""
+        """Note that all messages were just sent."""
         self._forged = False
 
     def on_message(self, topic: str, payload: bytes) -> None:
@@ -67,7 +67,8 @@ class AvailabilityMonitor:
     async def correct(self, publish: Callable[[Sequence[Message]], Awaitable[None]]) -> None:
         """Put the availabilities right, if it is time.
 
-        Counted when the broker has taken it: one that ends says our will, and takes none.
+        Counted when the broker has acknowledged it, because a broker that ends publishes the will and acknowledges
+        nothing.
         """
         now_s = asyncio.get_running_loop().time()
         since_s = now_s - self._corrected_s

@@ -40,7 +40,7 @@ class MessageBuilder:
         base_topic: First part of all topics.
         device: Name of the pack.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
-        home_assistant: How the pack is to stand there.
+        home_assistant: Settings of Home Assistant.
         alarms: Those that are watched: what a broker keeps of others, from other settings, is removed.
 
     Attributes:
@@ -97,7 +97,7 @@ class MessageBuilder:
         """Return the other messages of a snapshot with content that the broker does not have yet.
 
         Args:
-            sent: What it got.
+            sent: State that the broker has.
             snapshot: The snapshot.
             now_s: Monotonic clock [s].
 
@@ -145,7 +145,7 @@ class MessageBuilder:
         return self._retained(SENSOR_AVAILABILITY, b"online" if health.sensor_online else b"offline")
 
     def _discovery(self, described: DiscoveryInputs) -> bytes:
-        """Empty, which removes the device, where Home Assistant is to know none."""
+        """Empty, which removes the device, if discovery is disabled."""
         return _json(discovery(self._home, described, self.root, self._sample_period_s)) if self._home.enabled else b""
 
     def _kept(self, topic: str, report: Payload) -> Message:

@@ -36,7 +36,7 @@ log = structlog.get_logger(__name__)
 
 
 class RequestDispatcher:
-    """Handlers by name, and who may call them how often.
+    """Handlers by name, with permissions and rate limits.
 
     Args:
         delivery: Requests are counted there, by what became of them.
@@ -62,7 +62,7 @@ class RequestDispatcher:
 
     @property
     def allowed(self) -> tuple[Command, ...]:
-        """Commands that are allowed, in the order in which all stand."""
+        """Allowed commands, in the order of ``COMMANDS``."""
         return tuple(command for command in COMMANDS if command in self._allowed)
 
     async def handle(self, name: str, payload: bytes) -> bytes | None:
@@ -95,9 +95,9 @@ class RequestDispatcher:
         """Count a request that is not granted; log the first of a burst.
 
         Args:
-            kind: Under what it is counted.
+            kind: Counter.
             name: Of the request.
-            why: Goes to the log.
+            why: Fields for the log.
         """
         self._counts[kind] += 1
         now_s = self._monotonic()

@@ -32,7 +32,7 @@ from bms_estimator.sinks.mqtt.requests import MOST_SHOWN, RequestDispatcher
 from bms_estimator.store.outbox import Outbox
 
 BIRTH_DELAY_S = 2.0
-"""Home Assistant says it is online some time before it listens [s]."""
+"""Home Assistant publishes its birth message some time before it listens [s]."""
 HANDOVER_S = 2.0
 """Time that waiting messages of the outbox may take at the end [s]."""
 CLOSING_S = 3.0
@@ -48,11 +48,11 @@ class MqttSink:
         settings: The brokers.
         device: Name of the pack in the topics.
         requests: Answers requests.
-        delivery: Where it is counted what became of what was sent.
+        delivery: Counters of sent messages.
         outbox: What must reach the broker.
         connect: Makes a connection; over TCP when left out.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
-        home_assistant: How the pack is to stand there.
+        home_assistant: Settings of Home Assistant.
         alarms: Those that are watched.
         first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
         birth_delay_s: From Home Assistant's birth message to the retained messages [s].
@@ -119,7 +119,7 @@ class MqttSink:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Publish what is pending and ``offline``, then part from the broker; one that does not take it publishes the will."""
+        """Publish queued messages and ``offline``, then disconnect; one that does not take it publishes the will."""
         if self._task is None:
             return
         self._link.closing.set()
@@ -150,7 +150,7 @@ class MqttSink:
             self._refusals.end()
 
     async def _subscribe(self, connection: Connection) -> None:
-        """Subscribe, and say what the broker refuses.
+        """Subscribe, and report what the broker denies.
 
         Subscribe at QoS 0: Mosquitto counts a message that it withholds as too long among the messages in flight,
         where it stays at QoS 1.
@@ -190,7 +190,7 @@ class MqttSink:
                 return
 
     async def _receive(self, connection: Connection) -> None:
-        """Answer requests, hear Home Assistant's birth, watch over the availabilities."""
+        """Answer requests, handle Home Assistant's birth message, and check the availability topics."""
         while True:
             message = await connection.receive()
             if message.topic == self._birth_topic:

@@ -1,7 +1,7 @@
 """Topics of all payloads, and their common version.
 
-``PAYLOAD_VERSION`` goes up by one when a topic or a field vanishes, or a field gets another type, unit or meaning: what a
-reader relied on. An addition does not increase it: readers ignore unknown fields.
+``PAYLOAD_VERSION`` increases by one when a topic or field disappears, or a field gets another type, unit or meaning.
+An addition does not increase it: readers ignore unknown fields.
 ``tests/sinks/mqtt/test_payloads.py`` remembers every field and its type.
 """
 
@@ -12,7 +12,7 @@ from bms_estimator.model.payloads import PAYLOAD_VERSION, Alarm, Estimate, Healt
 
 
 class Topic(NamedTuple):
-    """A topic whose payload is a model."""
+    """A topic with a model as payload."""
 
     model: type[Payload]
     qos: int

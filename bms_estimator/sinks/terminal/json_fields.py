@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 LARGEST = 1e12
-"""No number of a battery is larger; what is would only fill a screen."""
+"""No number of a battery is larger; longer text would only fill a screen."""
 LONGEST_TEXT = 400
 """Texts are shown so far [characters]."""
 

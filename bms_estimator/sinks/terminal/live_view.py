@@ -21,13 +21,13 @@ from bms_estimator.sinks.terminal.scene import BrokerOutage, PackView, ScreenSta
 from bms_estimator.sinks.terminal.text_line import line
 
 REDRAW_S = 0.25
-"""A screen is drawn no more often than this, whatever the publish rate [s]."""
+"""Minimum interval of drawing a screen, at any publish rate [s]."""
 HISTORY = 256
 """Publications that the curves of voltage and current remember: the width of a very wide screen."""
 WAITING_LINES = 1000
 """Maximum number of lines waiting for a pipe that is not read; then the oldest is dropped."""
 END_LINES = 4
-"""Lines kept free below the last view for final messages and the prompt."""
+"""Lines left free below the last view for final messages and the prompt."""
 CLOSE_S = 2.0
 """Time that the last view waits for a terminal that does not read [s]."""
 

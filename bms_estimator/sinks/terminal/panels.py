@@ -66,7 +66,7 @@ class Screen:
         self._scene = scene
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Rich's protocol: as wide and at most as high as the options say."""
+        """Rich's protocol: as wide and at most as high as the options."""
         wide = options.max_width >= WIDE_CELLS and options.max_height >= WIDE_LINES
         yield from fitted(_blocks(self._scene, options.max_width, wide=wide), console, options)
 
@@ -238,7 +238,7 @@ def _sparks(scene: ScreenState, width: int) -> Text:
 
 
 def _elements(elements: JsonFields) -> Table:
-    """Each element with its standard deviation and where it comes from; bold where it is valid."""
+    """Each element with its standard deviation and its source; bold where it is valid."""
     table = Table.grid(padding=(0, 1))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(justify="right", no_wrap=True, min_width=VALUE_CELLS)

@@ -10,7 +10,8 @@ from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.sinks.terminal.json_fields import JsonFields
 
 SILENT_S = 10.0
-"""A service says its health each second; silent for longer, it is not there, though it has not said so [s]."""
+"""Interval of a service's health messages; a service that is silent for longer counts as gone, although it has not
+reported so [s]."""
 ALARM = "alarm/"
 """Topics of alarms begin so."""
 
@@ -64,7 +65,7 @@ class PackView:
 
     @cached_property
     def alarms(self) -> list[JsonFields]:
-        """Return raised alarms and, while samples come, those that cannot be monitored."""
+        """Return raised alarms and, while samples arrive, those that cannot be monitored."""
         told = [JsonFields(payload) for topic, payload in self.topics.items() if topic.startswith(ALARM)]
         online = JsonFields(self.topics.get("health")).flag("sensor_online")
         return [alarm for alarm in told if alarm.flag("active") or (online and alarm.text("unwatched_reason"))]

@@ -7,7 +7,7 @@ from bms_estimator.sinks.terminal.scene import ALARM
 
 
 def line(heard: DeviceMessage, true_soc: float | None = None) -> str | None:
-    """One line; None of what is worth none.
+    """One line; None for messages of no interest.
 
     Args:
         heard: A message of a pack.

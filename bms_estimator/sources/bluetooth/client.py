@@ -1,4 +1,4 @@
-"""A BMS over Bluetooth, by aiobmsble and bleak: looked for, connected to, asked again and again."""
+"""A BMS over Bluetooth, by aiobmsble and bleak: found, connected and polled."""
 
 import asyncio
 import logging
@@ -22,7 +22,7 @@ SCAN_S = 15.0
 
 
 class BleBringer(LineProducer):
-    """Asks a BMS. It stays connected: most take seconds to connect.
+    """Polls a BMS. It stays connected: most take seconds to connect.
 
     Args:
         settings: Of the BMS.

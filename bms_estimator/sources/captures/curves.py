@@ -32,7 +32,7 @@ def read_curve(path: Path) -> CurveColumns | None:
         None when the file is no CSV or has no such columns.
 
     Raises:
-        UserError: It has, but what is in them is no curve.
+        UserError: The columns are there, but their values are not a curve.
     """
     rows = _rows(path, COLUMNS)
     return None if rows is None else _checked(path, rows, has_hysteresis=not np.isnan(rows[:, 2]).all())

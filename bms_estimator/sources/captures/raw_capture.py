@@ -86,7 +86,7 @@ def sensor_of(path: Path) -> SensorSettings:
     """Return the board settings of the capture ``path`` that decoding needs.
 
     Raises:
-        UserError: As ``read_header``, or this program does not know the board's protocol.
+        UserError: As ``read_header``, or the board's protocol is unknown.
     """
     header = read_header(path)
     try:
@@ -124,7 +124,7 @@ class CaptureWriter:
 
     Args:
         path: A file that does not exist yet.
-        header: What is recorded.
+        header: Header of the capture.
 
     Raises:
         UserError: The file exists or cannot be made.
@@ -158,7 +158,7 @@ class CaptureWriter:
         self._append(record + _CRC.pack(binascii.crc_hqx(record, 0xFFFF)))
 
     def sync(self) -> None:
-        """Wait until the disk has all: what is needed against a loss of power, not of the process."""
+        """Wait until all data are on disk, which is necessary only against a power failure."""
         os.fdatasync(self._descriptor)
 
     def close(self) -> None:

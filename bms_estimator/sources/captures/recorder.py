@@ -24,14 +24,17 @@ log = structlog.get_logger(__name__)
 
 
 class CaptureRecorder:
-    """A tap that writes a capture in a thread of its own; a context manager, whose end writes what waits.
+    """A tap that writes a capture in a thread of its own.
 
-    A disk that fails, or stays behind for too long, ends the recording and nothing else. What is in the file is whole.
+    A context manager that writes the remaining chunks at its end.
+
+    A disk that fails, or stays behind for too long, ends the recording and nothing else. The file contains complete
+    records only.
     One that hangs does not hold up the end, either.
 
     Args:
         path: A file that does not exist yet.
-        header: What is recorded.
+        header: Header of the capture.
         waiting_reads: Maximum number of chunks waiting for the disk.
         sync_s: Interval at which data are synced to the disk [s].
 

@@ -1,4 +1,4 @@
-"""A recorded capture as a source: as fast as it goes, or paced by its time stamps."""
+"""A capture as a source: at full speed, or paced by its timestamps."""
 
 import asyncio
 import itertools
@@ -21,7 +21,7 @@ from bms_estimator.sources.captures.raw_capture import is_capture, read_capture,
 from bms_estimator.sources.captures.tables import READERS, ColumnTable, Sign, samples_of, table_reader
 
 TICK_S = 0.05
-"""A paced replay hands over what has become due this often [s]."""
+"""Interval at which a paced replay returns due samples [s]."""
 
 
 class Capture(Protocol):
@@ -48,8 +48,8 @@ class RawCapture:
 
     Args:
         path: What ``CaptureWriter`` wrote.
-        sensor: How to decode; None: as the capture's header says.
-        current_sign: What its current calls positive; None: as ``sensor`` says.
+        sensor: How to decode; None: that of the capture's header.
+        current_sign: What its current calls positive; None: that of ``sensor``.
 
     Attributes:
         decoder: What the bytes have gone through so far.
@@ -86,7 +86,7 @@ class RawCapture:
         return self.decoder.counters["implausible"]
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of samples, as ``Capture`` says."""
+        """Blocks of samples, as in ``Capture``."""
         for batch in read_capture(self._path):
             self._read += batch.data.size + RECORD_OVERHEAD_BYTES * batch.ends.size
             self.damaged, self.unread_bytes = batch.damaged, batch.unread_bytes
@@ -101,9 +101,9 @@ class Replay:
     How the samples are cut into blocks never shows in the estimates.
 
     Args:
-        capture: What is replayed.
-        speed: Times as fast as it was recorded; None: as fast as it goes.
-        longest_s: As fast as it goes, blocks are cut so that none lasts longer on the samples' clock [s].
+        capture: Capture to replay.
+        speed: Times as fast as it was recorded; None: full speed.
+        longest_s: At full speed, maximum duration of a block on the samples' clock [s].
         monotonic: Monotonic clock [s].
     """
 
@@ -166,7 +166,7 @@ class Replay:
         return self._decoder.cells if self._decoder else NO_CELLS
 
     async def _paced(self, speed: float) -> AsyncIterator[SampleBlock]:
-        """Each sample once its time has come; the first is immediate."""
+        """Each sample at its time; the first is immediate."""
         start_s, last_s, elapsed_s = self._monotonic(), math.nan, 0.0
         for block in self.capture:
             due_s = elapsed_s + _elapsed(block["time_s"], last_s)
@@ -208,7 +208,7 @@ def open_capture(
     Args:
         path: The file.
         sensor: How to decode raw bytes, and what the current of a table calls positive unless its format lays that
-            down; None: as the header of raw bytes says, and discharge.
+            down; None: that of the header of raw bytes, otherwise discharge.
         current_sign: Direction of positive current, which overrides ``sensor``, header and format.
 
     Raises:

@@ -20,7 +20,7 @@ GZIP, PARQUET = b"\x1f\x8b", b"PAR1"
 
 @contextmanager
 def standard_input() -> Iterator[Path]:
-    """All of stdin as a file, named for what its first bytes say it is; closed on exit.
+    """All of stdin as a file, with the suffix of its format; closed on exit.
 
     Raises:
         UserError: It is closed; or as raised while it is used, its folder left out of the message.

@@ -40,7 +40,7 @@ SPELLINGS = (
     ColumnNaming("time_s", "current_a", "voltage_v", "temperature_c", None),
     ColumnNaming("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", "charge_positive"),
 )
-"""Ours, and the Battery Data Format."""
+"""This project's columns, and those of the Battery Data Format."""
 
 
 class Sign(NamedTuple):
@@ -218,7 +218,7 @@ READERS: dict[str, type[CsvTable | ParquetTable]] = {
     ".bdf.gz": CsvTable,
     ".parquet": ParquetTable,
 }
-"""End of a file's name -> who reads it."""
+"""Suffix -> reader."""
 
 
 def table_reader(path: Path, sign: Sign) -> CsvTable | ParquetTable | None:
@@ -269,7 +269,7 @@ def _columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
     """Find the columns.
 
     Raises:
-        UserError: Some are missing; the message says which, and what there is.
+        UserError: Some are missing; the message lists it and the existing columns.
     """
     spelling = max(SPELLINGS, key=lambda d: sum(name in header for name in d[:3]))
     missing = [name for name in spelling[:3] if name not in header]

@@ -59,7 +59,7 @@ class CanBringer(LineProducer):
 
     @property
     def fault(self) -> str | None:
-        """Reason why no reading comes."""
+        """Reason why no reading arrives."""
         if self._is_off:
             return "the controller is bus off: are bitrate, wiring and termination right?"
         missing = self._map.missing
@@ -120,7 +120,7 @@ class CanBringer(LineProducer):
             raise SourceUnavailableError(f"cannot be opened: {error}") from error
 
     def _next(self, bus: can.BusABC) -> can.Message | None:
-        """Return the next frame if it comes soon.
+        """Return the next frame if it arrives soon.
 
         Raises:
             SourceUnavailableError: The bus is lost.

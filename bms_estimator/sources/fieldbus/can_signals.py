@@ -87,7 +87,7 @@ class CanMap:
         settings: Where the values lie.
 
     Raises:
-        UserError: The DBC file cannot be read, or does not know a signal.
+        UserError: The DBC file cannot be read, or lacks a signal.
     """
 
     def __init__(self, settings: CanSource) -> None:

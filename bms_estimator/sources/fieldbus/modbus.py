@@ -1,4 +1,4 @@
-"""A Modbus device, over the network or over a serial line: asked for its registers again and again."""
+"""A Modbus device, on the network or on a serial line, polled for its registers."""
 
 import asyncio
 import logging
@@ -44,9 +44,9 @@ class _RefusedError(Exception):
 
 
 class ModbusBringer(LineProducer):
-    """Asks a device for its registers.
+    """Polls a device for its registers.
 
-    Quantities that a device refuses are found by asking for each by itself: without voltage or current nothing comes;
+    Quantities that a device rejects are found by separate requests: without voltage or current there are no samples;
     temperature and cells are left out.
 
     Args:
@@ -156,7 +156,7 @@ class ModbusBringer(LineProducer):
         raise SourceUnavailableError(f"{request.described}: {error}")
 
     def _leave_out(self, request: Request, error: _RefusedError) -> None:
-        """Say so once."""
+        """Log this once."""
         if request.described not in self._refused:
             self._refused.add(request.described)
             log.warning("left out", source=self.name, what=request.described, reason=str(error))

@@ -22,7 +22,7 @@ _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float
 
 
 class Value(NamedTuple):
-    """One register value and what it is of."""
+    """A register value and its quantity."""
 
     quantity: str
     """Key within ``[source]``: ``voltage``, ``current``, ``temperature``, ``cells``."""
@@ -35,7 +35,7 @@ class Value(NamedTuple):
 
 
 class Request(NamedTuple):
-    """Registers that one request asks for."""
+    """Registers of one request."""
 
     table: Table
     address: int

@@ -114,7 +114,7 @@ class LinuxSensor(LineProducer):
         """Return amperes per unit of the channel, by the shunt.
 
         Raises:
-            SourceUnavailableError: The settings do not say, or the driver does not.
+            SourceUnavailableError: Neither the settings nor the driver define it.
         """
         shunt_ohm = self._settings.shunt_ohm
         if current.kind == "in":

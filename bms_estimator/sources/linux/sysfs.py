@@ -1,4 +1,4 @@
-"""Sensors whose driver is in the kernel: folders of sysfs, found by the chip's name, and their values in SI.
+"""Sensors with a kernel driver: folders of sysfs, found by the chip's name, and their values in SI units.
 
 hwmon: ``in*_input`` [mV], ``curr*_input`` [mA], ``temp*_input`` [millidegC], ``shunt_resistor`` [uohm], ``update_interval``
 [ms], as the kernel's Documentation/hwmon/sysfs-interface.rst and ina2xx.rst have them. iio: a channel is ``<name>_raw``,

@@ -67,7 +67,7 @@ class MqttReports(LineProducer):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The assembly's; messages that were too long or came faster than they were read."""
+        """The assembly's; messages that were too long or arrived too fast."""
         return {**self._assembly.counters, **self._lost}
 
     @property

@@ -18,7 +18,7 @@ CELL = re.compile(r"\{cell\}")
 
 
 class InvalidValueError(Exception):
-    """A payload does not tell the quantity; the message gives the reason."""
+    """A payload without the quantity; the message gives the reason."""
 
     kind = "no_number"
     """Under which it is counted."""
@@ -45,10 +45,12 @@ def read_value(payload: bytes, place: ValueLocation, path: str) -> float:
 
 
 def read_cells(payload: bytes, place: ValueLocation, path: str) -> dict[int, float]:
-    """Cells by their numbers from 1: of a list, or of what ``{cell}`` in the path stands for. A cell that has no number is NaN.
+    """Cells by their numbers from 1.
+
+    From a list, or from the values of ``{cell}`` in the path. A cell that has no number is NaN.
 
     Raises:
-        InvalidValueError: There are none.
+        InvalidValueError: There are no cells.
     """
     found = dict(_cells(_parsed(payload, path), path))
     cells = {}

@@ -33,7 +33,7 @@ class _Message(NamedTuple):
 
     Attributes:
         is_back: The value returned to that before the last jump.
-        is_quick: It came sooner than one publisher would publish.
+        is_quick: It arrived sooner than one publisher would publish.
     """
 
     value: float
@@ -46,9 +46,10 @@ class _Message(NamedTuple):
 class PublisherConflict:
     """Detects a second publisher of one quantity on one topic.
 
-    Two publishers with different values make the value jump back and forth, and one of the two jumps comes sooner than one
-    publisher would publish. A load that switches on and off jumps, too, but in step with its publisher. If a publisher
-    sends changes only, such a load can look like two publishers; therefore values must also be repeated or come regularly.
+    Two publishers with different values make the value jump back and forth, and one of the two jumps arrives sooner
+    than one publisher would publish. A load that switches on and off jumps, too, but in step with its publisher. If a
+    publisher
+    sends changes only, such a load can look like two publishers; therefore values must also be repeated or regular.
 
     Args:
         min_jump: Smallest difference between two publishers, as a fraction of the larger value.
@@ -61,7 +62,10 @@ class PublisherConflict:
         self._levels: tuple[float, float] | None = None  # before and after the last jump
 
     def take(self, value: float, now_s: float) -> bool:
-        """Take a value that came at ``now_s`` of the monotonic clock [s]. Return whether there are two publishers."""
+        """Take a value that arrived at ``now_s`` of the monotonic clock [s].
+
+        Return whether there are two publishers.
+        """
         message = _Message(value, now_s)
         if self._messages and self._is_jump(self._messages[-1].value, value):
             before, levels = self._messages[-1], self._levels
@@ -86,9 +90,9 @@ class PublisherConflict:
         return repeats >= MIN_REPEATS * len(self._messages) or self._are_regular(jumps)
 
     def _quick_returns(self) -> int:
-        """Count quick returns to the more frequent value that come when its publisher was due anyway.
+        """Count quick returns to the more frequent value that arrive when its publisher was due anyway.
 
-        A publisher that also reports changes goes back to its value between two of its regular messages.
+        A publisher that also reports changes returns to its value between two of its regular messages.
         """
         messages, levels = list(self._messages), self._levels
         if levels is None:
@@ -109,7 +113,7 @@ class PublisherConflict:
         )
 
     def _are_regular(self, jumps: Sequence[_Message]) -> bool:
-        """Return whether every second jump comes at the expected interval or faster, with little spread."""
+        """Return whether every second jump arrives at the expected interval or faster, with little spread."""
         intervals_s = _intervals_s(jumps[::2])
         if len(intervals_s) < MIN_RETURNS:
             return False
@@ -120,7 +124,7 @@ class PublisherConflict:
         return abs(value - before) > self._min_jump * max(abs(value), abs(before))
 
     def _is_quick(self, interval_s: float) -> bool:
-        """Return whether a message came sooner than one publisher would publish.
+        """Return whether a message arrived sooner than one publisher would publish.
 
         The upper quartile of the intervals stays that of one publisher while there are two.
         """

@@ -14,7 +14,7 @@ NEEDED = ("voltage", "current")
 
 
 class _TopicBinding(NamedTuple):
-    """A topic on which a quantity comes."""
+    """A topic of a quantity."""
 
     quantity: str
     place: ValueLocation
@@ -25,7 +25,7 @@ class _TopicBinding(NamedTuple):
 
 
 class _TimestampedValue(NamedTuple):
-    """A value, and when it came [s]."""
+    """A value and its arrival time [s]."""
 
     value: float
     at_s: float
@@ -36,7 +36,7 @@ class SampleAssembler:
 
     A sample is complete when voltage and current have arrived, or one of them has and the other has not within
     ``settle_s``: some publishers send only changes. That one counts for ``max_age_s``.
-    What the broker had kept from earlier is never taken: its age is unknown.
+    Retained messages are rejected, because their age is unknown.
     """
 
     def __init__(self, settings: MqttSource) -> None:
@@ -69,7 +69,7 @@ class SampleAssembler:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Messages that the broker had kept, payloads without the quantity or no number; samples that lacked one of two.
+        """Retained messages, payloads without the quantity or without a number; samples that lacked one of two.
 
         ``publisher_errors`` counts messages on a topic while two publishers write there.
         """
@@ -82,7 +82,7 @@ class SampleAssembler:
 
     @property
     def fault(self) -> str | None:
-        """Reason why no sample comes; None if unknown."""
+        """Reason why no sample is complete; None if unknown."""
         if self._offline:
             return f"the publisher says {self._offline} on {self._availability}"
         wrong = [fault for name in NEEDED if (fault := self._faults.get(name))]
@@ -102,10 +102,10 @@ class SampleAssembler:
         """Take a message.
 
         Args:
-            topic: Where it came.
-            payload: What came.
+            topic: Topic of the message.
+            payload: Received payload.
             now_s: Monotonic clock [s].
-            retained: The broker had kept it from earlier.
+            retained: True for a retained message.
         """
         if topic == self._availability:
             text = payload.decode("utf-8", "replace").strip()
@@ -173,7 +173,7 @@ class SampleAssembler:
                 self._cells.pop(each, None)
 
     def _has_conflict(self, way: _TopicBinding, now_s: float) -> bool:
-        """Return whether two publishers write the value that has just come on this topic."""
+        """Return whether two publishers write the latest value on this topic."""
         key = way.quantity, way.topic
         detector = self._detectors.get(key)
         if detector is None or not detector.take(self._told[way.quantity].value, now_s):

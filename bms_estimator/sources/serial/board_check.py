@@ -31,7 +31,7 @@ class BoardCheck:
     """Lets the reads of one board pass; those of a reopened port wait until its serial number is known.
 
     Args:
-        make: A decoder that hears them meanwhile.
+        make: Creates a decoder for pending chunks.
         serial: Of the pack's board, as the settings have it; empty: the stored one, otherwise that of the first
             board.
         memory: What outlives a restart; None: nothing does.
@@ -78,7 +78,7 @@ class BoardCheck:
             self._looking = False
 
     def accept(self, read: Chunk, decoder: DeviceProtocol) -> Sequence[Chunk]:
-        """Return the chunks that ``decoder``, which knows the pack's board, may be fed now.
+        """Return the chunks of the pack's board for ``decoder``.
 
         Raises:
             OtherBoardError: Neither this one nor those after it, until the port is reopened.
@@ -131,7 +131,7 @@ class BoardCheck:
             log.info("this is the pack's board from now on", **self._known)
 
     def _remember(self, now_s: float) -> None:
-        """Store the board without blocking on a hung disk; retry a failed write while samples come."""
+        """Store the board without blocking on a hung disk; retry a failed write while samples arrive."""
         if self._memory is None or self._keeping or now_s - self._tried_s < RETRY_S:
             return
         self._keeping, self._tried_s = True, now_s

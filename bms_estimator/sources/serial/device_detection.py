@@ -58,8 +58,8 @@ class DetectedDevice:
 def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
     """Detect the device on ``port``; return it, or the reason why it is unknown.
 
-    A board of the firmware is looked for first. Then every protocol that ``sensor.protocol`` knows is tried at its own baud
-    rate, one question at a time: questions only, which change nothing, and settings stay as they are.
+    A board of the firmware is looked for first. Then every protocol of ``sensor.protocol`` is tried at its own baud
+    rate, one request at a time. The requests change nothing.
 
     Args:
         port: Device path; opened for ourselves alone.
@@ -176,7 +176,7 @@ class BoardClient:
         return self.hello()
 
     def reference_v(self) -> float:
-        """Full range of its converter as its bandgap tells now [V]; what it measured at its reset may be long ago.
+        """Full range of its converter by the present bandgap reading [V]; the reading at its reset may be old.
 
         The board samples at ``REFERENCE_RATE_HZ`` from then on.
 
@@ -221,7 +221,7 @@ def _converse(
     answer: Callable[[], Answer | None],
     patience_s: float | None = None,
 ) -> Answer | None:
-    """Have decoders hear and talk until there is an answer; None where none comes.
+    """Let decoders receive and poll until there is an answer; None without one.
 
     Raises:
         OSError: The port is lost.

@@ -23,8 +23,8 @@ log = structlog.get_logger(__name__)
 class KnownBoardFile:
     """``<pack.name>.board.json`` in the state folder, for its owner alone.
 
-    A file of its own, not the checkpoint: that one is kept for each meaning of the state and restarts with another
-    cell, while the board on the line stays the same; and what is in it may be read, and forgotten, by a person.
+    A separate file, because a checkpoint belongs to one meaning of the state and restarts with another cell, while
+    the board stays the same; a person may read and delete it.
 
     Args:
         folder: The state folder.

@@ -1,6 +1,6 @@
 """A serial line: opened with pyserial, read when its descriptor has bytes, opened again when it is lost.
 
-Knows no protocol.
+Independent of protocols.
 """
 
 import asyncio
@@ -28,10 +28,10 @@ log = structlog.get_logger(__name__)
 class SerialPort:
     """A port with its received and sent bytes.
 
-    Arrival times are the wall clock at start plus a clock that never steps since; it goes on while the machine sleeps.
+    Arrival times are the wall clock at start plus a clock that never steps since; it continues during suspend.
 
     Args:
-        open_next: Opens the port, wherever it is: its path, and the port.
+        open_next: Opens the port: returns its path, and the port.
         say: Called with the reason why the port is not open.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
@@ -39,7 +39,7 @@ class SerialPort:
 
     Attributes:
         openings: How often it was opened.
-        lost: Set when the port has died, or by who wants it closed.
+        lost: Set when the port has died, or to request its end.
     """
 
     def __init__(

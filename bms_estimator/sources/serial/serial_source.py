@@ -1,4 +1,4 @@
-"""The board on a serial port, whatever it speaks: line and decoder tied together."""
+"""The board on a serial port: link and decoder of any protocol."""
 
 import asyncio
 import contextlib
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 TALK_S = 0.25
 """Interval at which due bytes are sent [s]."""
 TALKS = 4
-"""Number of these intervals between two checks that samples come."""
+"""Number of these intervals between two checks for samples."""
 SILENT_S = 3.0
 """Time without a frame that counts as a fault of the line [s]."""
 SILENT_PERIODS = 3.0
@@ -46,11 +46,11 @@ class SerialSource:
     """Async source of SAMPLE blocks from a board.
 
     All that makes a sample passes ``decoder.feed(arrival_s, data)``: a capture of these calls replays to the same bits.
-    It stays with the pack's board, and looks for it on other ports, as ``BoardCheck`` and ``PortDiscovery`` say.
+    It stays with the pack's board, and searches other ports for it (``BoardCheck``, ``PortDiscovery``).
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
-        memory: Remembers the pack's board, if it can tell its serial number; None: it is known for this run only.
+        memory: Stores the pack's board, if it has a serial number; None: it is known for this run only.
         tap: Gets the same (arrival time, bytes) as the decoder.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
@@ -110,7 +110,7 @@ class SerialSource:
 
     @property
     def message(self) -> str | None:
-        """Why no samples come; None when they do."""
+        """Reason why no samples arrive; None when they do."""
         return self._message
 
     @property
@@ -148,7 +148,7 @@ class SerialSource:
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:
         """Blocks as the descriptor brings them.
 
-        What the tap gets is what has been yielded: nothing is recorded that the caller has not taken.
+        The tap receives the chunks of yielded blocks, so nothing is recorded that the caller has not taken.
         """
         while (read := await self._line.read()) is not None:
             for arrival_s, data in self._admit(read):
@@ -200,7 +200,7 @@ class SerialSource:
         return block
 
     async def current_zero(self) -> None:
-        """Have the board take the present current as zero, for good: nothing may flow meanwhile.
+        """Let the board take the present current as zero permanently: disconnect the load first.
 
         Samples after it are decoded with the new zero. The blocks must be iterated over meanwhile.
 
@@ -302,7 +302,7 @@ class SerialSource:
             self._leave(message)
 
     async def _talk(self) -> None:
-        """Send what falls due, until it is time to look whether samples come or the line is lost."""
+        """Send due commands until the next check, or until the link is lost."""
         for _ in range(TALKS):
             self._tended_s = self._monotonic()
             self._send_due()
