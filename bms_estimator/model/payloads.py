@@ -5,7 +5,7 @@ are published as JSON schema.
 """
 
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -26,6 +26,12 @@ class Payload(BaseModel):
     def json_bytes(self) -> bytes:
         """JSON text, serialized once for all sinks."""
         return self.model_dump_json().encode()
+
+    def __copy__(self) -> Self:
+        """Copy without the cached JSON, because ``model_copy`` changes fields afterwards."""
+        copied = super().__copy__()
+        copied.__dict__.pop("json_bytes", None)
+        return copied
 
 
 _COUNTED = "at the terminals over all runs, up to the last checkpoint where there is one; it never decreases"
