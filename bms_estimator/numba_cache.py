@@ -105,7 +105,7 @@ def _opened(file: Any, name: str) -> Any:
 
 def _keep(folder: Path | None) -> None:
     """Have numba keep compiled kernels in ``folder``."""
-    cache: Any = Cache  # methods of both are replaced, which types do not know
+    cache: Any = Cache  # methods of both are replaced, which the types do not express
     kernel: Any = Dispatcher
     if folder is None:
         warnings.warn("compiled kernels are not kept: no folder can be written", RuntimeWarning, stacklevel=1)

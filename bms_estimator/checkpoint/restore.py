@@ -58,7 +58,7 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
     f = estimator.record["filter"]
     if estimator.identifying and (not was_on or abs(f["soc"][0] - estimator.state["soc"][0]) > SAME_SOC):
         unseen_s = math.inf
-    if "filter.mean_a" not in saved:  # a version that did not know the load
+    if "filter.mean_a" not in saved:  # a version without the load statistics
         f["mean_a"] = f["current_a"]
     if was_on and saved.get("filter.mean", np.zeros(0)).shape[-1] < STATES:
         _open_curve(estimator)

@@ -93,7 +93,9 @@ class DemoBroker:
 
     def __init__(self, port: int | None = None) -> None:
         self.port = choose_port(port, MQTT_PORT)
-        logging.getLogger("amqtt").setLevel(logging.CRITICAL)  # it logs whole stacks when a client goes without a word
+        logging.getLogger("amqtt").setLevel(
+            logging.CRITICAL
+        )  # it logs a stack trace when a client disconnects without a packet
         listener = ListenerConfig(bind=f"{LOOPBACK}:{self.port}")
         self._broker = _Broker(BrokerConfig(listeners={"default": listener}, plugins=ANONYMOUS))
 

@@ -110,7 +110,7 @@ def _samples(body: bytes, count: int) -> SampleBlock:
     size = count * _SAMPLE_BYTES
     unpacker = zlib.decompressobj()
     try:
-        raw = unpacker.decompress(body, size + 1)  # no more, whatever a damaged one would become
+        raw = unpacker.decompress(body, size + 1)  # upper limit for a damaged header
     except zlib.error as error:
         raise BlockError(str(error)) from None
     if len(raw) != size or count == 0 or not unpacker.eof or unpacker.unused_data:

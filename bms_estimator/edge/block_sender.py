@@ -109,7 +109,7 @@ class BlockSender:
         if self._times is None:
             raise RuntimeError("an edge takes samples within its context")
         if self._task is not None and self._task.done():
-            self._task.result()  # only a fault of ours ends it: let it be seen
+            self._task.result()  # only an internal error ends the task: raise it
         wall_s = self._clock.wall()
         self._times.go_on_from(
             self.store.last_s

@@ -112,7 +112,7 @@ class BlockStore:
     def put(self, gathered: ReadyBlock) -> None:
         """Take the newest block, its times in seconds since 1970; returns at once."""
         if self._task is not None and self._task.done():
-            self._task.result()  # only a fault of ours ends it: let it be seen
+            self._task.result()  # only an internal error ends the task: raise it
         self._put += 1
         self._waiting.append((self._put, gathered))
         while len(self._waiting) > 1 and sum(block.samples.size for _, block in self._waiting) > MOST_WAITING:

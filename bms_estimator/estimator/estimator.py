@@ -135,7 +135,7 @@ class Estimator:
             set_soc(f, self.settings_record[0]["filter"], soc)
             c["outliers"] = 0.0
             if not c["suspects"] & UNUSABLE:
-                c["last_v"] = 0.0  # what is found frozen later is not taken back to before
+                c["last_v"] = 0.0  # a sensor that freezes later must not restore an earlier state
             store_last_good_state(c, f)
 
     def resume(self, unseen_s: float) -> None:

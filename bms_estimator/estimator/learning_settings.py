@@ -45,7 +45,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
     q["file"][1:] = a[1:PARAMETERS]
     for j, name in enumerate(NAMES):
         q["lower"][j], q["upper"][j] = _bounds(cell, SCALED[name])
-    # a branch stays on its side of the mean of both ln tau; of two in the other order none goes further that way
+    # an RC pair stays on its side of the mean of both ln tau; if their order is reversed, neither moves further
     between = max(0.5 * np.log(a[6] * a[12] / (a[3] * a[9])), 0.0)
     q["upper"][TAU_TS], q["lower"][TAU_TL] = min(q["upper"][TAU_TS], between), max(q["lower"][TAU_TL], -between)
     q["middle"] = 0.5 * (q["lower"] + q["upper"])

@@ -13,7 +13,7 @@ Correlation = Annotated[float, Field(ge=-1.001, le=1.001)]
 class Hour(Payload):
     """One row. Charge and energy out are of discharge; std are of one standard deviation; unknown values are null."""
 
-    model_config = ConfigDict(extra="ignore")  # who collects may be older than who sums up
+    model_config = ConfigDict(extra="ignore")  # the collector may be older than the worker
 
     pack: str
     hour: int = Field(description="its begin, hours since 1970 UTC")

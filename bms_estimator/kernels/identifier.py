@@ -58,7 +58,7 @@ def identifier_step(
     f, c = s.filter, s.checks
     change_a = current_a - f.current_a
     if gap and f.window.samples > 0:
-        update_from_window(s, p)  # what was measured before tells nothing of what flowed in the gap
+        update_from_window(s, p)  # measurements before the gap give no information on the charge in it
     integrate_current(f, p.filter, dt_s, gap, current_a, temperature_c)
     if dt_s > p.filter.unmeasured_s:
         s.unlearned_s[:] += dt_s

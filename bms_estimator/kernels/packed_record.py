@@ -120,7 +120,7 @@ def unpack(packed: Words, mirror: Mirror, words: Words) -> bool:
         for w in range(b * WORD_BITS, min((b + 1) * WORD_BITS, n)):
             word = words[mirror[w]] if mirror[w] >= 0 else np.uint64(0)
             if bits & np.uint64(1):
-                if at == size or packed[at] == word:  # too short, or kept although it need not be
+                if at == size or packed[at] == word:  # too short, or stored although it is redundant
                     return False
                 word = packed[at]
                 at += 1

@@ -20,7 +20,7 @@ ESTIMATOR_SETTINGS = np.dtype(
         ("series_resistance", "i8"),  # 1: R_s by (4.2), step 3 of the thesis
         ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
         ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
-        ("lower", "f8", PARAMETERS),  # the configured bounds guard what is handed over
+        ("lower", "f8", PARAMETERS),  # the configured bounds limit the values handed over
         ("upper", "f8", PARAMETERS),
         ("map_memory_s", "f8"),  # time constant with which the map forgets [s]
     ],

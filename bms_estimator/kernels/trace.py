@@ -10,10 +10,10 @@ TRACE = np.dtype(
         ("temperature_c", "f8"),
         ("soc", "f8"),
         ("voltage_estimate_v", "f8"),
-        ("innovation_v", "f8"),  # measured less predicted: the identifier's, else the observer's e
+        ("innovation_v", "f8"),  # measured minus predicted voltage: the identifier's, or the observer's e
         ("tracking_error_v", "f8"),  # the observer's e (3.15)
-        ("nussbaum_gain", "f8"),  # N(k) (3.12) of a printed law, else NaN
-        ("adaptation_gain_hz", "f8"),  # gamma k of the learning law, else NaN [1/s]
+        ("nussbaum_gain", "f8"),  # N(k) (3.12) of a printed law, or NaN
+        ("adaptation_gain_hz", "f8"),  # gamma k of the learning law, or NaN [1/s]
         ("k", "f8"),
         ("delta_1", "f8"),
         ("delta_2", "f8"),

@@ -295,7 +295,7 @@ def is_fuel_cell(name_or_path: str | Path) -> bool:
     try:
         return "fuel_cell" in tomllib.loads(Path(name_or_path).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        return False  # whoever reads it as a cell says what is wrong
+        return False  # the reader of the cell file reports errors
 
 
 def _names(folder: str) -> list[str]:

@@ -101,7 +101,7 @@ def _sensor(was: Health | None, health: Health) -> Iterator[_Found]:
         return
     if health.sensor_online:
         yield _Found("sensor_online", "samples come")
-    elif was is not None:  # at start none has come yet
+    elif was is not None:  # none at start
         yield _Found("sensor_offline", health.sensor_message or "")
 
 

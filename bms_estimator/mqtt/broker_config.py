@@ -47,7 +47,7 @@ def password(settings: MqttSettings) -> str | None:
         return credential(settings.password_file).read_text(encoding="utf-8").rstrip("\r\n")
     except OSError as error:
         raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:  # whose text holds the bytes
+    except UnicodeDecodeError:  # whose text contains the bytes
         raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: not UTF-8 text") from None
 
 
@@ -109,7 +109,7 @@ def _show(context: ssl.SSLContext, settings: MqttSettings, cert_file: Path) -> N
         UserError: A file cannot be read, or the two do not belong together.
     """
     key_file = settings.key_file or cert_file
-    for name, path in (("cert_file", cert_file), ("key_file", key_file)):  # the error of both does not say which
+    for name, path in (("cert_file", cert_file), ("key_file", key_file)):  # the error of both does not name the file
         try:
             credential(path).read_bytes()
         except OSError as error:

@@ -123,7 +123,9 @@ class Client(aiomqtt.Client):
             self._answers[info.mid] = answer
             try:
                 await asyncio.wait([answer], timeout=self._acknowledged_s)
-                if not answer.done():  # it may be, though the time is up: both came while the process stood still
+                if (
+                    not answer.done()
+                ):  # it may have arrived in time: both events occurred while the process was suspended
                     raise BrokerConnectionError(
                         f"the broker has not acknowledged a message for {self._acknowledged_s:g} s"
                     )

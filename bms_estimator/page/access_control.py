@@ -81,7 +81,7 @@ def _token(settings: PageSettings) -> str | None:
         token = credential(name).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise UserError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:  # whose text holds the bytes
+    except UnicodeDecodeError:  # whose text contains the bytes
         raise UserError(f"page.token_file = {name}: cannot be read: not UTF-8 text") from None
     if len(token) < SHORTEST_TOKEN:
         raise UserError(

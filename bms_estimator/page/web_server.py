@@ -149,7 +149,7 @@ class WebServer:
             await asyncio.sleep(AGAIN_S)
             try:
                 return await self._listen(runner)
-            except OSError:  # said already
+            except OSError:  # already reported
                 continue
 
     @web.middleware

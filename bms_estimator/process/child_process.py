@@ -22,7 +22,7 @@ def ends_with_us() -> Callable[[], None] | None:
 
     def ask() -> None:
         prctl(PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGTERM))
-        if os.getppid() != parent:  # killed before it was asked
+        if os.getppid() != parent:  # killed before it was requested
             os._exit(1)
 
     return ask

@@ -48,7 +48,7 @@ class Stderr:
             try:
                 while rest:  # not by sys.stderr: its buffer would wait once more, as the process ends
                     rest = rest[os.write(STDERR, rest) :]
-            except OSError:  # a disk that is full: the line is lost and nothing else
+            except OSError:  # a full disk costs only this line
                 self.lost += 1
             self._lines.task_done()
 

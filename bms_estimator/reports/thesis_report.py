@@ -103,7 +103,7 @@ def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Calla
     found |= {f"F{key}": of_simulation(make) for key, make in simulation_figures.FIGURES.items()}
     found |= {f"T{key}": of_experiment(make) for key, make in experiment_tables.TABLES.items()}
     found |= {f"F{key}": of_experiment(make) for key, make in experiment_figures.FIGURES.items()}
-    if experiment.recorded is None:  # what is printed says these without any recording
+    if experiment.recorded is None:  # the printed values are enough for these
         found |= {f"F{key}": make for key, make in printed_pack.FIGURES.items()}
     found["TErrata"] = of_simulation(errata.table)
     found |= {f"F{key}": _diagram(key) for key in DIAGRAMS}

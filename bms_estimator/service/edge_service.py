@@ -63,7 +63,7 @@ async def serve_edge(
 async def _take(source: Source, edge: BlockSender) -> None:
     async for samples in source:
         edge.take(samples)
-        await asyncio.sleep(0)  # a source that always has samples must not starve who sends them
+        await asyncio.sleep(0)  # a source that always has samples must not starve the sender
 
 
 async def _keep_alive(

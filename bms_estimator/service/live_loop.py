@@ -135,7 +135,7 @@ async def run_estimation_loop(
             clean = True
         finally:  # a fault ends the loop, too
             notifier.stopping(name)
-            if saving:  # before the sinks part, which may take seconds: who stops us may not wait for them
+            if saving:  # before the sinks close, which may take seconds: the caller must not wait for them
                 await saving.save_final(clean=clean)
         publisher.publish_last()
     return estimator

@@ -217,7 +217,7 @@ class Publisher:
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         remaining = remaining_charge(self._estimator, window.current_a)
-        # only what outlives a kill, so that the next run goes on from there
+        # only saved values, so that the next run continues from there
         self._flow = self._flow.at_least(self.kept or self._tally.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
         return make_state_payload(window, remaining, self._source.counters, wall_s, self._flow, capacity_ah)
@@ -264,7 +264,7 @@ class Publisher:
         )
 
     def _info(self) -> Info:
-        self._board = self._source.board or self._board  # one that was lost is most likely to come back
+        self._board = self._source.board or self._board  # a lost board is most likely to return
         sensed = bool(self._estimator.record["filter"]["sensed"][0])
         return make_info_payload(
             self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed

@@ -58,7 +58,7 @@ def _node(example: str) -> dict[str, str]:
 
 
 PROFILES: Mapping[ProfileName, Profile] = {
-    # bmslib/mqtt_util.py, bmslib/wire/fields.py; the sign: issue 10. What has not changed it says each 10 s only.
+    # bmslib/mqtt_util.py, bmslib/wire/fields.py; the sign: issue 10. Unchanged values are published every 10 s only.
     "batmon-ha": Profile(
         {
             "voltage": {"topic": "{prefix}/soc/total_voltage"},

@@ -137,7 +137,7 @@ class Settings(Strict):
         told = sensor.model_dump(exclude_unset=True) if isinstance(sensor, SensorSettings) else sensor
         try:
             source = SOURCE.validate_python(tables["source"])
-        except ValidationError:  # said where the section itself is read
+        except ValidationError:  # the section itself reports it
             return tables
         if not isinstance(told, dict):
             return tables

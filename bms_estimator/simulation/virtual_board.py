@@ -169,7 +169,7 @@ class VirtualBoard:
 
     def __exit__(self, *_: object) -> None:
         """Pull the plug: the host's descriptor dies."""
-        self._unhear()  # before its number is given to another: a loop that still knew it would not hear that one
+        self._unhear()  # before its number is reused: a loop that still had it would not notice the new one
         for descriptor in (self._master, self._slave):
             if descriptor >= 0:
                 os.close(descriptor)
@@ -364,7 +364,7 @@ class VirtualBoard:
         if self._mode == "text":
             return
         for frame in frames:
-            with contextlib.suppress(ProtocolError):  # no answer: the host asks again
+            with contextlib.suppress(ProtocolError):  # no response: the host repeats the request
                 self._obey(unseal(frame) if frame else b"")
 
     def _obey(self, packet: bytes) -> None:

@@ -165,7 +165,7 @@ class _File:
             return self._run(work)
         except (NewerVersionError, OtherTablesError) as error:
             self._set_aside(str(error))
-        except UnicodeDecodeError as error:  # of what SQLite says of damaged tables
+        except UnicodeDecodeError as error:  # parts of SQLite's messages on damaged tables
             if self._ready:
                 raise
             self._set_aside(str(error))
@@ -192,7 +192,7 @@ class _File:
             raise
         if due:
             self._synced_s = time.monotonic()
-        with contextlib.suppress(sqlite3.Error):  # what is written is written; what ails the disk the next one says
+        with contextlib.suppress(sqlite3.Error):  # the rows are written; the next transaction reports a disk error
             _trim(connection)
         return result
 

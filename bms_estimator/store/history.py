@@ -69,7 +69,7 @@ class History:
         self._run, self._number = secrets.token_hex(8), 0
         self._due = asyncio.Event()
         self._closing = False
-        self._unpruned = MINUTES_A_DAY  # minutes since the last look at what is too old; the first one looks
+        self._unpruned = MINUTES_A_DAY  # minutes since the last removal of old rows, which happens at the first one too
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -90,7 +90,7 @@ class History:
     def publish(self, snapshot: Snapshot) -> None:
         """Take a snapshot; returns at once."""
         if self._task is not None and self._task.done():
-            self._task.result()  # only a fault of ours ends it: let it be seen
+            self._task.result()  # only an internal error ends the task: raise it
         if happened := events(self._before, snapshot):
             self._events.extend((self._next(), event) for event in happened)
             self._due.set()

@@ -73,7 +73,7 @@ class Outbox:
     def put(self, message: Message) -> None:
         """Keep a message; returns at once."""
         if self._task is not None and self._task.done():
-            self._task.result()  # only a fault of ours ends it: let it be seen
+            self._task.result()  # only an internal error ends the task: raise it
         self._queue.put(message)
         self._tell()
 

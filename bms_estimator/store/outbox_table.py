@@ -13,7 +13,7 @@ FARTHEST = 1 << 40
 LONGEST_TOPIC = 0xFFFF
 """[bytes]."""
 
-_TOPIC = re.compile(r"[^+#\x00-\x1f\x7f-\x9f\ud800-\udfff]+")  # bytes that are no UTF-8 come as the last of these
+_TOPIC = re.compile(r"[^+#\x00-\x1f\x7f-\x9f\ud800-\udfff]+")  # invalid UTF-8 raises the last of these
 _NUMBERS = (
     "SELECT min(number), max(number) FROM (SELECT number, number - row_number() OVER (ORDER BY number) AS run "
     "FROM outbox WHERE +number > ? AND +number < ?) GROUP BY run ORDER BY 1"
@@ -38,7 +38,7 @@ def read_backlog(connection: sqlite3.Connection) -> StoredBacklog:
 def _runs(connection: sqlite3.Connection, first: int, end: int) -> NumberRanges:
     runs: list[range] = []
     for low, high in connection.execute(_NUMBERS, (first - 1, end)):
-        runs.append(range(max(low, runs[-1].stop) if runs else low, high + 1))  # in a damaged file one may come twice
+        runs.append(range(max(low, runs[-1].stop) if runs else low, high + 1))  # in a damaged file one may occur twice
     return NumberRanges(runs)
 
 

@@ -99,7 +99,7 @@ class AlarmEvaluator:
         self._states = {each.name: AlarmState(each, lost_s=inputs.lost_s) for each in watched}
         self._charging_a = charging_a
         self._inputs, self._silent_s = inputs, silent_s
-        self._silence = ""  # why no samples come; empty while they do
+        self._silence = ""  # reason why no samples arrive; empty while they do
         self._has_samples = False  # since the start
         self._unwatched: dict[AlarmName, str] = {}  # reasons
         self._sampled, self._traced, self._shared = Steps(gap_s), Steps(gap_s), Steps(math.inf)

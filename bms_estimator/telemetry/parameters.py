@@ -204,7 +204,7 @@ def _identified(learned: IdentifiedValue, held: Parameter, limit: float, now_s: 
     if held.value is None:
         return held
     why = f"identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
-    std = math.hypot(learned.std, learned.value - held.value)  # of what is held, by what is known
+    std = math.hypot(learned.std, learned.value - held.value)  # of the configured value, by the known error
     return held.model_copy(update={"std": finite(std), "reason": why})
 
 

@@ -206,7 +206,7 @@ def _empty_v(good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], rests: 
 
 def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], capacity_ah: float) -> None:
     """Sign of the current, capacity."""
-    change = np.where(resting[:-1], 0.0, np.diff(soc))  # noise at rest goes both ways
+    change = np.where(resting[:-1], 0.0, np.diff(soc))  # noise at rest has both signs
     given = np.maximum(-change, 0.0).sum()
     taken = np.maximum(change, 0.0).sum()
     if taken > given:

@@ -156,7 +156,7 @@ def find_sources(
         share = _share(telling, found)
         half_v = telling.hysteresis_v / _colder(telling.temperature_c)
         kept_v = half_v * (_usual_share(telling, series_count) if share is None else share)
-        given = telling in sources[len(slow) :] and share is None  # who gives a curve means what it says
+        given = telling in sources[len(slow) :] and share is None  # given curves are used as they are
         hysteresis_v = np.interp(NODES, GRID, half_v if given else kept_v)
         hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_v)
         found = [

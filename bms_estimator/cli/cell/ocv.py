@@ -96,7 +96,7 @@ class OcvResult:
     form: str
     capacity_ah: float
     capacity_measured_ah: float | None  # by a slow discharge from full to empty
-    generic: str  # the generic cell most like it, which tells what the sources do not: resistances ...
+    generic: str  # the most similar generic cell supplies what the sources do not: resistances ...
     usual_hysteresis: bool  # ... and hysteresis
     series_count: int
     points: int
@@ -110,7 +110,7 @@ class OcvResult:
     parameters: dict[str, dict[str, float | None]]  # a16..a21: value, std (None at a bound); none for a table
     sources: list[SourceResult]
     captures: dict[str, dict[str, float]]  # those with rests
-    remaining_v: list[float]  # what was left to relax at the end of each rest
+    remaining_v: list[float]  # remaining relaxation at the end of each rest
     rejected: list[str]
 
 

@@ -44,7 +44,7 @@ def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> N
     kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackSpec)}
     of_each = {
         model_key(kind): pack for pack, kind in reversed(kinds.items())
-    }  # one, whose cell stands for the others'
+    }  # one pack, whose cell represents the others
     for pack in (*(pack for pack in sorted(known) if pack not in kinds), *of_each.values()):
         if reason := known.reason(pack):
             typer.echo(f"warning: {pack}: {reason}", err=True)

@@ -47,7 +47,7 @@ def keys(press: Callable[[str], None]) -> Iterator[None]:
         for meaning in meanings(pressed):
             press(meaning)
 
-    tty.setcbreak(terminal)  # Ctrl-C goes on to be a signal
+    tty.setcbreak(terminal)  # Ctrl-C still raises SIGINT
     loop.add_reader(terminal, read)
     try:
         yield

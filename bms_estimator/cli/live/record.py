@@ -84,7 +84,7 @@ async def _drain(source: Source) -> None:
 
 
 async def _end(recording: CaptureRecorder) -> None:
-    with contextlib.suppress(OSError):  # said by the caller
+    with contextlib.suppress(OSError):  # the caller reports it
         await asyncio.wrap_future(recording.ended)
 
 

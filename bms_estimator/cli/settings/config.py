@@ -120,7 +120,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
         warnings += unseen
         target(settings.influx.model_copy(update=dict.fromkeys(unread)))
-    make_line_producer(settings)  # says what of [source] cannot be used, or is not installed
+    make_line_producer(settings)  # reports parts of [source] that are invalid or not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")

@@ -53,7 +53,7 @@ SAID_S = 30.0
 """Minimum interval between two log lines about an equal error [s]."""
 
 log = structlog.get_logger(__name__)
-# The library's end of a TLS connection, of no use to anybody.
+# The library's end of a TLS connection, which is not usable.
 logging.getLogger("asyncio").addFilter(lambda record: "eof_received() has no effect" not in str(record.msg))
 
 

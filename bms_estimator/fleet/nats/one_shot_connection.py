@@ -45,5 +45,5 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
     try:
         async with nc:
             yield nc
-    except (StreamError, nats.errors.Error) as error:  # what is not allowed is said beside the question
+    except (StreamError, nats.errors.Error) as error:  # a denied permission is reported separately from the response
         raise UserError(f"--server {server}: {error_text(troubles[-1] if troubles else error)}") from None

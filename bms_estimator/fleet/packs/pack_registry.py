@@ -105,7 +105,7 @@ def _kind(data: bytes) -> PackSpec | str:
 def _made(kind: PackSpec, cell_file: str | None) -> tuple[Settings, PackModel] | str:
     try:
         settings, model = settings_of(kind), model_of(kind, cell_file)
-        type_estimator(settings, model)  # kept: a partition asks for the same next
+        type_estimator(settings, model)  # cached: a partition requests the same next
     except UserError as error:
         return str(error)
     except (ValueError, ArithmeticError) as error:

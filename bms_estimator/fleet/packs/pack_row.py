@@ -145,4 +145,4 @@ def _is_fuel_cell(cell_file: str) -> bool:
     try:
         return "fuel_cell" in tomllib.loads(cell_file)
     except (ValueError, RecursionError):
-        return False  # whoever reads it as a cell says what is wrong
+        return False  # the reader of the cell file reports errors

@@ -27,7 +27,7 @@ STD_EDGES = np.array([0.0, 0.01, 0.02, 0.04, 0.06, 0.08, 0.12, 0.16, 0.20, 0.30,
 
 ROW = np.dtype(
     [
-        ("heard_s", "f8"),  # when the newest state came, the page's clock; -inf: never
+        ("heard_s", "f8"),  # time of the newest state on the page's clock; -inf: never
         ("soc", "f8"),  # 0..1; nan: not known, as in all
         ("soc_std", "f8"),
         ("margin", "f8"),  # stability_margin

@@ -81,7 +81,9 @@ class Collector:
 
     async def _subscribe(self) -> JetStreamContext.PullSubscription:
         js = self._nc.jetstream()
-        wait_s = 2.0 * self._period_s + 60.0  # longer than any row waits here: none comes twice while all is well
+        wait_s = (
+            2.0 * self._period_s + 60.0
+        )  # longer than any row waits here, so that none is delivered twice in normal operation
         config = ConsumerConfig(
             durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=wait_s, max_ack_pending=3 * MOST_ROWS
         )
@@ -124,7 +126,7 @@ class Collector:
         fault = error.errors()[0]
         reason = f"{'.'.join(map(str, fault['loc'])) or 'all of it'}: {fault['msg']}"
         log.warning("this is no hour of a pack", subject=message.subject, reason=reason)
-        with contextlib.suppress(nats.errors.Error):  # then it comes again
+        with contextlib.suppress(nats.errors.Error):  # the row is delivered again
             await message.term()
 
     async def _save(self, stop: asyncio.Event) -> None:
@@ -141,7 +143,7 @@ class Collector:
             for message, _ in waiting:
                 await message.ack()
             await self._nc.flush()
-        except (nats.errors.Error, TimeoutError) as error:  # they come again: questions drop what stands there twice
+        except (nats.errors.Error, TimeoutError) as error:  # the rows are delivered again; queries drop duplicates
             await self._failed("what is written could not be acknowledged", error, stop)
 
     async def _failed(self, what: str, error: Exception, stop: asyncio.Event) -> None:

@@ -82,7 +82,7 @@ _LIMITS: dict[Role, dict[str, int]] = {
     Role.EDGE: {"subs": 8, "payload": MAX_BLOCK_BYTES}
 }
 _DENIED: dict[Role, tuple[str, ...]] = {
-    # who reads makes consumers of its own, and leaves those of the partitions alone
+    # a reader creates consumers of its own, and must not touch those of the partitions
     Role.READER: ("$JS.API.CONSUMER.DELETE.RAW.>", "$JS.API.CONSUMER.MSG.NEXT.RAW.>", "$JS.API.CONSUMER.UNPIN.>"),
     Role.WORKER: ("$JS.API.CONSUMER.DELETE.RAW.>",),
 }

@@ -256,7 +256,7 @@ async def _make_ready(place: NodeLocation, told: ServerSpec, pid: int, say: Call
     while True:
         try:
             return await _make_all_streams(place, told, say)
-        except NoAnswerError as error:  # of a node that is busy with all who come back, or again without a quorum
+        except NoAnswerError as error:  # of a node that is busy with reconnecting clients, or without a quorum
             log.warning("the streams are not there yet; trying again", reason=str(error))
 
 

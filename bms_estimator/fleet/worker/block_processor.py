@@ -100,7 +100,7 @@ class BlockProcessor:
         self._flows["sums"]["counted"] = 0
         if self._observer["started"] and math.isfinite(
             self._observer["time_s"]
-        ):  # else it awaits another clock already
+        ):  # otherwise it already awaits another store
             estimator.resume(self._unseen_s(block))
 
     def _estimate(self, block: Block, of_type: PackType, arrival_s: float) -> None:

@@ -63,7 +63,7 @@ def dtype_of(layout: str) -> np.dtype[Any]:
         raise ValueError(f"no layout of a record: {error}") from None
     if dtype.itemsize > _LONGEST_RECORD:
         raise ValueError(f"{dtype.itemsize} bytes: no layout of a pack's record")
-    symmetry_map(dtype)  # refuses what is not made of whole words
+    symmetry_map(dtype)  # rejects data that are not whole words
     return dtype
 
 

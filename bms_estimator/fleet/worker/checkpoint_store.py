@@ -90,7 +90,7 @@ class CheckpointStore:
         self._nc, self._js, self._worker = nc, nc.jetstream(), worker
         self._checkpoints, self._states = checkpoints, states
         self._names = NUID()
-        self._tried: dict[int, Pointer] = {}  # by partition, what was written last: maybe without an answer
+        self._tried: dict[int, Pointer] = {}  # last written checkpoint by partition, possibly without a response
 
     async def claim(self, partition: int) -> Claim:
         """Take a partition over, whoever had it.

@@ -24,14 +24,14 @@ MOST_LOST = 2**62
 
 DELIVERY = np.dtype(
     [
-        ("store", "u8"),  # the edge's, whose blocks are awaited [ns since 1970]; 0: none came yet
+        ("store", "u8"),  # the edge's store with the awaited blocks [ns since 1970]; 0: no block yet
         ("awaited", "u8"),  # number of the next block
-        ("ahead", "i8"),  # blocks that came since one is missing
+        ("ahead", "i8"),  # blocks after a missing one
         ("first_ahead", "u8"),  # lowest number of these; 0: none
-        ("passed", "i8"),  # times that it came
+        ("passed", "i8"),  # number of times that it was received
         ("blocks", "i8"),  # taken
-        ("lost_blocks", "i8"),  # that never came
-        ("clock", "u8"),  # store of the last sample's block: its time stamps are since then; 0: no sample came yet
+        ("lost_blocks", "i8"),  # blocks that were never received
+        ("clock", "u8"),  # store of the last sample's block, the origin of its time stamps; 0: no sample yet
         ("last_s", "f8"),  # the last sample's time stamp [s]
         ("hour", "i8"),  # that is summed up now [hours since 1970]; 0: none yet
         ("made_of", "u8", 2),  # digests of the type of the pack

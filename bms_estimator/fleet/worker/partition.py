@@ -256,7 +256,7 @@ class Partition:
         """Process the next block; None if it cannot be processed."""
         try:
             return BlockResult(pack, None, *self._stepping.step(pack, block, of_type, former))
-        except Exception:  # a fault of ours, with one block: awaited for ever it would stop the pack
+        except Exception:  # an internal error with one block: awaiting it forever would stop the pack
             log.exception("a block is left out", partition=self.number, pack=pack, number=block.number)
         self._stepping.forget()
         return None

@@ -94,7 +94,7 @@ class PartitionLease:
         self.lag_s: float | None = None
         self.blocks = self.samples = self.faults = 0
         self.trouble, self.due_s = "", 0.0
-        self._pin = 0  # with which the state was made sure to be ours
+        self._pin = 0  # sequence that confirmed the claim
         self._whole = False  # nothing is missing between the state and the last message given
         self._lost = self._silent = False
         self._ask_s = time.monotonic() + SILENCE_S  # when silence is to be looked into
@@ -229,7 +229,7 @@ class PartitionLease:
         js, subject = self._nc.jetstream(), subjects.kept(self.number, pack)
         try:
             message = await js.get_msg(subjects.RAW_STREAM, span.first, subject, next=True)
-        except NotFoundError:  # the stream has dropped them; the edge is asked for them with its next block
+        except NotFoundError:  # the stream has dropped them; the edge is asked to resend with its next block
             partition.deferred.advance(pack, span.last)
             return
         data, sequence = message.data or b"", message.seq or 0
@@ -355,7 +355,7 @@ class PartitionLease:
             begin_s = time.thread_time()
             try:
                 taken = take()
-            except Exception:  # a fault of ours with one pack, which would end one worker after the other
+            except Exception:  # an internal error with one pack, which would otherwise end one worker after another
                 log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
                 taken = BlockResult(pack, failed=1)
             self._budget.charge(pack, time.thread_time() - begin_s)
@@ -400,7 +400,7 @@ class PartitionLease:
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
         self.partition = self.claim = None
         self._pin, self._whole = 0, False
-        self.hours.clear()  # who has the partition makes them from the last checkpoint on
+        self.hours.clear()  # the owner of the partition computes them from the last checkpoint on
 
     async def _try(self, what: Callable[[], Awaitable[None]]) -> bool:
         """Return True if the server did it; log the reason if not."""

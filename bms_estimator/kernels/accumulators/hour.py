@@ -10,7 +10,7 @@ from bms_estimator.numba_cache import njit
 
 HOUR_SUMS = np.dtype(
     [
-        ("store", "u8"),  # of the last block: another one has another clock; 0: none came yet
+        ("store", "u8"),  # store of the last block; another one has another clock; 0: no block yet
         ("last_s", "f8"),  # the last sample: its time stamp [s],
         ("last_a", "f8"),  # current [A]
         ("last_w", "f8"),  # and power [W]; these and what follows go on from hour to hour
@@ -21,7 +21,7 @@ HOUR_SUMS = np.dtype(
         ("samples", "i8"),  # accepted; from here on of this hour alone
         ("dropped", "i8"),  # samples that were not
         ("gaps", "i8"),  # steps over which nothing is counted
-        ("lost_blocks", "i8"),  # that never came
+        ("lost_blocks", "i8"),  # blocks that were never received
         ("seen_s", "f8"),  # measured time [s]
         ("out_as", "f8"),  # charge [A s] and energy [W s], each step in its direction
         ("in_as", "f8"),

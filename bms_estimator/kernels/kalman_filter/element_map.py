@@ -156,7 +156,7 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
         w[b] = 0.0
         if m.weight[e, b] > 0.0:
             visited += 1
-            # samples of one pass are no independent witnesses: the mean variance stands, not the variance of the mean
+            # samples of one pass are not independent, so the mean variance is kept, not the variance of the mean
             w[b] = 1.0 / (m.dwell_s[e, b] / m.weight[e, b] + MODEL_ERROR**2)
             ratios += w[b] * (m.moment[e, b] / m.weight[e, b] - math.log(y[b]))
             weights += w[b]
@@ -237,7 +237,7 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
 def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats) -> None:
     """Square roots of the diagonal of (J' W J)^-1, by elimination; NaN where that matrix is singular."""
     amplitude, exponent, offset = fit.a[base], fit.a[base + 1], fit.a[base + 2]
-    # a parameter that the map says nothing of is known to a factor e^3, not less
+    # a parameter without data in the map is known to a factor e^3
     h00, h11, h22 = (3.0 * amplitude) ** -2, (3.0 * exponent) ** -2, (3.0 * offset) ** -2
     h01 = h02 = h12 = 0.0
     for b in range(BINS):

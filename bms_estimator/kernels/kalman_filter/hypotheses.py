@@ -178,7 +178,7 @@ def update_hypotheses(s: Record, p: Record) -> None:
             predict(s, p, q)
         innovation_v, total_v2, straight_v2 = update(s, p, q, variance_v2)
         u = innovation_v / math.sqrt(total_v2)
-        # a bend's part of S stays while nothing moves: counted each second, it would tell against the knee at full rest
+        # the bend's part of S is constant at rest: counted each second, it would reject the knee at full rest
         s.ln_weight[q] -= p.half_likelihood_exponent * (
             innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2)
         )

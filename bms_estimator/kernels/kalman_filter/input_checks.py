@@ -82,7 +82,7 @@ CHECKS = np.dtype(
         ("step_v", "f8"),  # the smallest change of voltage seen [V]; 0: none yet
         ("frozen_v_s", "f8"),  # time for which the voltage has been impossibly constant [s]
         ("frozen_a_s", "f8"),  # time for which the current has been impossibly constant
-        ("held_as", "f8"),  # charge since the voltage last changed [A s]; what was there then:
+        ("held_as", "f8"),  # charge since the voltage last changed [A s]; values at that time:
         ("held_a", "f8"),  # current [A],
         ("held_soc", "f8"),
         ("held_soc_std", "f8"),
@@ -93,7 +93,7 @@ CHECKS = np.dtype(
         ("searches", "f8"),  # times the filter began again of late
         ("seen_reopened", "i8"),
         ("suspects", "i8"),  # bits of model.input_faults.InputFault
-        ("good_mean", "f8", STATES),  # of the likeliest filter when it was last kept
+        ("good_mean", "f8", STATES),  # state of the likeliest filter when it was last saved
         ("good_covariance", "f8", (STATES, STATES)),
         ("good_soc", "f8"),
         ("good_soc_std", "f8"),
@@ -212,7 +212,7 @@ def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, volt
 
     A ramp is no change: where the curve ends, the voltage has one by itself.
     """
-    if dt_s > FAST_S or c.slow_v == 0.0:  # too long to tell, or the first sample
+    if dt_s > FAST_S or c.slow_v == 0.0:  # too long to judge, or the first sample
         c.slow_v = c.slower_v = voltage_v
         c.slow_a = c.slower_a = current_a
         return

@@ -85,7 +85,7 @@ def offset_variance(p: Record) -> float:
 @njit(cache=True)
 def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> float:
     """R [V^2] of the mean voltage of a window: what the ladder leaves, far more than the sensor's noise."""
-    measured_c = s.temperature_c if s.sensed else REFERENCE_C  # what is estimated makes nothing surer
+    measured_c = s.temperature_c if s.sensed else REFERENCE_C  # estimated values do not reduce errors
     model_v = (
         p.model_v
         * arrhenius(p.model_j, min(measured_c, max_known_temperature(p)))

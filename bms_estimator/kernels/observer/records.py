@@ -47,7 +47,7 @@ OBSERVER_STATE = np.dtype(
         ("time_s", "f8"),  # of the last accepted sample
         ("current_a", "f8"),  # of the last accepted sample
         ("step_s", "f8"),  # to it from the one before [s]
-        ("soc", "f8"),  # x1, 0..1: the identifier's, else by coulomb counting
+        ("soc", "f8"),  # x1, 0..1: by the identifier, or by coulomb counting
         ("soc_coulomb", "f8"),  # by coulomb counting alone (3.1), 0..1
         ("v_ts", "f8"),  # x2 [V]
         ("v_tl", "f8"),  # x3 [V]

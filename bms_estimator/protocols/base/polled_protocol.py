@@ -105,7 +105,7 @@ class PolledProtocol(ReadingProtocol):
 
     def _begin_round(self, now_s: float) -> None:
         on_time = now_s - self._round_s < 2.0 * PACE_S
-        self._round_s = self._round_s + PACE_S if on_time else now_s  # asked a little late, it keeps its pace
+        self._round_s = self._round_s + PACE_S if on_time else now_s  # asked a little late, it keeps its period
         self._unanswered = self._unanswered + 1 if self._answers == self._answers_before else 0
         self._answers_before = self._answers
         if self._unanswered > UNANSWERED_ROUNDS:
@@ -139,7 +139,7 @@ class PolledProtocol(ReadingProtocol):
                 frames.append(rest[at:done])
                 at = self._next(rest, done)
                 continue
-            if waiting < 0:  # else it is looked at again when the frame that has begun before it is over
+            if waiting < 0:  # otherwise it is checked again when the frame that began before it has ended
                 if look is ParseResult.MORE:
                     waiting = at
                 elif look is ParseResult.LENGTH:

@@ -51,7 +51,7 @@ class DalyProtocol(PolledProtocol):
         super().__init__("Daly BMS", re.compile(b"\xa5"), current_sign, address)
         self._cells: int | None = None
         self._probes: int | None = None
-        self._told = self._known = False  # whether a sample has come, and since the port was opened the number of cells
+        self._told = self._known = False  # True after a sample; and the number of cells since the port was opened
         self._first = 1  # number of the frame with cell 1
         self._cells_v: dict[int, Sequence[float]] = {}  # by the frame's number
         self._probes_c: dict[int, Sequence[float]] = {}

@@ -83,7 +83,7 @@ class JkProtocol(PolledProtocol):
     def __init__(self, *, current_sign: CurrentSign = "charge_positive", address: int | None = None) -> None:
         super().__init__("JK-BMS", re.compile(re.escape(OLD_START) + b"|" + re.escape(START)), current_sign, address)
         self._told: str | None = None
-        self._overheard_s = -math.inf  # when a newer frame came that was not asked for
+        self._overheard_s = -math.inf  # time of an unrequested newer frame
 
     @property
     def description(self) -> str | None:

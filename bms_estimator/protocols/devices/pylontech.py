@@ -49,9 +49,9 @@ class PylontechProtocol(ReadingProtocol):
         self._batteries: tuple[int, ...] = ()
         self._answers = 0
         self._round_s = self._asked_s = -math.inf
-        self._asked_at = -1  # answers when it was asked last
+        self._asked_at = -1  # number of responses at the last request
         self._asked = b""
-        self._turn = 0  # whose cells are next
+        self._turn = 0  # battery whose cells are requested next
 
     @property
     def description(self) -> str | None:

@@ -41,10 +41,10 @@ class TextProtocol(DeviceProtocol):
         self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
         self._rest = b""
         self._overlong = False  # the line is too long, its rest is skipped
-        self._in_step = False  # once a line has ended: what came before may be half a line
+        self._in_step = False  # True once a line has ended, because earlier bytes may be half a line
         self._clock, self._last_s = DeviceClock(), math.nan
         self._bytes = self._samples = self._errors = self._too_long = self._implausible = 0
-        self._bad: bytes | None = None  # the first line since the last good one that said nothing
+        self._bad: bytes | None = None  # the first line without values since the last good one
         self._good: Reading | None = None
 
     @property

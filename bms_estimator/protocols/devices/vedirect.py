@@ -32,7 +32,7 @@ class VeDirectProtocol(ReadingProtocol):
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__(current_sign, ("checksum_errors", "length_errors", "text_errors"))
         self._rest = b""
-        self._in_step = False  # once a block has ended: what came before may be half a block
+        self._in_step = False  # True once a block has ended, because earlier bytes may be half a block
         self._product = ""
 
     @property

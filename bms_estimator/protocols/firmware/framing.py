@@ -42,7 +42,7 @@ DECODER = np.dtype(
         ("packet", "u1", PACKET_BYTES + 2),  # the frame that has ended, out of COBS
         ("length", "i8"),  # bytes in the buffer
         ("overlong", "i8"),  # 1: the frame is too long, its rest is skipped
-        ("in_step", "i8"),  # 1 once a delimiter was seen: what came before may be half a frame
+        ("in_step", "i8"),  # 1 once a delimiter was received, because earlier bytes may be half a frame
         ("started", "i8"),  # a sample was taken
         ("expected", "i8"),  # sequence of the next sample
         ("boot_id", "i8"),  # of the last hello; -1: none since a reset, or since another board may be there
@@ -62,7 +62,7 @@ DECODER = np.dtype(
         ("clock_origin_s", "f8"),  # arrival from which lateness counts
         ("clock_at_us", "i8", CLOCK_WINDOWS),  # elapsed_us of each window's least late sample
         ("clock_late_s", "f8", CLOCK_WINDOWS),  # its arrival beyond origin and elapsed_us
-        ("current_sign", "f8"),  # 1 where the board's positive current is a discharge, else -1
+        ("current_sign", "f8"),  # 1 if the board's positive current is a discharge, otherwise -1
         ("bytes_received", "i8"),
         ("heard_at", "i8"),  # bytes_received at the end of the last frame with a right CRC
         ("frames_received", "i8"),  # samples taken
@@ -91,7 +91,7 @@ HASTE_S = 0.3
 """Time by which the board's clock may advance beyond arrival and sequence numbers from one sample to the next [s]."""
 SLOWEST = 0.01
 """No board's clock is slower than the host's by more than this, relative."""
-_REORDER_WINDOW = 64  # a sample further behind comes from a board whose clock restarted
+_REORDER_WINDOW = 64  # a sample further behind belongs to a board whose clock restarted
 _MOST_APART = 0.1  # sequence and clock of one board, relative; beyond this it is another, or has another rate
 LONGEST_DOUBT_S = 5.0
 """Maximum time for which samples wait for the hello that identifies their board [s]; then they are accepted as

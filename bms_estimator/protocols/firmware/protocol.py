@@ -147,7 +147,7 @@ class BoardProtocol(DeviceProtocol):
     def _tell(
         self, frame: bytes, *, again_s: float = ASK_AGAIN_S, hint: str = "", changes_hello: bool = True
     ) -> Command:
-        self._decoder.take_acks()  # of what was asked before
+        self._decoder.take_acks()  # of the previous request
         self._asked = b""
         self._told = _Told(frame=frame, again_s=again_s, hint=hint, changes_hello=changes_hello)
         return self._told
@@ -172,7 +172,7 @@ class BoardProtocol(DeviceProtocol):
                 told.acknowledged = True
                 if not told.changes_hello:
                     continue
-                self._decoder.forget_hello()  # the next one holds what was set; one that is lost is asked for again
+                self._decoder.forget_hello()  # the next one contains the new values; a lost one is requested again
             else:
                 told.refusal = f"the board refuses: {ack.result.name.lower().replace('_', ' ')}{told.hint}"
                 told.done = True

@@ -70,7 +70,7 @@ class InfluxSink:
     """
 
     def __init__(self, settings: InfluxSettings, *, first_delay_s: float = FIRST_DELAY_S) -> None:
-        target(settings)  # what cannot be used is said at start
+        target(settings)  # unusable settings are reported at start
         self._settings = settings
         self._pauses = Backoff(first_delay_s)
         self._waiting: deque[str] = deque()
@@ -91,7 +91,7 @@ class InfluxSink:
     def publish(self, snapshot: Snapshot) -> None:
         """Take a snapshot; returns at once."""
         if self._task is not None and self._task.done():
-            self._task.result()  # only a fault of ours ends it: let it be seen
+            self._task.result()  # only an internal error ends the task: raise it
         self._waiting.extend(lines(self._before, snapshot))
         self._before = snapshot
         while len(self._waiting) > MOST_WAITING:
@@ -216,7 +216,7 @@ def _secret(key: str, path: Path) -> str:
         secret = credential(path).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise UserError(f"influx.{key} = {path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:  # whose text holds the bytes
+    except UnicodeDecodeError:  # whose text contains the bytes
         raise UserError(f"influx.{key} = {path}: cannot be read: not UTF-8 text") from None
     if not secret.isprintable():
         raise UserError(f"influx.{key} = {path}: must hold one line of text")

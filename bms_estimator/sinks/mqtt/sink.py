@@ -104,7 +104,7 @@ class MqttSink:
     def publish(self, snapshot: Snapshot) -> None:
         """Take a snapshot; returns at once."""
         if self._task is not None and self._task.done():
-            self._task.result()  # only a fault of ours ends it: let it be seen
+            self._task.result()  # only an internal error ends the task: raise it
         self._backlog.put(self._messages.must_deliver(self._before, snapshot))
         self._slot = self._before = snapshot
         self._wake.set()
@@ -197,7 +197,7 @@ class MqttSink:
                 if message.payload == b"online" and not message.retain:
                     asyncio.get_running_loop().call_later(self._birth_delay_s, self._say_again)
             elif message.topic in (self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)):
-                if not message.retain:  # what the broker kept from earlier is not news
+                if not message.retain:  # retained messages are not news
                     self._availability.on_message(message.topic, message.payload)
             else:
                 await self._answer(connection, message)
@@ -208,8 +208,8 @@ class MqttSink:
             self._requests.count_refusal("retained", name[:MOST_SHOWN])
             return
         response = await self._requests.handle(name, message.payload)
-        if response is not None:  # so the name is one of ours
-            # not at QoS 1: in a flood the broker's word that it has it comes late, and who waits for that reads nothing
+        if response is not None:  # the name is a known request
+            # not at QoS 1: in a flood the broker acknowledges late, and waiting for that would stop reading
             await connection.publish(Message(self._topic(f"response/{name}"), response, 0, retain=False))
 
     def _say_again(self) -> None:

@@ -35,7 +35,11 @@ class BleBringer(LineProducer):
         known = sorted(module.name.removesuffix("_bms") for module in pkgutil.iter_modules(aiobmsble.bms.__path__))
         if settings.bms is not None and settings.bms.removesuffix("_bms") not in known:
             raise UserError(f"source.bms = {settings.bms!r}: aiobmsble knows {', '.join(known)}")
-        for library in ("aiobmsble", "bleak", "bleak_retry_connector"):  # what they say is said here, once
+        for library in (
+            "aiobmsble",
+            "bleak",
+            "bleak_retry_connector",
+        ):  # their log lines are replaced by one of this module
             logging.getLogger(library).setLevel(logging.CRITICAL)
         self._settings = settings
         self._not_measured = 0

@@ -67,7 +67,7 @@ def _rows(path: Path, columns: tuple[str, str, str], without: str = "") -> Float
                 return None
             found = [[_number(path, rows.line_num, name, row.get(name)) for name in columns] for row in rows]
     except (OSError, EOFError, UnicodeDecodeError):
-        return None  # whoever reads captures says what is wrong
+        return None  # the reader of captures reports errors
     return np.array(found).reshape(-1, 3)
 
 

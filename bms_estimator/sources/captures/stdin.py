@@ -50,4 +50,4 @@ def _ending(path: Path) -> str:
         with gzip.open(path) as packed:
             return ".gz" if packed.read(len(MAGIC)) == MAGIC else ".csv.gz"
     except (OSError, EOFError, zlib.error):
-        return ".csv.gz"  # whose reader says what is wrong with it
+        return ".csv.gz"  # whose reader reports errors

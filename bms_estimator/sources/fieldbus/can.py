@@ -41,7 +41,7 @@ class CanBringer(LineProducer):
         if settings.interface not in can.VALID_INTERFACES:
             known = ", ".join(sorted(can.VALID_INTERFACES))
             raise UserError(f"source.interface = {settings.interface!r}: python-can has {known}")
-        logging.getLogger("can").setLevel(logging.CRITICAL)  # what it says is said here, once
+        logging.getLogger("can").setLevel(logging.CRITICAL)  # its log lines are replaced by one of this module
         self._settings = settings
         self._map = CanMap(settings)
         self._junk = self._error_frames = 0

@@ -41,7 +41,7 @@ def bits_of(signal: Signal, data: bytes) -> int | None:
     if signal.byte_order == "little":
         shift = signal.start_bit
         end = signal.start_bit + signal.bits
-    else:  # within a byte a DBC file counts bits from its lowest, and a big endian value goes on in the next byte
+    else:  # within a byte a DBC file counts bits from its lowest, and a big endian value continues in the next byte
         end = 8 * (signal.start_bit // 8) + 7 - signal.start_bit % 8 + signal.bits
         shift = size - end
     if end > size:

@@ -54,7 +54,9 @@ class ModbusBringer(LineProducer):
     """
 
     def __init__(self, settings: ModbusSource) -> None:
-        logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # what it says is said here, once
+        logging.getLogger("pymodbus.logging").setLevel(
+            logging.CRITICAL
+        )  # its log lines are replaced by one of this module
         self._settings, self._values = settings, values_of(settings)
         self._requests: Sequence[Request] = ()
         self._refused: set[str] = set()

@@ -47,11 +47,11 @@ class SampleAssembler:
             for topic in settings.topics(place)
         ]
         self._availability = settings.filled(settings.availability_topic or "")
-        self._offline = ""  # what the publisher, or its will, said of it
+        self._offline = ""  # latest status from the publisher or its last will
         self._told: dict[str, _TimestampedValue] = {}
         self._cells: dict[int, _TimestampedValue] = {}
-        self._faults: dict[str, str] = {}  # of each quantity what was wrong last
-        self._new: dict[str, float] = {}  # of voltage and current those that have come since the last sample, and when
+        self._faults: dict[str, str] = {}  # latest error of each quantity
+        self._new: dict[str, float] = {}  # voltage and current received since the last sample, with their times
         self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
         self._detectors = {
             (way.quantity, way.topic): PublisherConflict(MIN_JUMPS[way.quantity], settings.interval_s)

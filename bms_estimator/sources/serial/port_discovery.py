@@ -50,7 +50,7 @@ class PortDiscovery:
         known = {os.path.realpath(path) for path in home}
         places, now_s = home + [path for path in there if os.path.realpath(path) not in known], self._monotonic()
         if not places:
-            resolve_port(self._port)  # says why
+            resolve_port(self._port)  # reports the reason
         self._left = {path: times for path, times in self._left.items() if path in places}
         never = (-math.inf, -math.inf)
         fresh = [path for path in places if self._left.get(path, never)[1] <= now_s] or home

@@ -57,7 +57,7 @@ def stable_names() -> list[Path]:
     """Names under /dev/serial/by-id; none where no USB serial port is there."""
     try:
         return sorted(BY_ID.iterdir())
-    except OSError:  # the folder comes with the first port and goes with the last
+    except OSError:  # the folder exists while there are ports
         return []
 
 
@@ -131,5 +131,5 @@ def holder(port: str) -> str | None:
 def _has_open(process: Path, device: str) -> bool:
     try:
         return any(str(entry.readlink()) == device for entry in (process / "fd").iterdir())
-    except OSError:  # it has ended, or belongs to someone else
+    except OSError:  # it has ended, or belongs to another user
         return False

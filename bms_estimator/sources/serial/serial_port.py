@@ -81,7 +81,7 @@ class SerialPort:
             self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
             try:
                 path, self._port = self._open_next()
-            except PortBusyError as error:  # who holds it is looked for: samples of other packs must not wait
+            except PortBusyError as error:  # the search for its holder takes time: samples of other packs must not wait
                 reason = await asyncio.to_thread(str, error)
             except (NoPortError, OSError) as error:
                 reason = str(error)

@@ -73,7 +73,7 @@ class SerialSource:
         slow_s = settings.period_s or 0.0
         self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
         self._monotonic = monotonic
-        make_protocol(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
+        make_protocol(settings).feed(0.0, b"\0\n")  # loads its kernel, so that nothing compiles once bytes arrive
         self._decoder = make_protocol(settings)
         tells_serial = settings.protocol == "binary"  # boards that print text cannot be distinguished
         self._door = BoardCheck(
@@ -89,7 +89,7 @@ class SerialSource:
         )
         self._message: str | None = "not opened yet"
         self._openings = 0  # of the line, as far as its reads have been taken
-        self._refused = False  # the message says why what is on the port is not taken
+        self._refused = False  # the message gives the reason why the device is rejected
         self._path = ""  # of the port that is open
         self._tended_s = monotonic()  # when the task last turned
         self._arrived_s = math.nan  # of the last block's bytes, on the line's clock
