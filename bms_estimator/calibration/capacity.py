@@ -33,7 +33,7 @@ from bms_estimator.settings.observer import IdentifierSettings
 
 LARGEST_STD = 0.1
 """Maximum std of an anchor's SOC."""
-LEAST_SWING = 0.15
+MIN_SWING = 0.15
 """SOC between the lowest and the highest anchor that a capacity needs."""
 LARGEST_RELATIVE_STD = 0.2
 """Maximum relative std of a capacity."""
@@ -236,14 +236,14 @@ def _check_swing(anchors: Sequence[Anchor], rejected: Sequence[str], capacity_ah
     parts = [[a for a in anchors if a.part == part] for part in {a.part for a in anchors}]
     swing = max(np.ptp([a.soc for a in part]) for part in parts)
     counted = max(np.ptp([a.counted_ah for a in part]) for part in parts) / capacity_ah
-    if swing < LEAST_SWING <= 0.5 * counted:
+    if swing < MIN_SWING <= 0.5 * counted:
         raise UserError(
             f"no capacity: the voltages of the rests are at most {swing:.2f} of SOC apart, the charge between them is "
             f"{counted:.2f} of the declared capacity: is the curve this cell's, and the unit of the current ampere?"
         )
-    if swing < LEAST_SWING:
+    if swing < MIN_SWING:
         raise UserError(
-            f"no capacity: the anchors of a capture are at most {swing:.2f} of SOC apart, at least {LEAST_SWING} are "
+            f"no capacity: the anchors of a capture are at most {swing:.2f} of SOC apart, at least {MIN_SWING} are "
             f"needed: rest again after more charge{':' if reasons else ''}{reasons}"
         )
 

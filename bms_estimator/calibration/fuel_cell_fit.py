@@ -26,7 +26,7 @@ WIDEST = math.log(100.0)
 """No parameter is looked for further from the file's value than this factor."""
 ROUNDS = 3
 """Number of fits: the weights of the sources follow from the residuals of the fit before."""
-LEAST_V = 1e-4
+MIN_V = 1e-4
 """No source is better than this [V]: what leaves less has as many points as parameters."""
 BLOCKS = 20
 """Number of parts of a record whose means show how long its errors are correlated."""
@@ -154,7 +154,7 @@ def _weight(source: Source, file: Floats, theta: Floats, parameters: int) -> flo
     """One over the error of a voltage that counts once: errors that are alike for a while count as one."""
     error_v = source.voltage_v - source.predicted(file, theta)[0]
     free = max(error_v.size - parameters, 1) / error_v.size
-    rms_v = max(_rms(error_v) / math.sqrt(free), LEAST_V)
+    rms_v = max(_rms(error_v) / math.sqrt(free), MIN_V)
     return 1.0 / (rms_v * math.sqrt(_alike(error_v) if source.time_s is not None else 1.0))
 
 
@@ -164,7 +164,7 @@ def _alike(error_v: Floats) -> float:
     if size < 2:
         return 1.0
     means = error_v[: size * BLOCKS].reshape(BLOCKS, size).mean(axis=1)
-    return float(np.clip(size * (means**2).mean() / max((error_v**2).mean(), LEAST_V**2), 1.0, size))
+    return float(np.clip(size * (means**2).mean() / max((error_v**2).mean(), MIN_V**2), 1.0, size))
 
 
 def _errors(a: Floats, told: list[int], covariance: Floats) -> dict[Parameter, float]:

@@ -33,7 +33,7 @@ from bms_estimator.telemetry.lifetime_totals import new_totals
 FORMAT = 7
 """Version of the file's layout. Raise it when a field changes its meaning, and migrate files of the version before."""
 DAY_S = 86400.0
-LONGEST_FILE = 1 << 20
+MAX_FILE = 1 << 20
 """Maximum size of a checkpoint file [bytes]; usual ones have about 100 kB."""
 KEPT = 8
 """Number of checkpoint files of one pack; older ones are deleted."""
@@ -149,7 +149,7 @@ class CheckpointFile:
         """Read the file. An error becomes the result's reason, not an exception."""
         new = RunCounters(0, new_totals(self._now().wall_s))
         try:
-            with np.load(io.BytesIO(read_private(self.path, LONGEST_FILE)), allow_pickle=False) as file:
+            with np.load(io.BytesIO(read_private(self.path, MAX_FILE)), allow_pickle=False) as file:
                 return self._checked(file)
         except FileNotFoundError:
             return CheckpointContent({}, 0.0, new, "none found")

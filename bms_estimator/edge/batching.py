@@ -6,7 +6,7 @@ import numpy as np
 
 from bms_estimator.model.sample import SampleBlock
 
-MOST_SAMPLES = 7_000
+MAX_SAMPLES = 7_000
 """Maximum number of samples in a block: even samples that do not compress stay below ``streams.MAX_BLOCK_BYTES``."""
 
 
@@ -26,7 +26,7 @@ class Batcher:
         most: Samples of a block.
     """
 
-    def __init__(self, block_s: float, most: int = MOST_SAMPLES) -> None:
+    def __init__(self, block_s: float, most: int = MAX_SAMPLES) -> None:
         self._block_s, self._most = block_s, most
         self._parts: list[SampleBlock] = []
         self._count, self._arrival_s, self._end_s = 0, 0.0, 0.0

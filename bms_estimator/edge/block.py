@@ -30,9 +30,9 @@ _HEADER = struct.Struct("<4sBxHQQQd")
 _OLDEST = 24
 """Offset of the field in the header."""
 _MAGIC, _VERSION = b"BMSB", 1
-MOST_SAMPLES = 65_535
+MAX_SAMPLES = 65_535
 """Maximum number of samples of a block."""
-MOST_NUMBER = 2**63
+MAX_NUMBER = 2**63
 """Maximum number of a store or block."""
 _COLUMNS = tuple((name, np.dtype(SAMPLE[name]).newbyteorder("<")) for name in SAMPLE.names or ())
 _SAMPLE_BYTES = sum(dtype.itemsize for _, dtype in _COLUMNS)
@@ -51,7 +51,7 @@ class Block:
         number: Of this block, from 1.
         oldest: The oldest number that the edge can still send; at most ``number``.
         arrival_s: Wall clock at the arrival of the last sample [s since 1970].
-        samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MOST_SAMPLES`` of them.
+        samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MAX_SAMPLES`` of them.
     """
 
     store: int
@@ -65,10 +65,10 @@ def encode(block: Block) -> bytes:
     """Encode a block.
 
     Raises:
-        ValueError: It holds no sample, or more than ``MOST_SAMPLES``.
+        ValueError: It holds no sample, or more than ``MAX_SAMPLES``.
     """
-    if not 1 <= block.samples.size <= MOST_SAMPLES:
-        raise ValueError(f"{block.samples.size} samples in a block: must be 1 to {MOST_SAMPLES}")
+    if not 1 <= block.samples.size <= MAX_SAMPLES:
+        raise ValueError(f"{block.samples.size} samples in a block: must be 1 to {MAX_SAMPLES}")
     header = _HEADER.pack(
         _MAGIC, _VERSION, block.samples.size, block.store, block.number, block.oldest, block.arrival_s
     )
@@ -93,7 +93,7 @@ def decode(data: bytes) -> Block:
     _, version, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
     if version != _VERSION:
         raise BlockError(f"version {version}; this program reads version {_VERSION}")
-    if not (1 <= oldest <= number < MOST_NUMBER and 0 < store < MOST_NUMBER and math.isfinite(arrival_s)):
+    if not (1 <= oldest <= number < MAX_NUMBER and 0 < store < MAX_NUMBER and math.isfinite(arrival_s)):
         raise BlockError(f"store {store}, number {number}, oldest {oldest}, arrival {arrival_s}: cannot be")
     return Block(store, number, oldest, arrival_s, _samples(data[_HEADER.size :], count))
 

@@ -15,7 +15,7 @@ import structlog
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
-from bms_estimator.edge.batching import MOST_SAMPLES, Batcher
+from bms_estimator.edge.batching import MAX_SAMPLES, Batcher
 from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES
 from bms_estimator.edge.sample_clock import SampleClock
@@ -78,7 +78,7 @@ class BlockSender:
         connect: Connect | None = None,
         clock: Clock | None = None,
         steady: Callable[[], float] = since_boot,
-        most_samples: int = MOST_SAMPLES,
+        most_samples: int = MAX_SAMPLES,
         first_delay_s: float = FIRST_DELAY_S,
         retry_s: float = RETRY_S,
         handover_s: float = HANDOVER_S,

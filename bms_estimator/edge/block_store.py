@@ -22,7 +22,7 @@ from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.mqtt.message import Message, QueuedMessage
 from bms_estimator.store.database import Database, StoreError
 
-MOST_WAITING = 500_000
+MAX_WAITING = 500_000
 """Samples that wait in memory for a disk that takes none: 20 MB, five days at a sample a second."""
 RETRY_S = 1.0
 """Retry interval of a disk operation that failed [s]; ``Database`` avoids a disk that has failed."""
@@ -115,7 +115,7 @@ class BlockStore:
             self._task.result()  # only an internal error ends the task: raise it
         self._put += 1
         self._waiting.append((self._put, gathered))
-        while len(self._waiting) > 1 and sum(block.samples.size for _, block in self._waiting) > MOST_WAITING:
+        while len(self._waiting) > 1 and sum(block.samples.size for _, block in self._waiting) > MAX_WAITING:
             self._waiting.popleft()
             self._drop(1, "the disk takes no blocks, and memory is full")
         self._wanted.set()

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bms_estimator.edge.batching import ReadyBlock
-from bms_estimator.edge.block import MOST_NUMBER, Block, BlockError, decode, encode
+from bms_estimator.edge.block import MAX_NUMBER, Block, BlockError, decode, encode
 
 NS = 1_000_000_000
-LATEST_S = MOST_NUMBER // NS - 1
+LATEST_S = MAX_NUMBER // NS - 1
 """No store is made later [s since 1970]: the year 2262."""
 DROP_ROWS = 64
 """Blocks that are looked at together where room must be made."""
@@ -154,7 +154,7 @@ def _kept(connection: sqlite3.Connection) -> StoreState | None:
     if row is None or [*map(type, row)] != [int, int, float, int, str, int]:
         return None
     kept = StoreState(*row)
-    return kept if 0 < kept.made_s <= LATEST_S and 0 < kept.next < MOST_NUMBER else None
+    return kept if 0 < kept.made_s <= LATEST_S and 0 < kept.next < MAX_NUMBER else None
 
 
 def _put(connection: sqlite3.Connection, kept: StoreState, gathered: ReadyBlock) -> StoreState:

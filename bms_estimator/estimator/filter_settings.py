@@ -35,9 +35,9 @@ BIAS_OF_STD = 0.15
 in their ratios, too."""
 ROOM_C = 15.0, 35.0
 """Resistances of unknown temperature are those of a room [C]."""
-LEAST_SHARE = 1e-4
+MIN_SHARE = 1e-4
 """No branch has less than this part of the sum at SOC 0.5: time constants are means weighted by resistance."""
-LEAST_CAPACITANCE = 0.05
+MIN_CAPACITANCE = 0.05
 """C_ts, C_tl, negative below delta1, delta2, are at least this part of a9, a12."""
 
 SOC_GRID = np.linspace(0.0, 1.0, GRID)
@@ -73,7 +73,7 @@ def filter_settings(
     weak_ohm, strong_ohm, r_std, (p["low_c"], p["high_c"]) = _ladder(cell)
     middle = GRID // 2
     p["middle_ohm"] = weak_ohm[middle].sum() + strong_ohm[middle].sum()
-    p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, LEAST_SHARE * p["middle_ohm"]), strong_ohm
+    p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, MIN_SHARE * p["middle_ohm"]), strong_ohm
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
     p["unmeasured_s"] = unmeasured_s(sampling)
@@ -149,8 +149,8 @@ def ladder_of_branches(cell: CellModel) -> NDArray[np.float64]:
     ln_taus = np.log(TAU_S)
     for i, soc in enumerate(SOC_GRID):
         ohm[i, 0] = chen_mora.r_s(soc, a)
-        c_ts = max(chen_mora.c_ts(soc, a), LEAST_CAPACITANCE * a[9])
-        c_tl = max(chen_mora.c_tl(soc, a), LEAST_CAPACITANCE * a[12])
+        c_ts = max(chen_mora.c_ts(soc, a), MIN_CAPACITANCE * a[9])
+        c_tl = max(chen_mora.c_tl(soc, a), MIN_CAPACITANCE * a[12])
         for r, c in ((chen_mora.r_ts(soc, a), c_ts), (chen_mora.r_tl(soc, a), c_tl)):
             position = float(np.interp(np.log(r * c), ln_taus, np.arange(BRANCHES)))
             k = min(int(position), BRANCHES - 2)

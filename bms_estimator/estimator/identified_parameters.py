@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import emf
 from bms_estimator.kernels.cell_model.rc_ladder import on_grid
-from bms_estimator.kernels.identifier import LEAST_BINS
+from bms_estimator.kernels.identifier import MIN_BINS
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
 from bms_estimator.kernels.kalman_filter.ocv_correction import node_error_scale, node_position
@@ -21,7 +21,7 @@ WIDEST_CAPACITY_STD = 0.3
 """Maximum std that a cell file may hold."""
 EVEN = tuple(np.round(np.linspace(0.0, 1.0, 101), 2).tolist())
 """SOCs of a table computed from (2.10)."""
-LEAST_RISE_V = 1e-6
+MIN_RISE_V = 1e-6
 """Minimum rise of the OCV between two SOCs of its table [V]."""
 
 
@@ -60,7 +60,7 @@ def present_resistance(record: np.void) -> float:
 
 
 def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
-    """a_index, 1..15, of the fit over SOC; None where its element was seen in fewer than ``LEAST_BINS`` bins.
+    """a_index, 1..15, of the fit over SOC; None where its element was seen in fewer than ``MIN_BINS`` bins.
 
     Args:
         record: Record of dtype ESTIMATOR_STATE.
@@ -68,7 +68,7 @@ def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
     """
     element = (index - 1) // 3
     fit = record["fit"]
-    if fit["bins"][element] < LEAST_BINS:
+    if fit["bins"][element] < MIN_BINS:
         return None
     return IdentifiedValue(float(fit["a"][index]), float(fit["std"][index]), float(record["unlearned_s"][element]))
 
@@ -185,5 +185,5 @@ def _corrected(record: np.void, settings: np.void, cell: CellModel, series: int)
     soc = np.array(table["soc"])
     correction_v, std_v = ocv_correction_with_std(record, settings, soc)
     ocv_v = np.array(table["ocv_v"]) if "ocv_v" in table else np.array([emf(x, cell.a) for x in soc])
-    rising_v = np.maximum.accumulate(ocv_v + correction_v / series) + LEAST_RISE_V * np.arange(soc.size)
+    rising_v = np.maximum.accumulate(ocv_v + correction_v / series) + MIN_RISE_V * np.arange(soc.size)
     return table | {"ocv_v": rising_v.tolist(), "error_v": (std_v / series).tolist()}

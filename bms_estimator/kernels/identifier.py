@@ -44,7 +44,7 @@ from bms_estimator.numba_cache import njit
 
 FIT_EVERY_S = 120.0
 """One element is fitted this often, each in its turn [s of samples]."""
-LEAST_BINS = 3
+MIN_BINS = 3
 """Minimum number of SOC bins for the three parameters of an element."""
 MIN_EXCITATION_C = 0.05
 """Minimum load that excites the resistances, RMS over 10 min [C]."""
@@ -145,7 +145,7 @@ def set_adaptation_targets(s: Record, p: Record, e: int) -> None:
     Parameters that no law adapts (a13..a15 of the improved method) take the fitted values at once.
     A capacitance that is negative at the present SOC is no limit to strive for: it would end the adaptation (E14).
     """
-    if p.hand_over == 0 or s.fit.bins[e] < LEAST_BINS:
+    if p.hand_over == 0 or s.fit.bins[e] < MIN_BINS:
         return
     i = 3 * e + 1
     amplitude, exponent, offset = fit_within(s.fit, e, p.lower, p.upper)

@@ -8,7 +8,7 @@ from pydantic import Field
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import Health, Payload, Snapshot
 
-LEAST_UNSEEN_S = 1.0
+MIN_UNSEEN_S = 1.0
 """Shorter gaps are counted in ``health`` alone [s]."""
 NOT_SAVED = ("cannot be saved", "not saved")
 """Beginnings of ``health.checkpoint`` when the disk does not accept it."""
@@ -92,7 +92,7 @@ def _watched(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Found]:
 
 
 def _unseen(unseen_s: float) -> Iterator[_Found]:
-    if unseen_s >= LEAST_UNSEEN_S:
+    if unseen_s >= MIN_UNSEEN_S:
         yield _Found("unseen", f"nobody measured for {unseen_s:.1f} s")
 
 

@@ -33,9 +33,9 @@ CellBlock = NDArray[np.float64]
 NO_CELLS: CellBlock = np.empty((0, 0))
 """Cell voltages of a block without any, of any length."""
 
-LEAST_C, MOST_C = -60.0, 200.0
+MIN_C, MAX_C = -60.0, 200.0
 """Maximum plausible temperature of a pack or stack [degC]."""
-LEAST_CELL_V, MOST_CELL_V = -5.0, 10.0
+MIN_CELL_V, MAX_CELL_V = -5.0, 10.0
 """No single cell has a voltage beyond, be it reversed [V]."""
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 from bms_estimator.mqtt.broker_config import Broker
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING
+from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING
 
 
 class BrokerConnectionError(Exception):
@@ -42,9 +42,9 @@ class ConnectOptions(NamedTuple):
     """Last will; None for a reader."""
     on_message_lost: Callable[[str, str], None]
     """Callback with kind (``too_long``, ``overflow``) and topic of each discarded message."""
-    most_waiting: int = MOST_WAITING
+    most_waiting: int = MAX_WAITING
     """Messages that wait to be read; more are lost."""
-    most_bytes: int = MOST_BYTES
+    most_bytes: int = MAX_BYTES
     """Maximum size of a received message [bytes]. An MQTT 5 broker withholds longer ones; else they are dropped here."""
 
 

@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import aiomqtt
 
-MOST_WAITING = 100
+MAX_WAITING = 100
 """Messages that wait to be read; more are lost."""
-MOST_BYTES = 16_384
+MAX_BYTES = 16_384
 """Maximum length of a received message [bytes]: an MQTT 5 broker enforces it, longer ones of an older broker are
 discarded."""
 

@@ -18,11 +18,11 @@ from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics, TopicCac
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
 
-MOST_WAITING = 2000
+MAX_WAITING = 2000
 """Messages that wait to be read: a broker sends all that is retained at once, some twenty of each device."""
-MOST_BYTES = 65_536
+MAX_BYTES = 65_536
 """Maximum length of a message: ``schema`` has a quarter of it."""
-REASONS = {"too_long": f"longer than {MOST_BYTES} bytes", "overflow": "faster than they are read"}
+REASONS = {"too_long": f"longer than {MAX_BYTES} bytes", "overflow": "faster than they are read"}
 LOG_S = 60.0
 """Minimum time between two log lines on dropped messages [s]."""
 CLOSING_S = 3.0
@@ -65,7 +65,7 @@ class Subscriber:
         self._published = TopicCache(settings.base_topic, left_out)
         self._delivery = DeliveryStats()
         self._lost_since: float | None = self._clock.wall()
-        hello = ConnectOptions(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
+        hello = ConnectOptions(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MAX_WAITING, MAX_BYTES)
         connect = connect or BrokerConnector(settings)
         self._link = ReconnectLoop(brokers(settings), hello, connect, self._serve, self._delivery, first_delay_s)
         self._task: asyncio.Task[None] | None = None

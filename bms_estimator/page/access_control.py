@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import credential
 from bms_estimator.settings.page import PageSettings
 
-SHORTEST_TOKEN = 16
+MIN_TOKEN = 16
 """Letters of a token, at least: `openssl rand -hex 16` makes 32."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -83,9 +83,9 @@ def _token(settings: PageSettings) -> str | None:
         raise UserError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:  # whose text contains the bytes
         raise UserError(f"page.token_file = {name}: cannot be read: not UTF-8 text") from None
-    if len(token) < SHORTEST_TOKEN:
+    if len(token) < MIN_TOKEN:
         raise UserError(
-            f"page.token_file = {name}: the token has {len(token)} letters, must have {SHORTEST_TOKEN} or more; "
+            f"page.token_file = {name}: the token has {len(token)} letters, must have {MIN_TOKEN} or more; "
             f"`openssl rand -hex 16 > {name}` makes one"
         )
     return token

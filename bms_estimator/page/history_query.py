@@ -11,7 +11,7 @@ from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.store.history_reader import HistoryFile
 from bms_estimator.store.minute import MINUTE_S
 
-MOST_EVENTS = 50
+MAX_EVENTS = 50
 FIELDS = (
     "time_s",
     "voltage_v",
@@ -85,7 +85,7 @@ class HistoryQuery:
 def _columns(file: HistoryFile, span: Span, now_s: float) -> bytes:
     since_s, until_s = now_s - span.length_s, now_s + MINUTE_S
     rows = file.rows(since_s, until_s, span.step_s)
-    events = file.events(since_s, until_s)[-MOST_EVENTS:]
+    events = file.events(since_s, until_s)[-MAX_EVENTS:]
     columns = {field: [getattr(row, field) for row in rows] for field in FIELDS}
     shown = {"step_s": span.step_s, **columns, "events": [event._asdict() for event in events]}
     return json.dumps(shown, separators=(",", ":")).encode()

@@ -5,11 +5,11 @@ import random
 FIRST_RETRY_S = 0.5
 """First retry delay of a missing or lost port; it doubles with each attempt [s]."""
 
-LONGEST_RETRY_S = 10.0
+MAX_RETRY_S = 10.0
 
 FIRST_DELAY_S = 2.0
 """The first pause; doubles with each [s]."""
-LONGEST_DELAY_S = 30.0
+MAX_DELAY_S = 30.0
 """A broker in the house is back before long [s]."""
 
 
@@ -26,7 +26,7 @@ class Backoff:
     def next_s(self) -> float:
         """Return the next delay [s]."""
         delay_s = self._next_s
-        self._next_s = min(2.0 * delay_s, LONGEST_DELAY_S)
+        self._next_s = min(2.0 * delay_s, MAX_DELAY_S)
         return delay_s * random.uniform(0.5, 1.0)
 
     def reset(self) -> None:

@@ -2,7 +2,7 @@
 
 import math
 
-SHORTEST_S = 1e-5
+MIN_S = 1e-5
 PER_OCTAVE = 4
 BINS = 100
 """Up to five minutes."""
@@ -17,7 +17,7 @@ class Latency:
 
     def add(self, latency_s: float) -> None:
         """Take one."""
-        octaves = math.log2(max(latency_s, SHORTEST_S) / SHORTEST_S)
+        octaves = math.log2(max(latency_s, MIN_S) / MIN_S)
         self._counts[min(math.ceil(PER_OCTAVE * octaves), BINS - 1)] += 1
         self._most_s = max(self._most_s, latency_s)
 
@@ -39,5 +39,5 @@ def _percentile(counts: list[int], share: float, most_s: float) -> float:
     for i, count in enumerate(counts):
         seen += count
         if seen >= wanted:
-            return min(SHORTEST_S * math.exp2(i / PER_OCTAVE), most_s)
+            return min(MIN_S * math.exp2(i / PER_OCTAVE), most_s)
     return most_s

@@ -28,7 +28,7 @@ from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import CheckpointWriter
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
+from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ, Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Source, SourceHealth
@@ -272,7 +272,7 @@ def _offer(
         return {}
 
     async def publish_rate(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        rate_hz, before = number(arguments, "rate_hz", LEAST_RATE_HZ, MOST_RATE_HZ), 1.0 / publisher.period_s
+        rate_hz, before = number(arguments, "rate_hz", MIN_RATE_HZ, MAX_RATE_HZ), 1.0 / publisher.period_s
         publisher.set_rate(rate_hz)
         log.info("publish rate set on request", before=before, rate_hz=rate_hz)
         return {"rate_hz": rate_hz, "before": before}

@@ -13,7 +13,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
 from bms_estimator.settings.pack import Settings
 
-LEAST_SILENT_S = 10.0
+MIN_SILENT_S = 10.0
 """A link that is silent for less is not lost yet [s]."""
 SILENT_PERIODS = 3
 """Minimum number of missing samples or publications before an alarm on silence."""
@@ -71,13 +71,13 @@ _BY_NOMINAL_V = (
 )
 """Up to which nominal voltage of a cell [V] it is taken to be of which chemistry."""
 
-LEAST_CHARGE = 0.02
+MIN_CHARGE = 0.02
 """Minimum charge current as a fraction of the capacity per hour; a smaller one is the sensor's offset."""
 
 
 DIGITS = 9
 """0.1 - 0.08 is to be 0.02."""
-MOST_DISCHARGE = 5.0
+MAX_DISCHARGE = 5.0
 """Default maximum discharge current as a multiple of the capacity per hour; a generic cell's file accepts readings
 far above the continuous limit of most such cells."""
 
@@ -114,13 +114,13 @@ def silent_limit_s(settings: Settings) -> float:
 
 def _silent_s(settings: Settings) -> float:
     """Default limit of ``link_lost`` [s]."""
-    return max(LEAST_SILENT_S, SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s))
+    return max(MIN_SILENT_S, SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s))
 
 
 def charging_a(cell: PackModel) -> float:
     """Minimum charge current [A]."""
     of = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
-    return LEAST_CHARGE * of
+    return MIN_CHARGE * of
 
 
 def out_of_range(settings: Settings, cell: PackModel) -> list[str]:
@@ -195,7 +195,7 @@ def _of_battery(cell: CellModel) -> dict[AlarmName, _Default]:
     each_v = c.nominal_voltage_v / n
     v = next(chemistry for most_v, chemistry in _BY_NOMINAL_V if each_v < most_v)
     charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
-    discharge_a = min(MOST_DISCHARGE * c.capacity_ah, c.current_max_a)
+    discharge_a = min(MAX_DISCHARGE * c.capacity_ah, c.current_max_a)
     return {
         "pack_over_voltage": _Default(n * v.over_v, n * v.over_clear_v, "V"),
         "pack_under_voltage": _Default(n * v.under_v, n * v.under_clear_v, "V", above=False),

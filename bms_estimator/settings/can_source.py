@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from bms_estimator.model.config_file import Strict
 from bms_estimator.settings.polled_source import PolledSource, with_profile
 
-LONGEST_ID, LONGEST_EXTENDED_ID = 0x7FF, 0x1FFF_FFFF
+MAX_ID, MAX_EXTENDED_ID = 0x7FF, 0x1FFF_FFFF
 """Largest identifiers of eleven and of 29 bits."""
 FRAME_BITS = 512
 """Bits of the longest CAN FD frame."""
@@ -32,7 +32,7 @@ class Signal(Strict):
     signal: Annotated[str, Field(min_length=1)] | None = Field(
         default=None, description="name in the DBC file: Signal, or Message.Signal where several have it"
     )
-    id: Annotated[int, Field(ge=0, le=LONGEST_EXTENDED_ID)] | None = Field(
+    id: Annotated[int, Field(ge=0, le=MAX_EXTENDED_ID)] | None = Field(
         default=None, description="identifier of the frame, such as 0x356"
     )
     extended: bool = Field(default=False, description="the identifier has 29 bits")
@@ -56,7 +56,7 @@ class Signal(Strict):
             raise ValueError("scale: must not be 0")
         if (self.signal is None) == (self.id is None):
             raise ValueError("give signal, a name in the DBC file, or id, start_bit and bits, and not both")
-        if self.id is not None and self.id > LONGEST_ID and not self.extended:
+        if self.id is not None and self.id > MAX_ID and not self.extended:
             raise ValueError("id: above 0x7FF it has 29 bits: extended = true")
         return self
 

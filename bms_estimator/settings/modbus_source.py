@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from bms_estimator.model.config_file import Strict
 from bms_estimator.settings.polled_source import PolledSource, with_profile
 
-MOST_WORDS = 125
+MAX_WORDS = 125
 """Registers that one request may ask for, of the Modbus application protocol V1.1b3, section 6.3."""
 WORDS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2}
 """Registers of a value, by its type."""
@@ -68,7 +68,7 @@ class CellRegisters(Register):
     """Voltages of cells, one after the other."""
 
     count: Annotated[int, Field(ge=1, le=96)] = Field(description="how many cells")
-    step: Annotated[int, Field(ge=1, le=MOST_WORDS)] | None = Field(
+    step: Annotated[int, Field(ge=1, le=MAX_WORDS)] | None = Field(
         default=None, description="registers from one cell to the next; those of a value when left out"
     )
 

@@ -25,7 +25,7 @@ SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource |
 
 SOURCE: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)
 
-LEAST_RATE_HZ, MOST_RATE_HZ = 0.1, 10.0
+MIN_RATE_HZ, MAX_RATE_HZ = 0.1, 10.0
 """Limits of the publish rate [Hz]."""
 LogLevel = Literal["info", "warning", "error"]
 DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
@@ -55,7 +55,7 @@ class PackSettings(Strict):
 class PublishSettings(Strict):
     """Publish rate."""
 
-    rate_hz: Annotated[float, Field(ge=LEAST_RATE_HZ, le=MOST_RATE_HZ)] = Field(
+    rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)] = Field(
         default=1.0, description="publications per second"
     )
 

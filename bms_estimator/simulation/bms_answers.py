@@ -133,5 +133,5 @@ BMS_ANSWERS: Mapping[str, Answers] = {
     "jk-pb": {jk.question(PACK): _jk_newer},
 }
 """Responses by protocol; ``jk`` and ``jk-pb`` are the two families of JK."""
-MOST_CELLS = 32
+MAX_CELLS = 32
 """No protocol has room for more in all its frames."""

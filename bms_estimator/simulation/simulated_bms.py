@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from enum import Enum
 
-from bms_estimator.simulation.bms_answers import BMS_ANSWERS, MOST_CELLS, Measured
+from bms_estimator.simulation.bms_answers import BMS_ANSWERS, MAX_CELLS, Measured
 from bms_estimator.simulation.simulated_meter import Signal, SimulatedMeter
 from bms_estimator.simulation.virtual_adc import Reading
 
@@ -54,8 +54,8 @@ class SimulatedBms(SimulatedMeter):
         capacity_ah: float = 100.0,
         seed: int = 0,
     ) -> None:
-        if not 1 <= cells <= MOST_CELLS:
-            raise ValueError(f"{cells} cells: a simulated BMS has 1 to {MOST_CELLS}")
+        if not 1 <= cells <= MAX_CELLS:
+            raise ValueError(f"{cells} cells: a simulated BMS has 1 to {MAX_CELLS}")
         super().__init__(signal, speed=speed)
         self._answers, self._soc, self._capacity_ah = BMS_ANSWERS[protocol], soc, capacity_ah
         self._random = random.Random(seed)

@@ -17,8 +17,8 @@ EMPTY_SOC, FULL_SOC = 0.05, 0.95
 """The load stops at the one and begins again at the other; in between the pack is charged. Above the other no load charges it."""
 ROOM_C = 25.0
 PULSE_S = 10.0
-SHORTEST_STEP_S, LONGEST_STEP_S = 1.0, 5.0
-MOST_CHARGE = 0.25
+MIN_STEP_S, MAX_STEP_S = 1.0, 5.0
+MAX_CHARGE = 0.25
 """Random steps also charge, with up to this part of the current."""
 
 Load = Iterator[tuple[float, float]]
@@ -42,7 +42,7 @@ def random_steps(current_a: float, seed: int = 0) -> Load:
     """Return a schedule of steps of random length and height, some of them charging."""
     dice = random.Random(seed)
     while True:
-        yield dice.uniform(SHORTEST_STEP_S, LONGEST_STEP_S), current_a * dice.uniform(-MOST_CHARGE, 1.0)
+        yield dice.uniform(MIN_STEP_S, MAX_STEP_S), current_a * dice.uniform(-MAX_CHARGE, 1.0)
 
 
 class LoadName(StrEnum):

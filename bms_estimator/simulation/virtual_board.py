@@ -19,14 +19,14 @@ from typing import Literal, Self
 
 from bms_estimator.protocols.firmware.messages import (
     DELIMITER,
-    LEAST_BANDGAP_V,
-    LEAST_DIVIDER,
-    LEAST_VOLTS_PER_AMPERE,
+    MAX_BANDGAP_V,
+    MAX_DIVIDER,
+    MAX_SILENT_S,
+    MAX_VOLTS_PER_AMPERE,
+    MIN_BANDGAP_V,
+    MIN_DIVIDER,
+    MIN_VOLTS_PER_AMPERE,
     MODULUS,
-    MOST_BANDGAP_V,
-    MOST_DIVIDER,
-    MOST_SILENT_S,
-    MOST_VOLTS_PER_AMPERE,
     PROTOCOL_VERSION,
     RATE_HZ,
     RELAY_HIGH,
@@ -77,9 +77,9 @@ def _millionths(least: float, most: float) -> range:
 
 _RANGES = {
     MessageType.COMMAND_SET_SERIAL: range(MODULUS),
-    MessageType.COMMAND_SET_BANDGAP: _millionths(LEAST_BANDGAP_V, MOST_BANDGAP_V),
-    MessageType.COMMAND_SET_DIVIDER: _millionths(LEAST_DIVIDER, MOST_DIVIDER),
-    MessageType.COMMAND_SET_CURRENT_SLOPE: _millionths(LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE),
+    MessageType.COMMAND_SET_BANDGAP: _millionths(MIN_BANDGAP_V, MAX_BANDGAP_V),
+    MessageType.COMMAND_SET_DIVIDER: _millionths(MIN_DIVIDER, MAX_DIVIDER),
+    MessageType.COMMAND_SET_CURRENT_SLOPE: _millionths(MIN_VOLTS_PER_AMPERE, MAX_VOLTS_PER_AMPERE),
     MessageType.COMMAND_SET_RATIOMETRIC: range(2),
 }
 """Range of the number that a command sets."""
@@ -405,7 +405,7 @@ class VirtualBoard:
         good = (
             word & 0xFE == 0
             and then <= RELAY_HIGH
-            and silent_s <= MOST_SILENT_S
+            and silent_s <= MAX_SILENT_S
             and (then == RELAY_KEEP or silent_s > 0)
         )
         if good:

@@ -12,7 +12,7 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.sample import CellBlock, SampleBlock
-from bms_estimator.process.backoff import FIRST_RETRY_S, LONGEST_RETRY_S
+from bms_estimator.process.backoff import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
@@ -193,7 +193,7 @@ class LineSource:
 
     async def _pause(self) -> None:
         """Each one is longer until a sample arrives."""
-        wait_s, self._retry_s = self._retry_s, min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
+        wait_s, self._retry_s = self._retry_s, min(max(2.0 * self._retry_s, self._first_retry_s), MAX_RETRY_S)
         await asyncio.sleep(wait_s)
 
     def _take(self, line: bytes) -> None:

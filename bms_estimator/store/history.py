@@ -20,7 +20,7 @@ MINUTES_A_DAY = 1440
 WAITING_MINUTES = 2 * MINUTES_A_DAY
 """Maximum number of rows in memory while the disk cannot be written."""
 WAITING_EVENTS = 1000
-MOST_EVENTS = 50_000
+MAX_EVENTS = 50_000
 """Maximum number of events in the database, so that a flapping line does not fill the disk."""
 
 Row = TypeVar("Row")
@@ -181,4 +181,4 @@ def _prune(connection: sqlite3.Connection, most: int) -> None:
         connection.execute("DELETE FROM minute WHERE time_s < ?", oldest)
         connection.execute("DELETE FROM event WHERE time_s < ?", oldest)
     beyond = "SELECT number FROM event ORDER BY number DESC LIMIT 1 OFFSET ?"
-    connection.execute(f"DELETE FROM event WHERE number <= ({beyond})", (MOST_EVENTS,))  # noqa: S608
+    connection.execute(f"DELETE FROM event WHERE number <= ({beyond})", (MAX_EVENTS,))  # noqa: S608

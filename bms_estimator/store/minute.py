@@ -8,7 +8,7 @@ from typing import NamedTuple
 from bms_estimator.model.payloads import Estimate
 
 MINUTE_S = 60
-LONGEST_S = 30.0
+MAX_S = 30.0
 """Longest interval between two publications that is not a gap; over a gap no charge is counted [s]."""
 GAP_RATIO = 3.0
 """An interval counts as a gap if it is this many times as long as the one before, so that a slow source has none."""
@@ -103,7 +103,7 @@ def seen(span_s: float, before_s: float) -> float:
         span_s: From one to the other on the board's clock [s].
         before_s: The same of the two before [s].
     """
-    return span_s if 0.0 < span_s <= max(LONGEST_S, GAP_RATIO * before_s) else 0.0
+    return span_s if 0.0 < span_s <= max(MAX_S, GAP_RATIO * before_s) else 0.0
 
 
 def epoch_s(time: str) -> float:

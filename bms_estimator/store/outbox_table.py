@@ -10,7 +10,7 @@ from bms_estimator.store.number_ranges import NumberRanges
 
 FARTHEST = 1 << 40
 """No number is as far from 0 in ten thousand years; one that is, is of a row that is damaged."""
-LONGEST_TOPIC = 0xFFFF
+MAX_TOPIC = 0xFFFF
 """[bytes]."""
 
 _TOPIC = re.compile(r"[^+#\x00-\x1f\x7f-\x9f\ud800-\udfff]+")  # invalid UTF-8 raises the last of these
@@ -94,7 +94,7 @@ class OutboxTransaction:
 
 def _message(topic: Any, payload: Any, qos: Any, retain: Any) -> Message | None:
     """Return a stored message; None for a damaged row, which could not be sent."""
-    sound = isinstance(topic, str) and _TOPIC.fullmatch(topic) and len(topic.encode()) <= LONGEST_TOPIC
+    sound = isinstance(topic, str) and _TOPIC.fullmatch(topic) and len(topic.encode()) <= MAX_TOPIC
     if not sound or not isinstance(payload, bytes) or qos not in (0, 1, 2) or retain not in (0, 1):
         return None
     return Message(topic, payload, int(qos), retain=bool(retain))

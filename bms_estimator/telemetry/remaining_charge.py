@@ -10,7 +10,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import present_resistance, relative_capacity
 from bms_estimator.kernels.cell_model import chen_mora
 
-LONGEST_H = 1000.0
+MAX_H = 1000.0
 """Longest published time to empty or full [h]; a smaller load or charge counts as none."""
 
 
@@ -50,7 +50,7 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
 
 def _time(charge_ah: float, current_a: float, capacity_ah: float) -> float:
     """Return the time for ``charge_ah`` [s]; NaN if the current is negligible for a pack of ``capacity_ah``."""
-    return 3600.0 * charge_ah / current_a if current_a * LONGEST_H > capacity_ah else math.nan
+    return 3600.0 * charge_ah / current_a if current_a * MAX_H > capacity_ah else math.nan
 
 
 def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:

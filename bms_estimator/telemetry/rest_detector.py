@@ -6,9 +6,9 @@ from bms_estimator.model.payloads import Estimate
 
 WATCHED_S = 30.0
 """Time for which current and voltage must have been constant [s]."""
-MOST_CURRENT = 0.04
+MAX_CURRENT = 0.04
 """Maximum current at rest, as a fraction of the cell file's largest current: the offset of a sensor."""
-MOST_STEPS = 2.0
+MAX_STEPS = 2.0
 """Maximum change between the means of two publish windows, in steps of the voltage's resolution."""
 
 
@@ -21,7 +21,7 @@ class RestDetector:
     """
 
     def __init__(self, current_max_a: float, voltage_resolution_v: float) -> None:
-        self._current_a, self._voltage_v = MOST_CURRENT * current_max_a, MOST_STEPS * voltage_resolution_v
+        self._current_a, self._voltage_v = MAX_CURRENT * current_max_a, MAX_STEPS * voltage_resolution_v
         self._windows: deque[tuple[float, float, float]] = deque()  # when, current, voltage
 
     def add(self, estimate: Estimate, now_s: float) -> None:

@@ -57,7 +57,7 @@ WARM_S = 20.0
 """Before it processor time and memory are not measured [s]."""
 HALF_DAY_S = 8.0 * 3600.0
 """So long the pulses discharge, then they charge [s]."""
-MOST_CPU, MOST_GROWTH_MIB = 0.20, 2.0
+MAX_CPU, MAX_GROWTH_MIB = 0.20, 2.0
 READ_BYTES = 4096
 PACK = """
 [pack]
@@ -230,10 +230,10 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         good = taken == run.sent == run.samples["samples"] and not any(faults.values()) and not run.no_room
         counted = ", ".join(f"{n} {name}" for name, n in (faults | {"without room": run.no_room}).items() if n)
         yield Row(what, "none lost", f"{taken:,} of {run.sent:,} taken {counted}", good)
-        yield Row("  service's processor time", f"below {MOST_CPU:.0%} of a core", f"{run.cpu:.1%}", run.cpu < MOST_CPU)
+        yield Row("  service's processor time", f"below {MAX_CPU:.0%} of a core", f"{run.cpu:.1%}", run.cpu < MAX_CPU)
         first, second = run.rss_mib
         growth = f"{first:.1f} MiB in the first half, {second:.1f} in the second"
-        yield Row("  resident memory", "flat", growth, second - first < MOST_GROWTH_MIB)
+        yield Row("  resident memory", "flat", growth, second - first < MAX_GROWTH_MIB)
     if options.hours:
         dialect, estimator, took_s, rss = fed(100, 3600.0 * options.hours)
         taken, samples = dialect.counters["frames_received"], int(estimator.state["samples"][0])
@@ -242,7 +242,7 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         yield Row(what, "none lost", f"{samples:,} of {sent:,} in {took_s:.0f} s", sent == taken == samples)
         begun = math.ceil(len(rss) / 6)  # what grows at first: the allocator's pools
         growth = f"{rss[begun - 1]:.1f} MiB after {begun} h, {rss[-1]:.1f} at the end"
-        yield Row("  resident memory", "flat", growth, rss[-1] - rss[begun - 1] < MOST_GROWTH_MIB)
+        yield Row("  resident memory", "flat", growth, rss[-1] - rss[begun - 1] < MAX_GROWTH_MIB)
     if options.attack_s:
         yield from edge_token.rows(options.attack_s)
 

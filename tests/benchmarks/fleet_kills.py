@@ -42,13 +42,13 @@ OF_WORKERS = 0.5
 """Part of the kills; the others are of the server's nodes."""
 OF_LEADERS = 0.5
 """Part of the nodes' kills, where there are three."""
-LONGEST_AWAY_S = 2.0
+MAX_AWAY_S = 2.0
 """Before who was killed is started again."""
 BLOCKS_AFTER = 2
 """That each edge sends after the last kill: what was lost is asked for again when the next block comes."""
 LOOKS = 20
 """A tenth of a second apart, at what is counted and what there is, that have to agree."""
-MOST_WRONG = 20
+MAX_WRONG = 20
 """Lines about what is wrong."""
 
 
@@ -140,7 +140,7 @@ def main() -> None:
         outcome = run(plan, _say)
         of = "1 node" if nodes == 1 else f"{nodes} nodes"
         _say(f"{of}, seed {plan.seed}, {time.monotonic() - began_s:.0f} s\n{outcome}")
-        for line in outcome.wrong[:MOST_WRONG]:
+        for line in outcome.wrong[:MAX_WRONG]:
             _say(line)
         wrong += len(outcome.wrong)
     sys.exit(wrong > 0)
@@ -194,14 +194,14 @@ def _kill(fleet_rig: Rig, plan: Plan, outcome: Outcome, said: Callable[[str], ob
         whom = "worker" if dice.random() < OF_WORKERS else "node"
         if whom == "worker":
             fleet_rig.kill_worker(dice.choice(sorted(fleet_rig.workers)))
-            time.sleep(dice.uniform(0.0, LONGEST_AWAY_S))
+            time.sleep(dice.uniform(0.0, MAX_AWAY_S))
             fleet_rig.start_worker(checkpoint_s=CHECKPOINT_S)
         else:
             leader = fleet_rig.engine.leader(subjects.RAW_STREAM)
             node = leader if leader >= 0 and dice.random() < OF_LEADERS else dice.randrange(plan.nodes)
             whom = "leader" if node == leader and plan.nodes > 1 else whom
             fleet_rig.engine.kill(node)
-            time.sleep(dice.uniform(0.0, LONGEST_AWAY_S))
+            time.sleep(dice.uniform(0.0, MAX_AWAY_S))
             fleet_rig.engine.start(node)
         outcome.killed[whom] += 1
         said(f"kill {kill + 1}: a {whom}")

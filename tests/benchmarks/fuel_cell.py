@@ -24,7 +24,7 @@ from tests.mann_stack import CURVE_A
 
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
-LEAST_A = 0.1
+MIN_A = 0.1
 """Of the measured curves: see docs/theory/fuel-cell.md [A/cm2]."""
 WRONG = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])
 """Parameters of the file that a search begins at, over those of ``pem_30w``."""
@@ -100,7 +100,7 @@ def real_curves() -> None:
     for name in ("oxygen", "air"):
         columns = read_polarisation(DATA / f"nafion112_{name}.csv")
         assert columns is not None
-        for text, part in ((f"above {LEAST_A} A", columns[columns[:, 0] > LEAST_A]), ("all points", columns)):
+        for text, part in ((f"above {MIN_A} A", columns[columns[:, 0] > MIN_A]), ("all points", columns)):
             fit = fit_fuel_cell([Source(name, None, *part.T.copy())], load_fuel_cell(DATA / "one_cm2.toml"))
             say(f"{name}, {text}: {1e3 * fit.rms_v[name]:.1f} mV RMS of {len(part)} points\n    {told(fit)}")
 

@@ -28,7 +28,7 @@ PROGRAM = Path(sys.executable).with_name("bms-estimator")
 PUBLISH_RATE_HZ = 10
 """The highest that the settings allow: each message holds the newest sample of its window."""
 SETTLE_S, MEASURE_S, PATIENCE_S = 2.0, 20.0, 30.0
-LONGEST_S = 120
+MAX_S = 120
 """A signal is prepared for so long [s]."""
 
 PACK = """
@@ -84,7 +84,7 @@ class Signal:
     """
 
     def __init__(self, rate_hz: int) -> None:
-        block = pulses(LONGEST_S * rate_hz, rate_hz)
+        block = pulses(MAX_S * rate_hz, rate_hz)
         self._readings = [Reading(*row) for row in zip(block["current_a"], block["voltage_v"], strict=True)]
         self.taken_s: list[float] = []
 

@@ -19,7 +19,7 @@ from tests.page.house import Service, simulated
 MINUTES = 5.0
 SETTLE_S = 20.0
 STEP_S = 30.0
-MOST_CPU, MOST_PAINT_S, MOST_GROWTH_MIB = 0.15, 1.0, 4.0
+MAX_CPU, MAX_PAINT_S, MAX_GROWTH_MIB = 0.15, 1.0, 4.0
 FIRST_PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
 
 
@@ -51,7 +51,7 @@ async def measure(service: Service, minutes: float) -> None:
     async with chromium() as browser, tab(browser, service.url) as opened:
         await opened.until_status("live")
         await opened.until("() => performance.getEntriesByName('first-contentful-paint').length")
-        say(f"first paint {await opened.page.evaluate(FIRST_PAINT) / 1e3:.2f} s (below {MOST_PAINT_S:g} s)")
+        say(f"first paint {await opened.page.evaluate(FIRST_PAINT) / 1e3:.2f} s (below {MAX_PAINT_S:g} s)")
         session = await opened.page.context.new_cdp_session(opened.page)
         await asyncio.sleep(SETTLE_S)
         own = [p for p in processes(psutil.Process().pid) if "chrom" in p.name()]
@@ -67,9 +67,9 @@ async def measure(service: Service, minutes: float) -> None:
         parts["the service, estimator and all"] = cpu_s(_of(service)) - server_s
         for name, took_s in parts.items():
             say(f"{name}: {took_s / span_s:.1%} of a core over {span_s / 60.0:.1f} min")
-        say(f"limit of all of Chromium: {MOST_CPU:.0%}")
+        say(f"limit of all of Chromium: {MAX_CPU:.0%}")
         say(f"JavaScript heap: {heaps[0]:.1f} MiB at first, {heaps[-1]:.1f} at last, {max(heaps):.1f} at most")
-        say(f"growth allowed: {MOST_GROWTH_MIB:g} MiB")
+        say(f"growth allowed: {MAX_GROWTH_MIB:g} MiB")
 
 
 def _of(service: Service) -> list[psutil.Process]:

@@ -19,7 +19,7 @@ NEVER_V = 1e3
 """No simulation is to end at a cut-off: what it tries may be far off."""
 CHANGE_C, EVERY_S = 0.02, 10.0
 """Rows that are kept: at both ends of a change of the current by more, and after so long."""
-MOST_ROWS = 7_000
+MAX_ROWS = 7_000
 
 
 def thinned(samples: SampleBlock, change_a: float) -> SampleBlock:
@@ -49,7 +49,7 @@ def fit(
     """
     soc = soc_by_counting(samples, cell.cell.capacity_ah, initial_soc)
     samples = thinned(samples[soc > LOWEST_SOC], CHANGE_C * cell.cell.capacity_ah)
-    if samples.size > MOST_ROWS:
+    if samples.size > MAX_ROWS:
         return None
     ocv_v = ocv_grid(cell)[0]
     grid = np.linspace(0.0, 1.0, ocv_v.size)

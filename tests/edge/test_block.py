@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bms_estimator.edge.block import MOST_SAMPLES, Block, BlockError, decode, encode
+from bms_estimator.edge.block import MAX_SAMPLES, Block, BlockError, decode, encode
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 
@@ -46,7 +46,7 @@ def test_a_minute_at_an_even_pace_is_small() -> None:
     assert len(encode(BLOCK)) < 200
 
 
-@pytest.mark.parametrize("count", [0, MOST_SAMPLES + 1])
+@pytest.mark.parametrize("count", [0, MAX_SAMPLES + 1])
 def test_no_block_is_empty_or_too_long(count: int) -> None:
     with pytest.raises(ValueError, match=f"{count} samples in a block"):
         encode(Block(1, 1, 1, 0.0, samples(count)))

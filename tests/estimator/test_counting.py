@@ -16,9 +16,9 @@ from tests.estimator.anywhere.use import DAY_S, cycles, days
 
 SEEDS = range(1, 9)
 OWN_CURVE = {"curve_error": 0.5, "unseen_h": 0.0}
-MOST_ERROR, SOH_ERROR = 0.025, 0.015
+MAX_ERROR, SOH_ERROR = 0.025, 0.015
 """Of a capacity: the worst of 16 cells, and RMS."""
-MOST_A, MOST_STD_A = 0.003, 0.006
+MAX_A, MAX_STD_A = 0.003, 0.006
 """Error and std of an offset after a day, in cells of 3 Ah."""
 
 
@@ -56,7 +56,7 @@ def test_a_capacity_wrong_by_a_fifth_is_known_after_three_cycles(told_wrong: flo
             learned = relative_capacity(after_cycles(case, told_wrong).record[0])
             errors.append(told * learned.value - 1.0)
             ratios.append(ratio(learned, 1.0 / told))
-    assert np.abs(errors).max() < MOST_ERROR
+    assert np.abs(errors).max() < MAX_ERROR
     assert np.sqrt(np.mean(np.square(errors))) < SOH_ERROR
     assert np.mean(np.square(ratios)) < nees_limit(len(SEEDS))  # both of one seed have the same curve
 
@@ -80,8 +80,8 @@ def test_an_offset_of_20_ma_is_found_within_a_day(temperature_c: float) -> None:
         estimator = Estimator(seen.cell, initial_soc=0.8)
         estimator.run(seen.samples)
         learned = current_offset(estimator.record[0])
-        assert abs(learned.value - offset_a) < MOST_A
-        assert learned.std < MOST_STD_A
+        assert abs(learned.value - offset_a) < MAX_A
+        assert learned.std < MAX_STD_A
         ratios.append(ratio(learned, offset_a))
     assert np.mean(np.square(ratios)) < 1.0
 
@@ -95,8 +95,8 @@ def test_an_offset_that_changes_after_days_is_found_again_and_the_soc_stays_righ
     before = current_offset(estimator.record[0])
     trace = estimator.run(seen.samples[change:])
     after = current_offset(estimator.record[0])
-    assert abs(before.value) < MOST_A
-    assert abs(after.value - 0.03) < MOST_A
+    assert abs(before.value) < MAX_A
+    assert abs(after.value - 0.03) < MAX_A
     inside = np.abs(trace["soc"] - seen.soc[change:]) < 2.0 * trace["soc_std"]
     assert inside[DAY_S:].mean() > 0.95
 

@@ -14,7 +14,7 @@ from bms_estimator.calibration.thesis.series_resistance import (
 from bms_estimator.checkpoint.identity import fields, without_observer
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.observer.series_resistance import BINS, MOST_SAMPLES
+from bms_estimator.kernels.observer.series_resistance import BINS, MAX_SAMPLES
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.telemetry.parameters import make_parameters_payload
@@ -144,9 +144,9 @@ def test_a_bin_forgets_so_that_r_s_can_age(load: SampleBlock) -> None:
     estimator.run(load[:flowing])
     sums = estimator.record["series_resistance"]
     full = int(estimator.state["soc"][0] * BINS)
-    sums["samples"][0, full], sums["square_a2"][0, full], sums["product_va"][0, full] = MOST_SAMPLES, 2e4, 2e3
+    sums["samples"][0, full], sums["square_a2"][0, full], sums["product_va"][0, full] = MAX_SAMPLES, 2e4, 2e3
     estimator.run(load[flowing : flowing + 1])
-    assert sums["samples"][0, full] == MOST_SAMPLES / 2 + 1
+    assert sums["samples"][0, full] == MAX_SAMPLES / 2 + 1
 
 
 def test_the_identifier_or_another_law_has_no_r_s_by_4_2(load: SampleBlock) -> None:

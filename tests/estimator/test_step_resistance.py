@@ -12,7 +12,7 @@ from tests.estimator.anywhere.cases import OXIDE, Case, cell_file
 from tests.estimator.anywhere.truth import simulate
 
 FULL_HZ, HOURS = 100, 0.4
-LEAST_A = 0.5 * OXIDE.capacity_ah
+MIN_A = 0.5 * OXIDE.capacity_ah
 FILES = {"of another such cell": Case("R_s"), "generic": Case("R_s", file_c="generic")}
 
 
@@ -43,7 +43,7 @@ def pulses() -> tuple[SampleBlock, Floats]:
 def seen_by_all(samples: SampleBlock) -> Floats:
     """What each step of the capture shows from one sample to the next [ohm]."""
     change_a, change_v = np.diff(samples["current_a"]), np.diff(samples["voltage_v"])
-    steps = np.abs(change_a) >= LEAST_A
+    steps = np.abs(change_a) >= MIN_A
     return -change_v[steps] / change_a[steps]
 
 

@@ -12,7 +12,7 @@ from tests.simavr_board import FIRMWARE, ROOT
 
 TABLE = (ROOT / "docs" / "pack" / "board.md").read_text(encoding="utf-8")
 DRAWING = " ".join(ET.parse(ROOT / "docs" / "images" / "wiring.svg").getroot().itertext())
-LEAST_AVCC_V = 4.5
+MIN_AVCC_V = 4.5
 FULL_PACK_V = 6 * 4.2
 TOLERANCE = 0.01
 UNITS = {"kΩ": 1e3, "nF": 1e-9, "Ω": 1.0}
@@ -37,7 +37,7 @@ R1, R2, R3 = value("R1"), value("R2"), value("R3")
 
 def test_a_full_pack_is_within_range_at_the_lowest_supply_with_the_worst_resistors() -> None:
     worst = 1.0 + R1 * (1.0 - TOLERANCE) / (R2 * (1.0 + TOLERANCE))
-    assert LEAST_AVCC_V * worst > 1.05 * FULL_PACK_V
+    assert MIN_AVCC_V * worst > 1.05 * FULL_PACK_V
 
 
 def test_the_firmware_and_the_virtual_board_are_built_as_drawn() -> None:

@@ -23,7 +23,7 @@ from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant
 from tests.home_assistant.packs import Packs
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
-from tests.sinks.home_assistant.test_discovery import CELLS, MOST_ROWS_PER_MIN, noisy, restless, rows
+from tests.sinks.home_assistant.test_discovery import CELLS, MAX_ROWS_PER_MIN, noisy, restless, rows
 from tests.sinks.home_assistant.test_discovery import described as shown
 
 SOC, SET_SOC, LOW = "sensor.bms_pack_soc_percent", "number.bms_pack_set_soc", "binary_sensor.bms_pack_alarm_soc_low"
@@ -194,7 +194,7 @@ def test_its_recorder_writes_at_most_20_rows_a_minute_for_a_pack(
     info = next(stream(1.0))[1].info
     described = DiscoveryInputs(info, CELLS if stream is restless else 0)
     wanted = len(rows(stream(60.0 * minutes), shown(discovery(HomeAssistantSettings(), described, "bms/pack", 0.0))))
-    assert 100 < wanted <= MOST_ROWS_PER_MIN * minutes
+    assert 100 < wanted <= MAX_ROWS_PER_MIN * minutes
     deadline = time.monotonic() + LONG_S
     while (written := changes(home, device)) < wanted:  # it writes a moment later
         assert time.monotonic() < deadline, written

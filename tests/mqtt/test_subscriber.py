@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.mqtt.subscriber import MOST_BYTES, Subscriber
+from bms_estimator.mqtt.subscriber import MAX_BYTES, Subscriber
 from bms_estimator.mqtt.topic_cache import DeviceMessage
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import MOSQUITTO, Broker, Listener
@@ -75,7 +75,7 @@ async def test_garbage_is_kept_from_nobody_else_and_ends_nothing(broker: Broker)
         await watch.until(lambda: watch.links)
         await other.publish("bms/pack/state", b"\xff\xfe no json", qos=1)
         await other.publish("bms/no device/state", b"1", qos=1)
-        await other.publish("bms/pack/info", bytes(2 * MOST_BYTES), qos=1)
+        await other.publish("bms/pack/info", bytes(2 * MAX_BYTES), qos=1)
         await other.publish("bms/pack/health", json.dumps({"uptime_s": 1}), qos=1)
         await watch.until(lambda: watch.kept("pack", "health"))
         assert "no json" in watch.kept("pack", "state")
@@ -154,7 +154,7 @@ async def test_long_messages_are_dropped_with_one_log_line(broker: Broker) -> No
             async with watch.subscriber:
                 await watch.until(lambda: watch.subscriber.lost_since is None)
                 for number in range(5):
-                    await live.publish(f"bms/pack/t{number}", b"x" * (MOST_BYTES + 1), qos=1)
+                    await live.publish(f"bms/pack/t{number}", b"x" * (MAX_BYTES + 1), qos=1)
                 await live.publish("bms/pack/state", b"1", qos=1)
                 await watch.until(lambda: watch.kept("pack", "state"))
                 assert watch.subscriber.lost_messages == 5

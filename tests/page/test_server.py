@@ -23,7 +23,7 @@ from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE
 from tests.store.test_history import at, keep
 
-MOST_BYTES = 100_000
+MAX_BYTES = 100_000
 """Of all that a browser is given."""
 TOKEN = "0123456789abcdef"
 
@@ -60,7 +60,7 @@ async def messages(response: aiohttp.ClientResponse) -> AsyncIterator[dict[str, 
 def test_all_that_a_browser_is_given_is_small_and_comes_from_here():
     given = [file.path for file in FILES.values()]
     assert sorted(given) == sorted(STATIC.iterdir())
-    assert sum(path.stat().st_size for path in given) <= MOST_BYTES
+    assert sum(path.stat().st_size for path in given) <= MAX_BYTES
     own = [path.read_text() for path in given if path.name != "uplot.js"]
     assert not any("http://" in text.replace("http://www.w3.org/2000/svg", "") or "https://" in text for text in own)
 

@@ -31,7 +31,7 @@ LOST = ReasonCode(PacketTypes.DISCONNECT, "Unspecified error")
 SILENT = ReasonCode(PacketTypes.DISCONNECT, "Keep alive timeout")
 PARTED = ReasonCode(PacketTypes.DISCONNECT, "Normal disconnection")
 NO_FLAGS = SimpleNamespace(is_disconnect_packet_from_server=False, session_present=False)
-MOST_IN_FLIGHT = 20
+MAX_IN_FLIGHT = 20
 GRANTED = ReasonCode(PacketTypes.SUBACK, identifier=0)
 
 
@@ -315,7 +315,7 @@ class VirtualPaho:
         self._client_id = (self.identifier or "").encode()
         self.keepalive_s = 60.0
         self.will: Packet | None = None
-        self.max_inflight_messages = MOST_IN_FLIGHT
+        self.max_inflight_messages = MAX_IN_FLIGHT
         self._connection: Connection | None = None
         self._mid = 0
         self.on_connect = self.on_disconnect = self.on_subscribe = self.on_unsubscribe = _ignored

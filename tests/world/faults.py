@@ -14,15 +14,15 @@ from tests.world.loop import KilledError
 if TYPE_CHECKING:
     from tests.world.world import World
 
-SHORTEST_PAUSE_S, LONGEST_PAUSE_S = 5.0, 300.0
+MIN_PAUSE_S, MAX_PAUSE_S = 5.0, 300.0
 FIRST_S = 20.0
 STOP_S = 90.0
 """Systemd kills what has not ended by then [s]."""
 
 
-LEAST_JUMP_S, MOST_JUMP_S = 3.0, 3600.0
+MIN_JUMP_S, MAX_JUMP_S = 3.0, 3600.0
 """Of the board's clock: the service believes a sample that is less than 2 s early."""
-MOST_RANDOM_S = 5.0
+MAX_RANDOM_S = 5.0
 """So long the board's clock may run at random."""
 
 
@@ -60,7 +60,7 @@ def schedule(dice: random.Random, until_s: float, kinds: Sequence[str]) -> list[
     faults = []
     at_s = FIRST_S * dice.random()
     while True:
-        at_s += min(dice.expovariate(1.0 / 90.0) + SHORTEST_PAUSE_S, LONGEST_PAUSE_S)
+        at_s += min(dice.expovariate(1.0 / 90.0) + MIN_PAUSE_S, MAX_PAUSE_S)
         if at_s >= until_s:
             return faults
         seconds = min(dice.expovariate(1.0 / 40.0) + 0.1, 400.0, until_s - at_s)
@@ -113,7 +113,7 @@ def _reset_board(world: "World", fault: Fault) -> None:
 def _jump_s(fault: Fault) -> float:
     """Of a clock: seconds to an hour, ahead or back."""
     size = abs(2.0 * fault.share - 1.0)
-    return math.copysign(LEAST_JUMP_S * (MOST_JUMP_S / LEAST_JUMP_S) ** size, fault.share - 0.5)
+    return math.copysign(MIN_JUMP_S * (MAX_JUMP_S / MIN_JUMP_S) ** size, fault.share - 0.5)
 
 
 def _clock_stepped(world: "World", fault: Fault) -> None:
@@ -126,7 +126,7 @@ def _stamp_wrong(world: "World", fault: Fault) -> None:
 
 def _clock_at_random(world: "World", fault: Fault) -> None:
     board, dice = world.board, world.dice["faults"]
-    samples = math.ceil(min(fault.seconds, MOST_RANDOM_S) / board.period_s)
+    samples = math.ceil(min(fault.seconds, MAX_RANDOM_S) / board.period_s)
     board.stamps_off_us.extend(dice.randrange(MODULUS) for _ in range(samples))
 
 

@@ -11,14 +11,14 @@ from bms_estimator.protocols.firmware.messages import DELIMITER, PROTOCOL_VERSIO
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from tests.world.broker import Connection, Packet
 
-MOST_STDS = 4.0
+MAX_STDS = 4.0
 """The true SOC is never further from the estimate than so many of its standard deviations, and ``SOC_FLOOR``."""
 SOC_FLOOR = 0.004
 """What a published SOC may be off whatever its std says: the sample that it belongs to may be the one before."""
 USUAL_STDS = 2.0
-MOST_TASKS = 40
-MOST_READS = 64
-MOST_READY = 2000
+MAX_TASKS = 40
+MAX_READS = 64
+MAX_READY = 2000
 
 
 class InvariantError(Exception):
@@ -162,7 +162,7 @@ class Band:
         self.worst_error = max(self.worst_error, error)
         beyond = max(error - SOC_FLOOR, 0.0) / e.soc_std
         self.worst_stds = max(self.worst_stds, beyond)
-        if beyond > MOST_STDS:
+        if beyond > MAX_STDS:
             return f"SOC {e.soc:.4f} +- {e.soc_std:.4f}, true {true_soc:.4f}"
         return ""
 

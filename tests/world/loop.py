@@ -14,7 +14,7 @@ from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Executor
 from typing import Any
 
-MOST_CLOSINGS = 20
+MAX_CLOSINGS = 20
 """A coroutine that is thrown away may go on to so many further awaits."""
 
 
@@ -250,7 +250,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
 def _close(coroutine: Any) -> None:
     """Throw a coroutine away, whatever it still wants to wait for."""
-    for _ in range(MOST_CLOSINGS):
+    for _ in range(MAX_CLOSINGS):
         try:
             coroutine.close()
         except RuntimeError:  # it awaits while it is thrown away: as often as it has such places

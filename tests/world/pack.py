@@ -8,7 +8,7 @@ from bms_estimator.simulation.simulated_pack import SimulatedPack
 
 CELL = load_cell("chen_mora")
 CAPACITY_AH = CELL.cell.capacity_ah
-SHORTEST_S, LONGEST_S = 20, 400
+MIN_S, MAX_S = 20, 400
 RATES_C = (0.0, 0.0, 0.2, 0.5, 1.0, 2.0, 3.0, -0.3, -1.0)
 """Steps of the load, of its greatest."""
 GREATEST = (0.1, 0.1, 0.2, 1.0)
@@ -19,7 +19,7 @@ def steps(dice: random.Random) -> Iterator[tuple[float, float]]:
     """Seconds and current [A], positive on discharge; whole seconds, for a board's window knows no more."""
     greatest = dice.choice(GREATEST)
     while True:
-        yield float(dice.randint(SHORTEST_S, LONGEST_S)), CAPACITY_AH * greatest * dice.choice(RATES_C)
+        yield float(dice.randint(MIN_S, MAX_S)), CAPACITY_AH * greatest * dice.choice(RATES_C)
 
 
 def new_pack(dice: random.Random) -> SimulatedPack:

@@ -10,7 +10,7 @@ from tests.world.broker import LateError
 from tests.world.disk import Disk, PowerCutError
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 
-SHORTEST_S, LONGEST_S = 0.0005, 0.05
+MIN_S, MAX_S = 0.0005, 0.05
 """So long a call takes."""
 LOOK_S = 1.0
 """So often is looked whether a hung disk answers."""
@@ -52,7 +52,7 @@ class Threads:
         self, call: Callable[[], Any], future: Future[Any], then: Callable[[], None], database: bool | None
     ) -> None:
         """Have ``call`` happen; ``database``: it is one, None: it has nothing to do with the disk."""
-        delay_s = self._dice.uniform(SHORTEST_S, LONGEST_S)
+        delay_s = self._dice.uniform(MIN_S, MAX_S)
         self._timeline.after(delay_s, lambda: self._work(call, future, then, database))
 
     def _work(

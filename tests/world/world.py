@@ -492,11 +492,11 @@ class World:
     def _check_memory(self, process: Process) -> None:
         """Nothing grows."""
         tasks = sum(not task.done() for task in process.loop._tasks)
-        if tasks > invariants.MOST_TASKS:
+        if tasks > invariants.MAX_TASKS:
             self.fail(f"{tasks} tasks")
-        if process.loop.waiting > invariants.MOST_READY:
+        if process.loop.waiting > invariants.MAX_READY:
             self.fail(f"{process.loop.waiting} handles wait")
-        if process.board is not None and self._reads(process) > invariants.MOST_READS:
+        if process.board is not None and self._reads(process) > invariants.MAX_READS:
             self.fail(f"{self._reads(process)} reads wait")
 
     def _check_availability(self, now_s: float) -> None:

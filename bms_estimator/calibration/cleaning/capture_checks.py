@@ -8,13 +8,13 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 
-LEAST_CURRENT_C = 0.1
+MIN_CURRENT_C = 0.1
 """Maximum C-rate of a capture without information on resistances [1/h]; such a capture is for `ocv`."""
 STEP_SHARE = 0.1
 """Change of current between two samples that counts as a step, of the capture's largest current."""
 STEP_S = 3.0
 """Two samples further apart do not show the ohmic step [s]."""
-LEAST_STEPS = 5
+MIN_STEPS = 5
 """Fewer steps do not show the sign."""
 LONG_REST_S = 300.0
 """Length of a rest after which the voltage is near the OCV [s]."""
@@ -23,11 +23,11 @@ SOC_OFF, VOLTAGE_OFF_V = 0.1, 0.1
 GAP_STEPS, GAP_CHARGE = 10.0, 0.01
 """A step is a gap with unknown charge if it is this many times the median one and the current at its start would draw
 this fraction of the capacity."""
-SHORTEST_S = 30.0
+MIN_S = 30.0
 """Minimum duration of a capture [s]."""
-LEAST_ANSWER_V = 1e-3
+MIN_ANSWER_V = 1e-3
 """Minimum change of a real cell's voltage at current steps of 1 C, per cell [V]: most have 20 to 100 mV."""
-LEAST_SWEEP = 0.05
+MIN_SWEEP = 0.05
 """SOC that must have moved for the sign to show in the voltage's trend."""
 
 
@@ -54,7 +54,7 @@ def step_resistance(load: CleanCapture) -> float | None:
     change_a = np.diff(load.current_a)
     largest_a = float(np.abs(load.current_a).max(initial=0.0))
     steps = (np.abs(change_a) > STEP_SHARE * largest_a) & (np.diff(load.time_s) <= STEP_S)
-    if steps.sum() < LEAST_STEPS:
+    if steps.sum() < MIN_STEPS:
         return None
     return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
 
@@ -72,19 +72,19 @@ def soc_outside(load: CleanCapture, capacity_ah: float, start: float) -> str | N
 
 
 def _short(load: CleanCapture) -> str | None:
-    if load.time_s[-1] >= SHORTEST_S:
+    if load.time_s[-1] >= MIN_S:
         return None
     return f"it lasts {load.time_s[-1]:.3g} s, which tells nothing of a battery: is time_s in seconds?"
 
 
 def _no_excitation(load: CleanCapture, cell: CellModel) -> str | None:
     largest_a = float(np.abs(load.current_a).max())
-    least_a = LEAST_CURRENT_C * cell.cell.capacity_ah
+    least_a = MIN_CURRENT_C * cell.cell.capacity_ah
     if largest_a >= least_a:
         return None
     return (
         f"no excitation: the current never exceeds {largest_a:.4f} A in {load.time_s[-1] / 3600.0:.2f} h, and at least "
-        f"{least_a:.4f} A ({LEAST_CURRENT_C:g} C) is needed; record a load with steps and rests"
+        f"{least_a:.4f} A ({MIN_CURRENT_C:g} C) is needed; record a load with steps and rests"
     )
 
 
@@ -96,7 +96,7 @@ def _sign(load: CleanCapture, cell: CellModel) -> str | None:
             "ampere (median); discharge must be positive (--current-sign)"
         )
     soc = -load.discharged_ah / cell.cell.capacity_ah
-    if ohm is None and np.ptp(soc) > LEAST_SWEEP and np.cov(soc, load.voltage_v)[0, 1] < 0.0:
+    if ohm is None and np.ptp(soc) > MIN_SWEEP and np.cov(soc, load.voltage_v)[0, 1] < 0.0:
         return (
             f"the current's sign is wrong: {load.discharged_ah[-1]:.3f} Ah drawn while the voltage went from "
             f"{load.voltage_v[0]:.3f} to {load.voltage_v[-1]:.3f} V; discharge must be positive (--current-sign)"
@@ -105,7 +105,7 @@ def _sign(load: CleanCapture, cell: CellModel) -> str | None:
 
 
 def _answer(load: CleanCapture, cell: CellModel) -> str | None:
-    ohm, least_ohm = step_resistance(load), LEAST_ANSWER_V * cell.cell.series_count / cell.cell.capacity_ah
+    ohm, least_ohm = step_resistance(load), MIN_ANSWER_V * cell.cell.series_count / cell.cell.capacity_ah
     if np.ptp(load.voltage_v) == 0.0:
         moves = "does not move"
     elif ohm is not None and ohm < least_ohm:

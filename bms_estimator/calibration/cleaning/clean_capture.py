@@ -12,7 +12,7 @@ from bms_estimator.model.sample import SampleBlock
 
 NEIGHBOURS = 2
 """Number of neighbors on each side by which a glitch is recognized."""
-LEAST_SAMPLES = 2 * NEIGHBOURS + 1
+MIN_SAMPLES = 2 * NEIGHBOURS + 1
 """Minimum number of good samples of a capture."""
 SPIKE_V = 0.03
 """A voltage off its neighbours' median by more than this, per cell, and more than the current explains, is a glitch [V]."""
@@ -91,8 +91,8 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
             f"{limits.voltage_max_v:g} V, {limits.current_max_a:g} A); the capture runs from {voltage_v.min():.3f} to "
             f"{voltage_v.max():.3f} V and {current_a.min():.3f} to {current_a.max():.3f} A: is it this cell's?"
         )
-    if good.size < LEAST_SAMPLES:
-        raise UserError(f"{name}: {good.size} good samples are too few, at least {LEAST_SAMPLES} are needed")
+    if good.size < MIN_SAMPLES:
+        raise UserError(f"{name}: {good.size} good samples are too few, at least {MIN_SAMPLES} are needed")
     return good
 
 

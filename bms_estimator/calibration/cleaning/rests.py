@@ -9,9 +9,9 @@ from bms_estimator.model.sample import SampleBlock
 
 GLITCH_FRACTION = 0.5
 """A voltage off the median by more than this fraction is a fault of the instrument: no Li-ion cell swings so far."""
-MOST_BACK = 0.1
+MAX_BACK = 0.1
 """Part of the samples that may lie before others in time: a clock that is set back by a little."""
-LEAST_GOOD = 0.5
+MIN_GOOD = 0.5
 """Minimum fraction of good voltages; below it the faulty ones cannot be recognized."""
 REST_CURRENT_C = 0.01
 """Maximum current of a rest [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
@@ -41,7 +41,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
         )
     middle = float(np.median(alive_v))
     off = np.abs(good["voltage_v"] - middle) > GLITCH_FRACTION * middle
-    if off.mean() > 1.0 - LEAST_GOOD:
+    if off.mean() > 1.0 - MIN_GOOD:
         first = good[int(np.argmax(off))]
         raise UserError(
             f"{name}: {off.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
@@ -50,7 +50,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
     good = good[~off]
     latest = np.maximum.accumulate(good["time_s"])
     back = good["time_s"] < latest
-    if back.mean() > MOST_BACK:
+    if back.mean() > MAX_BACK:
         first = int(np.argmax(back))
         raise UserError(
             f"{name}: time goes back {(np.diff(good['time_s']) < 0.0).sum()} times, first from {latest[first]:g} to "

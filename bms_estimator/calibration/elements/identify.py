@@ -55,7 +55,7 @@ SHOWN_SOC = (0.2, 0.5, 0.8)
 """SOCs at which the resistances are reported."""
 OCV_STEP = 0.01
 """Nodes of the corrected table: at each such step of SOC."""
-LEAST_SLOPE_V = 1e-3
+MIN_SLOPE_V = 1e-3
 """The corrected table rises at least so steeply, per cell and 1 of SOC [V]."""
 SPAN_K = 10.0
 """Minimum temperature difference that gives activation energies and dE/dT [K]."""
@@ -411,7 +411,7 @@ def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOc
     given = cell.ocv if isinstance(cell.ocv, TableOcv) else None
     soc = np.linspace(0.0, 1.0, round(1.0 / OCV_STEP) + 1)
     grid_v = ocv_grid(cell)[0]
-    slope = LEAST_SLOPE_V * cell.cell.series_count * soc
+    slope = MIN_SLOPE_V * cell.cell.series_count * soc
     corrected_v = np.interp(soc, np.linspace(0.0, 1.0, grid_v.size), grid_v) + correction_at(soc) @ fit.correction
     per_kelvin_v = linear_interpolation_matrix(soc, KELVIN_NODES) @ fit.per_kelvin_v if entropy else None
     if given is not None and given.per_kelvin_v is not None:

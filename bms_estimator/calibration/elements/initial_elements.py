@@ -22,9 +22,9 @@ NEGLIGIBLE = 1e-6
 """Part of an element that depends on SOC: none, but a cell file wants it above 0."""
 LOWEST_SOC = 0.1
 """Rests below are left out: the elements rise there."""
-MOST_SAMPLES = 1000
+MAX_SAMPLES = 1000
 """Maximum number of samples of a rest; longer ones are thinned."""
-LEAST_OHM = 1e-5
+MIN_OHM = 1e-5
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: fl
 
 def _of_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: float) -> tuple[float, ...]:
     """R_s, R_ts, tau_ts, R_tl, tau_tl from one rest after a load of ``current_a``."""
-    rest = rest[:: -(-rest.size // MOST_SAMPLES)]
+    rest = rest[:: -(-rest.size // MAX_SAMPLES)]
     time_s = rest["time_s"] - rest["time_s"][0]
     duration_s = float(time_s[-1])
     fits = []
@@ -98,7 +98,7 @@ def _of_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: flo
     _, fast, slow, (end_v, short_v, long_v) = min(fits, key=lambda fit: fit[0])
     load_s = drawn_as / current_a
     return (
-        max((end_v - short_v - long_v - loaded_v) / current_a, LEAST_OHM),
+        max((end_v - short_v - long_v - loaded_v) / current_a, MIN_OHM),
         _loaded_ohm(short_v, current_a, load_s, fast),
         fast,
         _loaded_ohm(long_v, current_a, load_s, slow),
@@ -108,7 +108,7 @@ def _of_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: flo
 
 def _loaded_ohm(size_v: float, current_a: float, load_s: float, tau_s: float) -> float:
     """Resistance of a branch that a load of ``load_s`` has charged to ``size_v``, (2.2) solved for it [ohm]."""
-    return max(size_v / (current_a * -float(np.expm1(-load_s / tau_s))), LEAST_OHM)
+    return max(size_v / (current_a * -float(np.expm1(-load_s / tau_s))), MIN_OHM)
 
 
 def _resistance(ohm: float) -> Resistance:

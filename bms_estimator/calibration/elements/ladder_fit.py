@@ -76,7 +76,7 @@ COUNT_STD = 0.004
 """Relative std of the charge counted in a capture, and of the capacity at its temperature."""
 STEP_SHARE = 0.1
 """A change of current by this part of the capture's largest begins a new stretch."""
-SHORTEST_S, LONGEST_S = 10.0, 30.0
+MIN_S, MAX_S = 10.0, 30.0
 """Minimum of the time since that step, and maximum of the time since the row before [s]."""
 LONG_REST_S, REST_SHARE = 500.0, 0.01
 """Rest of this length, below this part of the largest current."""
@@ -302,10 +302,10 @@ def _apart(time_s: Floats) -> NDArray[np.bool_]:
 def _weights(load: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the weight of each row, up to a factor, and which rows are the last of a long rest."""
     largest_a = float(np.abs(load.current_a).max())
-    step_s = np.clip(np.diff(load.time_s, append=load.time_s[-1] + 1.0), 0.0, LONGEST_S)
+    step_s = np.clip(np.diff(load.time_s, append=load.time_s[-1] + 1.0), 0.0, MAX_S)
     changed = np.r_[True, np.abs(np.diff(load.current_a)) > STEP_SHARE * largest_a]
     since_s = load.time_s - load.time_s[np.maximum.accumulate(np.where(changed, np.arange(changed.size), 0))]
-    weight = step_s / np.maximum(since_s + step_s, SHORTEST_S)
+    weight = step_s / np.maximum(since_s + step_s, MIN_S)
     weight /= weight.sum()
     resting = np.abs(load.current_a) < REST_SHARE * largest_a
     ends = [end - 1 for first, end in true_runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]

@@ -18,7 +18,7 @@ WRONG_SOC = (-0.2, 0.2)
 """Errors of the initial SOC."""
 SETTLED_S = 900.0
 """Time after the start from which on a replay is scored [s]."""
-LEAST_S = 900.0
+MIN_S = 900.0
 """Minimum scored time [s]."""
 LOWEST_SOC = 0.05
 """Minimum scored SOC."""
@@ -49,7 +49,7 @@ def _one(cell: CellModel, load: CleanCapture, soc: Floats, start: int, wrong: fl
     true_soc = np.interp(trace["time_s"], load.time_s, soc)
     judged = (trace["time_s"] - load.time_s[start] >= SETTLED_S) & (true_soc >= LOWEST_SOC)
     step_s = np.clip(np.diff(trace["time_s"], append=trace["time_s"][-1]), 0.0, 60.0)[judged]
-    if step_s.sum() < LEAST_S:
+    if step_s.sum() < MIN_S:
         return float("nan")
     std = trace["soc_std"][judged]
     beyond = np.maximum(np.abs(trace["soc"][judged] - true_soc[judged]) - 2.0 * std, 0.0)

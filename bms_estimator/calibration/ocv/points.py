@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.ocv.relaxation_test import LEAST_POINTS, RelaxationTest
+from bms_estimator.calibration.ocv.relaxation_test import MIN_POINTS, RelaxationTest
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
@@ -23,7 +23,7 @@ LONG_REST_S = 3600.0
 """Length of rest beyond which its cold error decreases with the length [s]."""
 AFTER_CHARGE_V = 0.005
 """Standard deviation that hysteresis gives a rest after charge when its size is not known, per cell in series [V]."""
-LEAST_SPAN = 0.3
+MIN_SPAN = 0.3
 """SOC that the points must span at least."""
 
 
@@ -155,15 +155,15 @@ def check_points(points: Points) -> None:
     Raises:
         UserError: There are not.
     """
-    if points.soc.size < LEAST_POINTS:
+    if points.soc.size < MIN_POINTS:
         raise UserError(
-            f"{points.soc.size} points of the open-circuit voltage; (2.10) has {LEAST_POINTS} parameters and needs at "
-            f"least {LEAST_POINTS} points"
+            f"{points.soc.size} points of the open-circuit voltage; (2.10) has {MIN_POINTS} parameters and needs at "
+            f"least {MIN_POINTS} points"
         )
     span = float(points.soc[-1] - points.soc[0])
-    if span < LEAST_SPAN:
+    if span < MIN_SPAN:
         raise UserError(
-            f"points span SOC {points.soc[0]:.2f} to {points.soc[-1]:.2f} only: discharge over at least {LEAST_SPAN} of "
+            f"points span SOC {points.soc[0]:.2f} to {points.soc[-1]:.2f} only: discharge over at least {MIN_SPAN} of "
             "the capacity, best until empty"
         )
 

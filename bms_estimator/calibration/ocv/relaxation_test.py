@@ -22,29 +22,29 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-SHORTEST_REST_S = 30.0
+MIN_REST_S = 30.0
 """A shorter rest shows the ohmic step and not the relaxation [s]."""
 LARGEST_STD_V = 0.02
 """A rest whose extrapolation is less certain than this, per cell in series, is rejected [V]."""
 LATE_FROM = 0.5
 """The extrapolation fits this latter part of a rest: the fast branch is over there."""
-SHORTEST_TAU, LONGEST_TAU, TAU_GRID = 0.05, 0.7, 40
+MIN_TAU, MAX_TAU, TAU_GRID = 0.05, 0.7, 40
 """Time constants tried, in multiples of the rest. A slower one cannot be distinguished from a drift and extrapolates
 wildly."""
 FORM_ERROR = 0.6
 """Part of the extrapolated voltage that is its standard deviation: relaxation is no pure exponential. Half-hour rests of
 a NCR18650 cut to a quarter of an hour miss their end by 2.4 mV RMS so extrapolated, and by 4.7 mV when not."""
-LEAST_NOISE_V = 1e-4
+MIN_NOISE_V = 1e-4
 """No voltage is read more exactly [V]."""
 SLOWEST_S = 600.0
 """Time constant of a slow branch [s]; a rest shorter than this takes it for a faster one, and is judged by both."""
 SLOW_PART = 0.4
 """Part of the difference between the two that is the standard deviation of such a rest."""
-LEAST_STD_V = 5e-4
+MIN_STD_V = 5e-4
 """No point is better known: half a step of the usual converter, and temperature [V]."""
 NEAR_FULL, NEAR_EMPTY = 0.995, 0.02
 """SOC from which a first sample counts as full, below which a last one counts as empty."""
-LEAST_POINTS = 6
+MIN_POINTS = 6
 """Minimum number of points: the number of parameters of (2.10)."""
 
 
@@ -178,9 +178,9 @@ def find_rests(
     rejected: list[str] = []
     for first, last in true_runs(resting):
         duration_s = float(good["time_s"][last - 1] - good["time_s"][first])
-        if duration_s < SHORTEST_REST_S:
+        if duration_s < MIN_REST_S:
             rejected.append(
-                f"rest at {good['time_s'][first]:.0f} s: {duration_s:.0f} s long, shorter than {SHORTEST_REST_S:.0f} s"
+                f"rest at {good['time_s'][first]:.0f} s: {duration_s:.0f} s long, shorter than {MIN_REST_S:.0f} s"
             )
             continue
         charged = first > 0 and bool(good["current_a"][first - 1] < 0.0)
@@ -250,7 +250,7 @@ def _relaxed(rest: SampleBlock, soc: float, *, after_charge: bool) -> Rest:
         soc=soc,
         voltage_v=voltage_v,
         ocv_v=ocv_v,
-        std_v=float(np.sqrt(spread_v**2 + unseen_v**2 + (FORM_ERROR * (ocv_v - voltage_v)) ** 2 + LEAST_STD_V**2)),
+        std_v=float(np.sqrt(spread_v**2 + unseen_v**2 + (FORM_ERROR * (ocv_v - voltage_v)) ** 2 + MIN_STD_V**2)),
         temperature_c=mean_temperature_c(rest),
         after_charge=after_charge,
     )
@@ -263,11 +263,11 @@ def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[
     their likelihoods: noise or few samples leave v_inf uncertain.
     """
     elapsed = time_s - time_s[0]
-    taus = np.geomspace(SHORTEST_TAU * duration_s, LONGEST_TAU * duration_s, TAU_GRID)
+    taus = np.geomspace(MIN_TAU * duration_s, MAX_TAU * duration_s, TAU_GRID)
     fits = [_with_tau(elapsed, voltage_v, tau) for tau in taus]
     v_inf = np.array([coefficients[0] for coefficients, _, _ in fits])
     squares = np.array([s for _, _, s in fits])
-    variance = max(float(squares.min()) / max(elapsed.size - 3, 1), LEAST_NOISE_V**2)
+    variance = max(float(squares.min()) / max(elapsed.size - 3, 1), MIN_NOISE_V**2)
     likelihood = np.exp(-0.5 * (squares - squares.min()) / variance)
     likelihood /= likelihood.sum()
     of_each = variance * np.array([np.linalg.pinv(basis.T @ basis)[0, 0] for _, basis, _ in fits])
@@ -295,9 +295,9 @@ def _check_rests(
             f"{name}: no rests in {hours:.2f} h: the current never falls below {least:.3f} A; "
             "a relaxation test discharges in steps with a rest after each"
         )
-    if len(rests) < LEAST_POINTS:
+    if len(rests) < MIN_POINTS:
         reasons = "".join(f"\n  {line}" for line in rejected[:8])
         raise UserError(
-            f"{name}: {len(rests)} usable rests, at least {LEAST_POINTS} are needed; {len(rejected)} others were "
+            f"{name}: {len(rests)} usable rests, at least {MIN_POINTS} are needed; {len(rejected)} others were "
             f"too short or too far from relaxed{':' if reasons else ''}{reasons}"
         )

@@ -17,7 +17,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-LEAST_S = 7.0 * 3600.0
+MIN_S = 7.0 * 3600.0
 """Minimum duration of a low-rate curve [s]: a full one at C/7. At C/10 half of the difference between discharge and
 charge is some 20 mV."""
 SAME_CURRENT = 0.05
@@ -124,7 +124,7 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
         current_a = smooth["current_a"][first:last]
         middle_a = float(np.median(current_a))
         for a, b in true_runs(np.abs(current_a - middle_a) <= SAME_CURRENT * abs(middle_a) + noise_a):
-            if good["time_s"][first + b - 1] - good["time_s"][first + a] >= LEAST_S:
+            if good["time_s"][first + b - 1] - good["time_s"][first + a] >= MIN_S:
                 found.append(_branch(good, moved_ah, resting, first + a, first + b, name))
     return found
 

@@ -37,7 +37,7 @@ SOC [V], over this range of SOC. Two coexisting phases keep it (Dreyer et al., N
 Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
 USUAL_STD = 0.6
 """Relative standard deviation of a hysteresis that is no more than usual."""
-LEAST_SHARE, SHARE_POINTS, SHARE_K, SHARE_SOC = 0.1, 6, 10.0, (0.1, 0.95)
+MIN_SHARE, SHARE_POINTS, SHARE_K, SHARE_SOC = 0.1, 6, 10.0, (0.1, 0.95)
 """Minimum fraction, number of rests, distance from the curves' temperature [K] and range of SOC with which rests
 determine it themselves."""
 OTHER_CAPACITY = 0.05
@@ -226,7 +226,7 @@ def _share(telling: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> f
         below_v = np.interp(points.soc, telling.points.soc, telling.points.ocv_v) - points.ocv_v
         tells = (points.soc > low) & (points.soc < high) & (points.way < 0.0) & (size_v > 0.0)
         shares += (below_v[tells] / size_v[tells]).tolist()
-    return float(np.clip(np.median(shares), LEAST_SHARE, 1.0)) if len(shares) >= SHARE_POINTS else None
+    return float(np.clip(np.median(shares), MIN_SHARE, 1.0)) if len(shares) >= SHARE_POINTS else None
 
 
 def _usual_share(telling: Source, series_count: int) -> float:

@@ -41,7 +41,7 @@ FIRST_SLOPE_V = 0.8
 """Slope that the first pass assumes [V]."""
 BEND_LENGTH = 0.05
 """SOC over which one bend has nothing to do with the next."""
-LEAST_SLOPE_V = 1e-3
+MIN_SLOPE_V = 1e-3
 """Least slope of the curve, per cell of 4 V and 1 of SOC: monotone means invertible [V]."""
 CELL_V = 4.0
 """Voltage of the cell that the voltages above refer to [V]."""
@@ -201,7 +201,7 @@ def _solved(model: _Model, points: Points, std_v: Floats, cells: float) -> Float
     sums = np.tril(np.ones((model.splines, model.splines)))  # coefficients from their increments
     rows[:, : model.splines] = rows[:, : model.splines] @ sums
     lowest = np.full(rows.shape[1], -np.inf)
-    lowest[1 : model.splines] = LEAST_SLOPE_V * cells * np.diff(_centres())
+    lowest[1 : model.splines] = MIN_SLOPE_V * cells * np.diff(_centres())
     orthogonal, triangle = np.linalg.qr(rows)
     increments = lsq_linear(triangle, orthogonal.T @ target, bounds=(lowest, np.inf), method="bvls").x
     x = np.zeros(model.points.shape[1])

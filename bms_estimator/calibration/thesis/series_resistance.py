@@ -27,7 +27,7 @@ EXPONENTS = np.geomspace(2.0, 200.0, 200)
 """Exponents a14 tried."""
 TINY = 1e-300
 """Lower limit of the determinant of the normal equations; avoids division by zero."""
-LEAST_BINS = 5
+MIN_BINS = 5
 """Minimum number of bins for a fit of three parameters."""
 
 
@@ -137,8 +137,8 @@ def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> S
     """
     used = curve.soc >= lowest_soc
     soc, r_s = curve.soc[used], curve.r_s_ohm[used]
-    if soc.size < LEAST_BINS:
-        raise UserError(f"R_s is known in {soc.size} steps of SOC, at least {LEAST_BINS} are needed for a13..a15")
+    if soc.size < MIN_BINS:
+        raise UserError(f"R_s is known in {soc.size} steps of SOC, at least {MIN_BINS} are needed for a13..a15")
     weight = curve.weight[used] / curve.weight[used].mean()
     a13, exponent, a15 = _best(soc, r_s, weight)
     a, root = np.array([a13, exponent, a15]), np.sqrt(weight)

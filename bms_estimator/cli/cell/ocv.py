@@ -51,11 +51,11 @@ from bms_estimator.sources.captures.replay import load_capture
 
 CELL_VOLTAGE_V = 3.7
 """Voltage of one Li-ion cell in the middle of its discharge [V], which gives the number of cells in series."""
-LOWEST_CELL_V, HIGHEST_CELL_V, MOST_CELLS = 1.5, 4.5, 300
+LOWEST_CELL_V, HIGHEST_CELL_V, MAX_CELLS = 1.5, 4.5, 300
 """Range of that voltage for any cell [V], and maximum number of cells in series."""
 LOWEST, HIGHEST = 0.55, 1.06
 """Limits of a good sample: of the median voltage, of the full one."""
-LEAST_EMPTY = 0.25
+MIN_EMPTY = 0.25
 """An empty cell has at least this part of the voltage of a half full one."""
 MEASURED_CAPACITY_STD = 0.03
 """Relative std of a capacity measured by a slow discharge: gain of the current sensor, other cells of the kind, some
@@ -201,7 +201,7 @@ def _cells_in_series(voltage_v: NDArray[np.float64], told: int | None) -> int:
     """
     middle_v = float(np.median(voltage_v))
     count = told or max(round(middle_v / CELL_VOLTAGE_V), 1)
-    if not told and count > MOST_CELLS:
+    if not told and count > MAX_CELLS:
         raise UserError(
             f"the voltage is {middle_v:g} V, that of {count} cells in series: are these millivolts? else give --series"
         )
@@ -217,7 +217,7 @@ def _check_ends(fit: ChenMoraFit | TableFit, found: OcvSources) -> None:
         UserError: It does.
     """
     lowest_v, middle_v = (float(v) for v in fit(np.array([0.0, 0.5])))
-    if lowest_v > LEAST_EMPTY * middle_v:
+    if lowest_v > MIN_EMPTY * middle_v:
         return
     raise UserError(
         f"the points begin at SOC {found.points.soc[0]:.2f}, and their curve would be {lowest_v:.2f} V at SOC 0: give captures "

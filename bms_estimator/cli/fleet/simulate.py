@@ -21,12 +21,12 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
 
-MOST_PACKS = 999_999
+MAX_PACKS = 999_999
 """Their names have six digits."""
 
 
 def simulate(
-    packs: Annotated[int, typer.Option(parser=whole(1, MOST_PACKS), help="number of packs")] = 1000,
+    packs: Annotated[int, typer.Option(parser=whole(1, MAX_PACKS), help="number of packs")] = 1000,
     mqtt: Annotated[
         str | None,
         typer.Option(help="fleet server, mqtt://host:port or mqtts://host:port; separate several with commas"),

@@ -10,12 +10,12 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.protocols.firmware.messages import (
     BAUD,
-    LEAST_BANDGAP_V,
-    LEAST_DIVIDER,
-    LEAST_VOLTS_PER_AMPERE,
-    MOST_BANDGAP_V,
-    MOST_DIVIDER,
-    MOST_VOLTS_PER_AMPERE,
+    MAX_BANDGAP_V,
+    MAX_DIVIDER,
+    MAX_VOLTS_PER_AMPERE,
+    MIN_BANDGAP_V,
+    MIN_DIVIDER,
+    MIN_VOLTS_PER_AMPERE,
     Channels,
     Hello,
     set_bandgap_command,
@@ -41,7 +41,7 @@ def board(
     divider: Annotated[
         float | None,
         typer.Option(
-            parser=decimal(LEAST_DIVIDER, MOST_DIVIDER),
+            parser=decimal(MIN_DIVIDER, MAX_DIVIDER),
             help="set the divider ratio: pack voltage / voltage at A0",
             show_default=False,
         ),
@@ -49,7 +49,7 @@ def board(
     volts_per_ampere: Annotated[
         float | None,
         typer.Option(
-            parser=decimal(LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE),
+            parser=decimal(MIN_VOLTS_PER_AMPERE, MAX_VOLTS_PER_AMPERE),
             help="set the slope of the current sensor [V/A], for a ratiometric sensor at 5 V",
             show_default=False,
         ),
@@ -142,10 +142,10 @@ def _bandgap_v(asked: BoardClient, hello: Hello, aref_v: float) -> float:
     """
     reference_v = asked.reference_v()
     bandgap_v = hello.bandgap_uv * 1e-6 * aref_v / reference_v
-    if not LEAST_BANDGAP_V <= bandgap_v <= MOST_BANDGAP_V:
+    if not MIN_BANDGAP_V <= bandgap_v <= MAX_BANDGAP_V:
         raise UserError(
             f"--aref-v {aref_v:g}: the bandgap would be {bandgap_v:.3f} V, but every board's is between "
-            f"{LEAST_BANDGAP_V} and {MOST_BANDGAP_V} V; with {_volts(hello)} the board measures {reference_v:.3f} V at AREF"
+            f"{MIN_BANDGAP_V} and {MAX_BANDGAP_V} V; with {_volts(hello)} the board measures {reference_v:.3f} V at AREF"
         )
     return bandgap_v
 

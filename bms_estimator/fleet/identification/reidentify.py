@@ -27,20 +27,20 @@ from bms_estimator.settings.sampling import Sampling
 
 TRAINING = 2.0 / 3.0
 """Fraction of the time whose samples identify; the others judge."""
-LEAST_S = 6 * 3600.0
+MIN_S = 6 * 3600.0
 """Fewer samples are not enough to do both [s]."""
-LEAST_MOVED = 1.0
+MIN_MOVED = 1.0
 """Nor is it where less charge was moved, out and in, in capacities."""
 GAP_S = 60.0
 """Two samples further apart belong to two pieces [s]."""
-LEAST_PIECE_S = 900.0
+MIN_PIECE_S = 900.0
 """A shorter piece neither identifies nor judges [s]."""
 WINDOW_S = 3 * 3600.0
 """Open loop is begun again after it, from the SOC that an estimator with the cell has by then: errors of the counted charge
 do not swamp those of the resistances [s]."""
 UNSURE_SOC = 0.05
 """An SOC with a larger standard deviation begins no fit."""
-LEAST_GAIN = 0.03
+MIN_GAIN = 0.03
 """A new cell is taken where the judges' RMS error is smaller by this part at least."""
 ROWS = 65_536
 """Samples that are estimated at a time."""
@@ -127,21 +127,19 @@ class _Pack:
     def __init__(self, outcome: ReidentificationResult, samples: SampleBlock, kind: PackSpec, cell: CellModel) -> None:
         self._outcome, self._kind, self._cell = outcome, kind, cell
         seconds = 3600.0 * outcome.hours
-        if seconds < LEAST_S:
-            raise _NotEnoughError(f"{seconds / 3600.0:.1f} h of samples: at least {LEAST_S / 3600.0:g} h are needed")
-        pieces = [piece for piece in _pieces(samples) if np.ptp(piece["time_s"]) >= LEAST_PIECE_S]
+        if seconds < MIN_S:
+            raise _NotEnoughError(f"{seconds / 3600.0:.1f} h of samples: at least {MIN_S / 3600.0:g} h are needed")
+        pieces = [piece for piece in _pieces(samples) if np.ptp(piece["time_s"]) >= MIN_PIECE_S]
         moved = sum(map(_moved_ah, pieces)) / cell.cell.capacity_ah
-        if moved < LEAST_MOVED:
+        if moved < MIN_MOVED:
             raise _NotEnoughError(
-                f"{moved:.2f} capacities were moved in {seconds / 3600.0:.1f} h: at least {LEAST_MOVED:g} is needed"
+                f"{moved:.2f} capacities were moved in {seconds / 3600.0:.1f} h: at least {MIN_MOVED:g} is needed"
             )
         split_s = samples["time_s"][0] + TRAINING * seconds
         self._training = list(_clipped(pieces, -math.inf, split_s))
         self._judges = list(_clipped(pieces, split_s, math.inf))
         if not self._training or not self._judges:
-            raise _NotEnoughError(
-                f"no {LEAST_PIECE_S / 60.0:g} min without a gap: the edge's link or its board is away"
-            )
+            raise _NotEnoughError(f"no {MIN_PIECE_S / 60.0:g} min without a gap: the edge's link or its board is away")
 
     def found(self) -> ReidentificationResult:
         """Return the better method's result if it beats the old cell; else None."""
@@ -169,7 +167,7 @@ class _Pack:
         )
         if not judged[best].samples:
             return replace(outcome, reason="none of the samples that judge is above SOC 0.1")
-        if not rms_v < (1.0 - LEAST_GAIN) * before.rms_v:
+        if not rms_v < (1.0 - MIN_GAIN) * before.rms_v:
             return replace(outcome, reason="not better than the cell that it has")
         return replace(outcome, cell_file=self._written(cell, best, before.rms_v, rms_v))
 
@@ -261,7 +259,7 @@ def _clipped(pieces: list[SampleBlock], since_s: float, until_s: float) -> Itera
     """Return the pieces within ``since_s`` and ``until_s`` that are long enough."""
     for piece in pieces:
         part = piece[(piece["time_s"] >= since_s) & (piece["time_s"] < until_s)]
-        if part.size and np.ptp(part["time_s"]) >= LEAST_PIECE_S:
+        if part.size and np.ptp(part["time_s"]) >= MIN_PIECE_S:
             yield part
 
 

@@ -15,7 +15,7 @@ from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, known_cells, m
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import DEVICE_NAME
 
-MOST_SAID = 20
+MAX_SAID = 20
 """Maximum number of a table's errors that are shown."""
 CELL_FILE = ".toml"
 """The end of a cell that is a file beside the table."""
@@ -56,7 +56,7 @@ def read_table(path: Path) -> PackTable:
     The first line names the columns, separated by ``,`` or ``;``; ``pack`` and ``cell`` must be there.
 
     Raises:
-        UserError: It cannot be read; or one line for each wrong value, ``MOST_SAID`` at most.
+        UserError: It cannot be read; or one line for each wrong value, ``MAX_SAID`` at most.
     """
     return _Reader(path).table()
 
@@ -214,8 +214,8 @@ def _meant(name: str) -> str:
 
 def _refuse(path: Path, errors: Sequence[str]) -> None:
     if errors:
-        left = len(errors) - MOST_SAID
-        raise UserError("\n".join([*errors[:MOST_SAID], *([f"{path}: and {left} more"] if left > 0 else [])]))
+        left = len(errors) - MAX_SAID
+        raise UserError("\n".join([*errors[:MAX_SAID], *([f"{path}: and {left} more"] if left > 0 else [])]))
 
 
 def table_lines(packs: Mapping[str, PackSpec]) -> Iterator[str]:

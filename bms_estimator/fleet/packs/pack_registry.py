@@ -13,7 +13,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
-MOST_KINDS = 1024
+MAX_KINDS = 1024
 """Maximum number of kinds of packs that are cached."""
 UNKNOWN_PACK = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
 
@@ -25,8 +25,8 @@ class PackRegistry:
         self._rows = dict[str, bytes]()
         self._same = dict[bytes, bytes]()
         self._cells = dict[str, str]()
-        self._kind = lru_cache(MOST_KINDS)(_kind)
-        self._made = lru_cache(MOST_KINDS)(_made)
+        self._kind = lru_cache(MAX_KINDS)(_kind)
+        self._made = lru_cache(MAX_KINDS)(_made)
 
     def __len__(self) -> int:
         return len(self._rows)

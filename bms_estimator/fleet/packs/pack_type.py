@@ -15,7 +15,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
-MOST_TYPES = 256
+MAX_TYPES = 256
 """Maximum number of cached types, 40 kB each; others are made again each time, in 50 ms."""
 Digest = tuple[int, int]
 """The first 128 bits, as two words."""
@@ -79,7 +79,7 @@ class PackTypes:
         """
         key = id(settings), id(cell)
         if key not in self._known:
-            if len(self._known) >= MOST_TYPES:
+            if len(self._known) >= MAX_TYPES:
                 self._known.clear()
             self._known[key] = settings, cell, pack_type(settings, cell, self._record)
         return self._known[key][2]
@@ -115,7 +115,7 @@ def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
     return _estimator(_Recipe(config_digest(settings, cell), settings, cell))
 
 
-@lru_cache(maxsize=MOST_TYPES)
+@lru_cache(maxsize=MAX_TYPES)
 def _estimator(recipe: _Recipe) -> Estimator:
     return estimator_of(recipe.settings, recipe.cell)
 

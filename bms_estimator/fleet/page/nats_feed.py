@@ -26,9 +26,9 @@ TABLE_S = 2.0
 """Poll interval for changes of the table of packs, and retry interval [s]."""
 HOURS_S = 3900.0
 """Interval of hourly summaries, with a delay [s]."""
-MOST_BYTES = 1 << 16
+MAX_BYTES = 1 << 16
 """Maximum length of a message."""
-MOST_REASON = 200
+MAX_REASON = 200
 """Bytes of why a pack is unknown."""
 
 log = structlog.get_logger(__name__)
@@ -112,11 +112,11 @@ class FleetFeed:
         view, clock = self._view, time.monotonic
 
         async def state(message: Msg) -> None:
-            if len(message.data) <= MOST_BYTES:
+            if len(message.data) <= MAX_BYTES:
                 view.packs.hear_state(_pack(message), message.data, clock())
 
         async def parameters(message: Msg) -> None:
-            if len(message.data) <= MOST_BYTES:
+            if len(message.data) <= MAX_BYTES:
                 view.packs.hear_parameters(_pack(message), message.data)
 
         async def hour(message: Msg) -> None:
@@ -126,7 +126,7 @@ class FleetFeed:
             view.hear_worker(message.data, clock())
 
         async def unknown(message: Msg) -> None:
-            view.hear_unknown(message.subject.rpartition(".")[2], message.data[:MOST_REASON].decode(errors="replace"))
+            view.hear_unknown(message.subject.rpartition(".")[2], message.data[:MAX_REASON].decode(errors="replace"))
 
         return {
             subjects.published("*", "state"): state,

@@ -18,7 +18,7 @@ ALIVE_S = 180.0
 """Time without a block after which a pack counts as silent [s]; a pack sends a block a minute."""
 LISTED = 20
 """Packs of a list, at most."""
-MOST_TYPES = 8
+MAX_TYPES = 8
 """Maximum number of types shown; the rarer ones are combined."""
 OTHER, UNLISTED = "other types", "not in the table"
 SOC_EDGES = np.linspace(0.0, 1.0, 21)
@@ -174,7 +174,7 @@ class FleetPacks:
         counts = np.bincount(rows["type"][known], minlength=len(self._types))
         names = list(self._types)
         found = sorted((-int(counts[place]), names[place], int(place)) for place in np.flatnonzero(counts))
-        often = [place for _, _, place in found[:MOST_TYPES]]
+        often = [place for _, _, place in found[:MAX_TYPES]]
         masks: list[tuple[str, Mask]] = [(names[place], known & (rows["type"] == place)) for place in often]
         rest = known & ~np.isin(rows["type"], often)
         if rest.any():

@@ -11,7 +11,7 @@ from bms_estimator.fleet.page.packs import LISTED, FleetPacks
 from bms_estimator.fleet.page.workers import OVER_S, FleetWorkers
 from bms_estimator.model.clock import iso_utc
 
-MOST_UNKNOWN = 1000
+MAX_UNKNOWN = 1000
 
 
 class FleetView:
@@ -52,7 +52,7 @@ class FleetView:
         """Record that a worker holds blocks of an unknown pack."""
         self._unknown.pop(name, None)
         self._unknown[name] = why
-        if len(self._unknown) > MOST_UNKNOWN:
+        if len(self._unknown) > MAX_UNKNOWN:
             del self._unknown[next(iter(self._unknown))]
 
     def know(self, name: str, kind: str | None) -> None:

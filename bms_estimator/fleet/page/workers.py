@@ -11,7 +11,7 @@ REMEMBERED_S = 300.0
 """Time for which a lost worker is listed [s]."""
 OVER_S = 10.0
 """Averaging time of rates [s]."""
-MOST_WORKERS = 256
+MAX_WORKERS = 256
 UNHELD = -1
 
 
@@ -33,7 +33,7 @@ class FleetWorkers:
 
     def hear(self, heartbeat: Heartbeat, now_s: float) -> None:
         """Take a heartbeat."""
-        if heartbeat.id not in self._heard and len(self._heard) >= MOST_WORKERS:
+        if heartbeat.id not in self._heard and len(self._heard) >= MAX_WORKERS:
             return
         heard = self._heard.setdefault(heartbeat.id, deque())
         if heard and heartbeat.blocks < heard[-1].heartbeat.blocks:

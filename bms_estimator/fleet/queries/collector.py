@@ -28,7 +28,7 @@ DURABLE = "collector"
 """Name of the consumer, so that a collector continues where the last one ended."""
 PERIOD_S = 300.0
 """Maximum time that a row waits for its file [s]; more files of a day slow down queries."""
-MOST_ROWS = 10_000
+MAX_ROWS = 10_000
 """Maximum number of rows of a file; they wait in memory, 5 kB each."""
 AT_ONCE = 1000
 """Rows that are fetched at a time."""
@@ -71,7 +71,7 @@ class Collector:
         while not stop.is_set():
             await self._take(await self._fetch(stop))
             now_s = self._clock.monotonic()
-            if len(self._waiting) >= MOST_ROWS or (self._waiting and now_s - self._first_s >= self._period_s):
+            if len(self._waiting) >= MAX_ROWS or (self._waiting and now_s - self._first_s >= self._period_s):
                 await self._save(stop)
             if now_s - self._compacted_s >= COMPACT_S:
                 self._compacted_s = now_s
@@ -85,7 +85,7 @@ class Collector:
             2.0 * self._period_s + 60.0
         )  # longer than any row waits here, so that none is delivered twice in normal operation
         config = ConsumerConfig(
-            durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=wait_s, max_ack_pending=3 * MOST_ROWS
+            durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=wait_s, max_ack_pending=3 * MAX_ROWS
         )
         try:
             await js.add_consumer(HOURS_STREAM, config)

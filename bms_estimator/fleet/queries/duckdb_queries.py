@@ -27,7 +27,7 @@ AGED_SOC, CHARGE_ERROR = 1000.0, 0.002
 READING = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 BY_CHANCE = 0.1
 """Expected number of packs of a whole fleet that are reported by chance, for each quantity."""
-LEAST_STDS = 3.0
+MIN_STDS = 3.0
 """Minimum deviation of a reported pack in std, for any size of fleet."""
 
 
@@ -217,7 +217,7 @@ def _given(now_hour: int) -> dict[str, Any]:
 def _stds(base: duckdb.DuckDBPyConnection) -> float:
     """Return the deviation in std that hardly one of all packs exceeds by chance."""
     (packs,) = base.execute("SELECT count(*) FROM packs").fetchone() or (0,)
-    return max(NormalDist().inv_cdf(1.0 - 0.5 * BY_CHANCE / max(packs, 1)), LEAST_STDS)
+    return max(NormalDist().inv_cdf(1.0 - 0.5 * BY_CHANCE / max(packs, 1)), MIN_STDS)
 
 
 def _sql(name: str) -> str:

@@ -25,7 +25,7 @@ from bms_estimator.process.private_file import UnsafeFileError, read_private, wr
 from bms_estimator.settings.fleet import TenantSettings
 
 CLAIMS = "claims.json"
-_LONGEST_KEY, _LONGEST_CLAIMS = 200, 64 << 20
+_MAX_KEY, _MAX_CLAIMS = 200, 64 << 20
 """Bytes of a file."""
 GB = 1_000_000_000
 
@@ -65,7 +65,7 @@ def read_accounts(folder: Path) -> Accounts:
     """
     path = folder / CLAIMS
     try:
-        found = Accounts(**json.loads(_read(path, _LONGEST_CLAIMS)))
+        found = Accounts(**json.loads(_read(path, _MAX_CLAIMS)))
     except (ValueError, TypeError):
         raise UserError(f"{path}: no claims of a fleet: copy the file of the node that has the keys") from None
     return found
@@ -133,7 +133,7 @@ def _key(path: Path, kind: int) -> Key:
 
 def _read_key(path: Path) -> Key:
     try:
-        return jwt_claims.key_of(_read(path, _LONGEST_KEY).strip())
+        return jwt_claims.key_of(_read(path, _MAX_KEY).strip())
     except ValueError:
         raise UserError(f"{path}: not a key; put the right file back") from None
 

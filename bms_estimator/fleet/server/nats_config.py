@@ -12,10 +12,10 @@ from bms_estimator.fleet.nats.connection import LET_IN_S
 
 NATS_PORT, MQTT_PORT, MONITOR_PORT, CLUSTER_PORT = 4222, 1883, 8222, 6222
 """Default ports of NATS; the monitor has no authentication and stays on the loopback."""
-LONGEST_BLOCK_BYTES = 1 << 20
+MAX_BLOCK_BYTES = 1 << 20
 """Maximum size of a message [bytes]: a block of 60 samples takes 700 bytes, one of a whole day at 1 Hz less than
 this."""
-MOST_CONNECTIONS = 200_000
+MAX_CONNECTIONS = 200_000
 """Maximum number of connections of a node: if two of three are down, one has all edges. The server's default is
 65,536."""
 
@@ -102,8 +102,8 @@ def configuration(node: Node) -> str:
         f"server_name: {_text(node.name)}",
         f"listen: {_text(node.nats)}",
         f"http: {_text(node.monitor)}",
-        f"max_payload: {LONGEST_BLOCK_BYTES}",
-        f"max_connections: {MOST_CONNECTIONS}",
+        f"max_payload: {MAX_BLOCK_BYTES}",
+        f"max_connections: {MAX_CONNECTIONS}",
         *([tls] if tls else []),
         patience,
         f"jetstream {{ {_jetstream(node)} }}",

@@ -24,14 +24,14 @@ from bms_estimator.settings.mqtt import MqttSettings
 
 ROUND_S = 0.1
 """Interval between two checks for due blocks [s]."""
-MOST_IN_FLIGHT = 2000
+MAX_IN_FLIGHT = 2000
 """Blocks that a connection may have sent without an acknowledgement."""
 QUIET_S = 3.0
 """Time after the last block in which a worker may request a missing one [s]."""
 SAID_S = 5.0
 """Interval between two progress lines [s]."""
 KEEPALIVE_S = 20
-LEAST_WAIT_S, MOST_WAIT_S = 1, 4
+MIN_WAIT_S, MAX_WAIT_S = 1, 4
 """Minimum and maximum delay before a reconnect [s]."""
 _HEARD = awaits("+").replace(".", "/")
 
@@ -73,8 +73,8 @@ class _Connection:
         self._client.username_pw_set(settings.username, password(settings))
         if any(broker.tls for broker in brokers(settings)):
             self._client.tls_set_context(tls_context(settings))
-        self._client.max_inflight_messages_set(MOST_IN_FLIGHT)
-        self._client.reconnect_delay_set(LEAST_WAIT_S, MOST_WAIT_S)
+        self._client.max_inflight_messages_set(MAX_IN_FLIGHT)
+        self._client.reconnect_delay_set(MIN_WAIT_S, MAX_WAIT_S)
         self._client.on_connect = self._subscribe
         self._client.on_publish = self._count
         self._client.on_message = self._hear
@@ -176,7 +176,7 @@ def _listen(heard: deque[tuple[str, bytes]], edges: SimulatedEdges) -> None:
 
 def _send(fleet: SimulatedFleet, edges: SimulatedEdges, links: list[_Connection], topics: list[str]) -> int:
     """Send due blocks within the limit of messages in flight. Returns how many bytes of blocks that was."""
-    free = min(MOST_IN_FLIGHT - link.in_flight for link in links)
+    free = min(MAX_IN_FLIGHT - link.in_flight for link in links)
     due = edges.due(time.time(), max(0, free))
     blocks = list(fleet.blocks(*due))  # all of them first: the connections' threads would take turns with this one
     for pack, block in zip(due.packs.tolist(), blocks, strict=True):

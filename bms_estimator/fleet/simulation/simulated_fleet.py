@@ -32,7 +32,7 @@ MIDDLE_SOC, SWING_SOC = 0.52, 0.36
 """SOC range is 0.16 to 0.88."""
 SLOW, QUICK, QUICKNESS = 0.75, 0.25, 3.3
 """Shares of the two oscillations of SOC, and how much faster the second is."""
-SHORTEST_S, LONGEST_S = 8 * 3600.0, 24 * 3600.0
+MIN_S, MAX_S = 8 * 3600.0, 24 * 3600.0
 """Period of the slow one [s]: up to 0.43 C."""
 PULSE_S, PULSE_C = 15, 0.6
 """Length [s] and maximum size [C] of a pulse in each minute; a third of it in the other direction follows."""
@@ -44,7 +44,7 @@ JITTER_S = 0.02
 """Maximum error of a real device's timestamps [s]."""
 WORN, NEW, TIRED = 0.75, 1.02, 0.6
 """Range of true to declared capacity, and its value for a pack with a defect."""
-MOST_RESISTANCE, FAILING = 1.6, 3.0
+MAX_RESISTANCE, FAILING = 1.6, 3.0
 """True resistances to the cell file's: the range begins at 0.8; and those of a pack about to fail."""
 OUTLIERS = 0.01
 """Part of the packs that is tired, and as many again that are failing."""
@@ -128,7 +128,7 @@ class SimulatedFleet:
         within_s = self._dice(pack, 1) * BLOCK_S
         self.begin_ns = begin_ns
         self.store: Whole = begin_ns + (within_s * 1e9).astype(np.int64)
-        self._omega = 2.0 * math.pi / (SHORTEST_S + (LONGEST_S - SHORTEST_S) * self._dice(pack, 2))
+        self._omega = 2.0 * math.pi / (MIN_S + (MAX_S - MIN_S) * self._dice(pack, 2))
         self._phase = 2.0 * math.pi * self._dice(pack, 3)
         self._warm_c = np.round(20.0 + 10.0 * self._dice(pack, 4), 1)
         self.truth = self._aged(pack)
@@ -136,7 +136,7 @@ class SimulatedFleet:
     def _aged(self, pack: Whole) -> Truth:
         fate = self._dice(pack, 5)
         capacity = WORN + (NEW - WORN) * self._dice(pack, 6)
-        resistance = 0.8 + (MOST_RESISTANCE - 0.8) * self._dice(pack, 7)
+        resistance = 0.8 + (MAX_RESISTANCE - 0.8) * self._dice(pack, 7)
         capacity[fate < OUTLIERS] = TIRED
         resistance[(fate >= OUTLIERS) & (fate < 2 * OUTLIERS)] = FAILING
         rated_as = np.array([curves.capacity_as for curves in self._curves])

@@ -10,7 +10,7 @@ import numpy as np
 
 from bms_estimator.edge.block import Block
 from bms_estimator.edge.subjects import BlockRequest
-from bms_estimator.fleet.worker.pack_state import MOST_LOST
+from bms_estimator.fleet.worker.pack_state import MAX_LOST
 
 TOLD_EACH = 10
 """Number of blocks between two confirmations to an edge that earlier blocks are safe."""
@@ -68,7 +68,7 @@ def mark_taken(d: np.void) -> None:
 
 def _lose(d: np.void, number: int) -> int:
     """Count the blocks before a number as lost; returns the number."""
-    d["lost_blocks"] = min(int(d["lost_blocks"]) + number - int(d["awaited"]), MOST_LOST)
+    d["lost_blocks"] = min(int(d["lost_blocks"]) + number - int(d["awaited"]), MAX_LOST)
     return _await(d, number)
 
 

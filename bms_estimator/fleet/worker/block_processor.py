@@ -14,7 +14,7 @@ from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
 from bms_estimator.fleet.worker import hour_summary
-from bms_estimator.fleet.worker.density import LONGEST_STORE_S
+from bms_estimator.fleet.worker.density import MAX_STORE_S
 from bms_estimator.fleet.worker.pack_state import PACK_STATE, Fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads import Payload
@@ -136,7 +136,7 @@ class BlockProcessor:
     def _check_times(self, samples: SampleBlock) -> None:
         """Set implausible timestamps to NaN."""
         times = samples["time_s"]
-        fit = (times >= 0.0) & (times <= LONGEST_STORE_S)
+        fit = (times >= 0.0) & (times <= MAX_STORE_S)
         if not fit.all():
             self._counters["no_time"] += int(np.count_nonzero(~fit))
             times[~fit] = math.nan

@@ -31,8 +31,8 @@ from bms_estimator.kernels.packed_record import symmetry_map
 FORMAT = 1
 CHUNK_BYTES = 1 << 20
 _HEAD, _CHUNK, _ENTRY = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
-_MAGIC, _FORMER_BLOCK, _MOST_LAYOUTS = b"BMSFLEET", 255, 255
-_LONGEST_RECORD = 1 << 24
+_MAGIC, _FORMER_BLOCK, _MAX_LAYOUTS = b"BMSFLEET", 255, 255
+_MAX_RECORD = 1 << 24
 
 
 class CheckpointError(ValueError):
@@ -61,7 +61,7 @@ def dtype_of(layout: str) -> np.dtype[Any]:
         dtype = np.dtype(_fields(json.loads(layout)))
     except (TypeError, KeyError, IndexError, RecursionError, OverflowError) as error:
         raise ValueError(f"no layout of a record: {error}") from None
-    if dtype.itemsize > _LONGEST_RECORD:
+    if dtype.itemsize > _MAX_RECORD:
         raise ValueError(f"{dtype.itemsize} bytes: no layout of a pack's record")
     symmetry_map(dtype)  # rejects data that are not whole words
     return dtype
@@ -103,7 +103,7 @@ class PartitionCheckpoint:
 
     def chunks(self) -> Iterator[bytes]:
         """Yield the checkpoint's bytes in chunks of about ``CHUNK_BYTES``."""
-        layouts = list(dict.fromkeys([PRESENT, *(each.layout for each in self.former.values())]))[:_MOST_LAYOUTS]
+        layouts = list(dict.fromkeys([PRESENT, *(each.layout for each in self.former.values())]))[:_MAX_LAYOUTS]
         header = {
             "partition": self.number,
             "sequence": self.sequence,

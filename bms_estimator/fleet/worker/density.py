@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from bms_estimator.edge.batching import MOST_SAMPLES
+from bms_estimator.edge.batching import MAX_SAMPLES as EDGE_MAX_SAMPLES
 from bms_estimator.model.sample import SampleBlock
 
 MAX_RATE_HZ = 1000.0
 """Highest sample rate of a source."""
 MAX_SAMPLES = 20_000
-"""Maximum number of samples in a block: the limit of earlier edges; later ones cut at ``MOST_SAMPLES``."""
-LONGEST_STORE_S = 2.0**33
+"""Maximum number of samples in a block: the limit of earlier edges; later ones cut at ``EDGE_MAX_SAMPLES``."""
+MAX_STORE_S = 2.0**33
 """Latest plausible time stamp [s since the store was created]: a store may be created in 1970 on a machine without
 the time."""
 
@@ -17,14 +17,14 @@ the time."""
 def density_fault(samples: SampleBlock) -> str:
     """Return why a block has too many samples, in total or for its duration; empty if it has not.
 
-    ``MOST_SAMPLES`` are allowed beyond the rate, because an edge's clock may stand still while a source's is
+    ``EDGE_MAX_SAMPLES`` are allowed beyond the rate, because an edge's clock may stand still while a source's is
     corrected.
     """
     if samples.size > MAX_SAMPLES:
         return f"{samples.size} samples: at most {MAX_SAMPLES}"
     times = samples["time_s"]
-    plausible = times[(times >= 0.0) & (times <= LONGEST_STORE_S)]
+    plausible = times[(times >= 0.0) & (times <= MAX_STORE_S)]
     elapsed_s = float(np.ptp(plausible)) if plausible.size else 0.0
-    if samples.size <= MOST_SAMPLES + MAX_RATE_HZ * elapsed_s:
+    if samples.size <= EDGE_MAX_SAMPLES + MAX_RATE_HZ * elapsed_s:
         return ""
-    return f"{samples.size} samples in {elapsed_s:.3g} s: at most {MAX_RATE_HZ:g} a second, and {MOST_SAMPLES} more"
+    return f"{samples.size} samples in {elapsed_s:.3g} s: at most {MAX_RATE_HZ:g} a second, and {EDGE_MAX_SAMPLES} more"

@@ -19,7 +19,7 @@ from bms_estimator.kernels.records import ESTIMATOR_STATE
 
 Fields = Mapping[str, NDArray[Any]]
 """Fields of a record by name, those of parts as ``part.field``."""
-MOST_LOST = 2**62
+MAX_LOST = 2**62
 """No more lost blocks are counted."""
 
 DELIVERY = np.dtype(
@@ -121,7 +121,7 @@ class WorkRecord:
     def count_lost(self, blocks: int) -> None:
         """Count blocks of this hour as lost."""
         lost = self.record[0]["hour"]
-        lost["lost_blocks"] = min(int(lost["lost_blocks"]) + blocks, MOST_LOST)
+        lost["lost_blocks"] = min(int(lost["lost_blocks"]) + blocks, MAX_LOST)
 
     def take(self) -> bytes:
         """Return the pack's record, packed."""

@@ -32,7 +32,7 @@ LISTEN_S = 0.5
 """Time of listening to other workers before partitions are claimed [s]: they answer a new worker at once."""
 LOOK_S = 0.5
 """Interval between two checks for a due checkpoint or waiting summaries [s]."""
-MOST_UNKNOWN = 20
+MAX_UNKNOWN = 20
 """Packs that a heartbeat names."""
 AT_ONCE = 8
 """Partitions that are given back at the same time."""
@@ -334,7 +334,7 @@ class Worker:
             lag_s=max(lags, default=None),
             counters=dict(counters),
             unknown_count=len(unknown),
-            unknown=tuple(sorted(unknown)[:MOST_UNKNOWN]),
+            unknown=tuple(sorted(unknown)[:MAX_UNKNOWN]),
             waiting=sum(len(holding.consumer.waiting) for holding in self._holdings),
             hours_waiting=sum(len(holding.hours) for holding in self._holdings),
             checkpoint_age_s=max(ages, default=None),

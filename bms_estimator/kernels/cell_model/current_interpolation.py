@@ -13,7 +13,7 @@ UNMEASURED_S = 60.0
 """Longest step over which the current counts as measured [s]; for slower sources ``PERIODS`` of their periods."""
 PERIODS = 2.5
 """Longest regular step [periods]: a regular source may be late, or lose a sample."""
-LONGEST_FLOW_S = 3600.0
+MAX_FLOW_S = 3600.0
 """A current is not taken to have flowed for longer without a sample: one wrong time stamp must not empty a cell [s]."""
 
 

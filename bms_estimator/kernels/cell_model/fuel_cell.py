@@ -43,7 +43,7 @@ BARRIER_V = 0.948
 with i_0 after Arrhenius has it: xi_1 of Mann et al. (2000) [V]."""
 MEMBRANE_K = 1268.0
 """Temperature coefficient of the membrane's conductivity, e^(-1268 / T): Springer et al. (1991) [K]."""
-LEAST_REST = 0.02
+MIN_REST = 0.02
 """1 - I / i_L is no less: beyond 98 % of the limiting current the loss stays, for there is no steady state [1]."""
 
 
@@ -94,8 +94,8 @@ def settled(theta: Floats, given: Floats, current_a: float, slope: Floats) -> fl
     internal_a = given[INTERNAL] * math.exp(theta[INTERNAL])
     reaction_a = reaction_current(current_a, internal_a)
     rest = 1.0 - reaction_a / limit_a
-    limited = rest < LEAST_REST
-    rest = max(rest, LEAST_REST)
+    limited = rest < MIN_REST
+    rest = max(rest, MIN_REST)
     gain = 0.0 if limited else b_v * reaction_a / (limit_a * rest)  # d v_inf / d ln I of the last term
     slope[:] = 0.0
     slope[TAFEL] = tafel_v * math.log(reaction_a)

@@ -19,7 +19,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS, TREND
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
-LEAST_CAPACITANCE = 1e-3
+MIN_CAPACITANCE = 1e-3
 """C_ts, C_tl are held at this fraction of a9, a12 below delta1, delta2, where (2.7), (2.8) turn negative."""
 
 
@@ -91,8 +91,8 @@ def two_branches(time_s: Floats, current_a: Floats, soc: Floats, a: Floats) -> F
         if j > 0:
             dt_s, held_a, middle = time_s[j] - time_s[j - 1], current_a[j - 1], max(0.5 * (soc[j - 1] + soc[j]), 0.0)
             ohm_ts, ohm_tl = r_ts(middle, a), r_tl(middle, a)
-            farad_ts = max(c_ts(middle, a), LEAST_CAPACITANCE * a[9])
-            farad_tl = max(c_tl(middle, a), LEAST_CAPACITANCE * a[12])
+            farad_ts = max(c_ts(middle, a), MIN_CAPACITANCE * a[9])
+            farad_tl = max(c_tl(middle, a), MIN_CAPACITANCE * a[12])
             v_ts = rc_step(v_ts, held_a, ohm_ts, ohm_ts * farad_ts, dt_s)
             v_tl = rc_step(v_tl, held_a, ohm_tl, ohm_tl * farad_tl, dt_s)
         drop_v[j] = v_ts + v_tl + current_a[j] * r_s(max(soc[j], 0.0), a)

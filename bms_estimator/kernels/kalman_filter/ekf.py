@@ -28,7 +28,7 @@ from bms_estimator.numba_cache import njit
 
 NARROWEST, WIDEST = 0.02, 0.3
 """The OCV's slope is that of the secant over one std of SOC, between these."""
-LEAST_SLOPE_V = 0.02
+MIN_SLOPE_V = 0.02
 """Minimum slope of the OCV of one cell [V per unit SOC]; on a flat plateau the filter would diverge."""
 HUBER = 2.0
 """Limit of an innovation in std; a larger one counts as this much (Huber)."""
@@ -36,13 +36,13 @@ MINUTE_S, TEN_MINUTES_S = 60.0, 600.0
 """Averaging times over which a mean innovation shows a persistent error [s]."""
 INFLATION_OVER = 5.0, 3.0
 """Averaging time of the inflation, in multiples of its own time constant."""
-NEAR, MOST_TIMES = 0.01, 8
+NEAR, MAX_TIMES = 0.01, 8
 """Convergence limit in SOC and maximum number of iterations, as an update is linearized again about its result."""
 LOWEST, HIGHEST = -0.05, 1.05
 """Limits of a filter's SOC."""
-MOST_STDS = 3.0
+MAX_STDS = 3.0
 """Limit of ln of the resistances in multiples of their initial std."""
-LEAST_LN_Q, MOST_LN_Q = math.log(0.5), math.log(1.3)
+MIN_LN_Q, MAX_LN_Q = math.log(0.5), math.log(1.3)
 """Limits of the learned relative to the declared capacity: aging takes up to half of it, and no make exceeds its
 declaration by much."""
 HOLD_NOTHING, HOLD_CAPACITY, HOLD_CELL, HOLD_CELL_AND_CURVE = range(4)
@@ -142,7 +142,7 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     soc, variance = x[SOC], cov[SOC, SOC]
     innovation_v, total_v2, straight_v2 = compute_innovation(s, p, q, variance_v2, soc, variance)
-    for _ in range(MOST_TIMES):
+    for _ in range(MAX_TIMES):
         to_soc = min(max(x[SOC] + ph[SOC] * innovation_v / total_v2, LOWEST), HIGHEST)
         to_variance = cov[SOC, SOC] - ph[SOC] * ph[SOC] / total_v2
         if max(abs(to_soc - soc), abs(secant_reach(to_variance) - secant_reach(variance))) < NEAR:
@@ -150,8 +150,8 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
         soc, variance = to_soc, to_variance
         innovation_v, total_v2, straight_v2 = compute_innovation(s, p, q, variance_v2, soc, variance)
     apply_correction(x, cov, ph, innovation_v, total_v2, states_to_hold(s, p, q))
-    x[LN_Q] = min(max(x[LN_Q], LEAST_LN_Q), MOST_LN_Q)
-    most = MOST_STDS * resistance_std(s, p)
+    x[LN_Q] = min(max(x[LN_Q], MIN_LN_Q), MAX_LN_Q)
+    most = MAX_STDS * resistance_std(s, p)
     for j in (LN_R0, LN_R):
         x[j] = min(max(x[j], -most), most)
     return innovation_v, total_v2, straight_v2
@@ -205,7 +205,7 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
     )
     for j in range(STATES):
         h[j] = 0.0
-    h[SOC] = max(0.5 * (above - below) / reach, LEAST_SLOPE_V * p.series)
+    h[SOC] = max(0.5 * (above - below) / reach, MIN_SLOPE_V * p.series)
     first, others = math.exp(x[LN_R0]), math.exp(x[LN_R])
     h[LN_R0] = -first * ohm[0] * (w.sum_a / w.samples - x[OFFSET])
     for k in range(BRANCHES):

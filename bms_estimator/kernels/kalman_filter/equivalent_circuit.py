@@ -32,7 +32,7 @@ SHORT_S = 60.0
 SHORT = sum(tau_s < SHORT_S for tau_s in TAU_S)
 SHAPE_STD = 0.03
 """Relative std of the file's series resistance, scaled to the cell, at one SOC and temperature."""
-LONGEST_S = 2.0
+MAX_S = 2.0
 """Samples further apart show no step of the current [s]."""
 KNOWN = 0.5
 """A scale of the resistances was identified when its variance is below this part of the first one."""
@@ -101,7 +101,7 @@ def branch_rise_within_sample(f: Record, e: Record) -> float:
     """Return the rise of the branches within one sample after a step [ohm]. How much of it is R_s cannot be observed."""
     ohm = 0.0
     for k in range(BRANCHES):
-        ohm += e.ohm[1 + k] * (1.0 - math.exp(-min(f.decay_s, LONGEST_S) / TAUS[k]))
+        ohm += e.ohm[1 + k] * (1.0 - math.exp(-min(f.decay_s, MAX_S) / TAUS[k]))
     return ohm
 
 

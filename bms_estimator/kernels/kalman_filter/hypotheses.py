@@ -67,7 +67,7 @@ OVERLAP = 0.62
 """Std of a hypothesis over the distance to the next."""
 BEYOND_STD = 0.03
 """Std of an SOC set outside 0..1."""
-LEAST_STD = 0.005
+MIN_STD = 0.005
 """Minimum std of the SOC: full and empty of a cell are not defined better."""
 UNKNOWN_FULL = 0.03
 """Std of the SOC, over that of ln R, of a cell that was not measured: another make is full elsewhere on the curve."""
@@ -238,4 +238,4 @@ def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
 def weakest_cell_soc_std(s: Record, p: Record) -> float:
     """Return the std of the SOC of the weakest cell in series; how far it lies below the mean cannot be observed."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
-    return math.hypot(max(s.soc_std, LEAST_STD, UNKNOWN_FULL * p.r_std), spread)
+    return math.hypot(max(s.soc_std, MIN_STD, UNKNOWN_FULL * p.r_std), spread)

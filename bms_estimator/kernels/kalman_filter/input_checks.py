@@ -40,7 +40,7 @@ LOST_AT_MOST = 0.4
 """No SOC is less certain than this, std."""
 SIGN_S = 300.0
 """Memory of the relation between voltage and current changes, counted while the current changes [s]."""
-LEAST_EVIDENCE = 0.1
+MIN_EVIDENCE = 0.1
 """Share of that memory which must be filled."""
 CLIP = 5.0
 """Limit of a voltage change, in multiples of what the resistances explain, so that a glitch to zero does not
@@ -244,7 +244,7 @@ def unusable_input_bits(c: Record, p: Record) -> int:
 def sign_is_wrong(c: Record, p: Record) -> bool:
     """Return True if the voltage rises with a reported discharge; a present suspicion stays until it falls."""
     steep = 0.25 * reference_series_resistance(p) * c.change_a2
-    return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > LEAST_EVIDENCE
+    return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > MIN_EVIDENCE
 
 
 @njit(cache=True)

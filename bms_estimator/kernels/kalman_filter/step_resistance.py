@@ -11,13 +11,13 @@ import math
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, resistances
 from bms_estimator.kernels.kalman_filter.ekf import HUBER
-from bms_estimator.kernels.kalman_filter.equivalent_circuit import LONGEST_S
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import MAX_S
 from bms_estimator.kernels.kalman_filter.records import LN_R, SOC
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 UNHELD, HELD, STEPPED = range(3)
-LEAST_C = 0.2
+MIN_C = 0.2
 """Minimum change of the current between two samples that counts as a step [C]."""
 HELD_SHARE = 0.1
 """A current is held that changes by no more than this part of the (least) step."""
@@ -32,10 +32,10 @@ SHAPE_STD = 0.3
 @njit(cache=True)
 def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: float) -> None:
     """Take one sample, after ``integrate_current``: the current changed by ``change_a`` [A] within ``dt_s`` [s]."""
-    step, least_a = s.step, LEAST_C * p.capacity_as / 3600.0
+    step, least_a = s.step, MIN_C * p.capacity_as / 3600.0
     before, step.phase = step.phase, UNHELD
     step.variance += SHAPE_STD**2 * abs(s.current_a) * dt_s / p.capacity_as
-    if dt_s > LONGEST_S:
+    if dt_s > MAX_S:
         return
     stepped_a = abs(s.current_a - step.current_a)
     if before == STEPPED and stepped_a >= least_a and abs(change_a) <= HELD_SHARE * stepped_a:

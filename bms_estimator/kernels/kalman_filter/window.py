@@ -6,7 +6,7 @@
 import math
 
 from bms_estimator.kernels.cell_model.current_interpolation import (
-    LONGEST_FLOW_S,
+    MAX_FLOW_S,
     SLOW_S,
     interpolated_current,
     ramp_correction,
@@ -60,7 +60,7 @@ def integrate_current(s: Record, p: Record, dt_s: float, gap: bool, current_a: f
     w = s.window
     held_a, change_a = interpolated_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
     unseen = gap or dt_s > p.unmeasured_s
-    charge_as = held_a * min(dt_s, LONGEST_FLOW_S)
+    charge_as = held_a * min(dt_s, MAX_FLOW_S)
     if gap and dt_s > p.unmeasured_s:
         charge_as += expected_excess_charge(s, held_a, dt_s)
         held_a = charge_as / dt_s

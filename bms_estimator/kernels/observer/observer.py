@@ -8,7 +8,7 @@ solved exactly, so the step is stable for every N >= 0 and every step length. ``
 import math
 
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, soc_from_ocv
-from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, interpolated_current
+from bms_estimator.kernels.cell_model.current_interpolation import MAX_FLOW_S, interpolated_current
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
@@ -48,7 +48,7 @@ def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v:
 def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     """SOC by coulomb counting (3.1); none of a fuel cell."""
     if p.capacity_as > 0.0:
-        charge_as = interpolated_current(dt_s, s.current_a, current_a, p.unmeasured_s) * min(dt_s, LONGEST_FLOW_S)
+        charge_as = interpolated_current(dt_s, s.current_a, current_a, p.unmeasured_s) * min(dt_s, MAX_FLOW_S)
         s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
 

@@ -17,7 +17,7 @@ BINS = 100
 """Number of SOC bins, one value of R_s each."""
 SMALLEST_CURRENT_C = 0.02
 """Smallest current that (4.2) is evaluated at: below it, the sensor's noise dominates [1/h]."""
-MOST_SAMPLES = 20_000
+MAX_SAMPLES = 20_000
 """Samples of a bin at which its sums are halved, so that R_s follows the cell's ageing."""
 
 SERIES_RESISTANCE = np.dtype(
@@ -74,7 +74,7 @@ def series_resistance_step(s: Record, p: Record, dt_s: float, before_a: float, s
     if r.settle_s > 0.0 or not o.adapting or not flows(o.current_a, p):
         return
     b = bin_of(o.soc)
-    if r.samples[b] >= MOST_SAMPLES:
+    if r.samples[b] >= MAX_SAMPLES:
         r.samples[b] *= 0.5
         r.square_a2[b] *= 0.5
         r.product_va[b] *= 0.5

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from enum import Enum
 
-from bms_estimator.model.sample import LEAST_C, MOST_C, CurrentSign
+from bms_estimator.model.sample import MAX_C, MIN_C, CurrentSign
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
@@ -19,7 +19,7 @@ UNANSWERED_ROUNDS = 3
 """Number of unanswered poll cycles after which the next query variant is tried."""
 NOISE_BYTES = 64
 """Number of bytes without a frame that counts as a fault and not as a single glitch."""
-LONGEST_START = 4
+MAX_START = 4
 """No frame begins with more bytes that are always the same."""
 FAULTS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs")
 FRESH_S = 3.0
@@ -151,7 +151,7 @@ class PolledProtocol(ReadingProtocol):
                         "crc_errors", "answers come with wrong checksums: interference, or a second master on the line?"
                     )
             at = self._next(rest, at + 1)
-        keep = waiting if waiting >= 0 else max(done, len(rest) - LONGEST_START + 1)
+        keep = waiting if waiting >= 0 else max(done, len(rest) - MAX_START + 1)
         self._skip(keep - done)
         self._rest = rest[keep:]
         return frames
@@ -182,6 +182,6 @@ class PolledProtocol(ReadingProtocol):
 
     def _mean_c(self, probes_c: Sequence[float]) -> float:
         """Return the pack's mean temperature from its probes [C]; an absent or broken probe reads beyond a pack's range."""
-        there = [probe_c for probe_c in probes_c if LEAST_C <= probe_c <= MOST_C]
+        there = [probe_c for probe_c in probes_c if MIN_C <= probe_c <= MAX_C]
         self._counts["implausible"] += len(probes_c) - len(there)
         return sum(there) / len(there) if there else math.nan

@@ -26,7 +26,7 @@ PACKS = range(0x01, 0x40)
 NO_CURRENT = 30000
 ZERO_C = 40
 """0 degC; 0 is a probe that is not there."""
-CELLS_A_FRAME, PROBES_A_FRAME, MOST_FRAMES = 3, 7, 16
+CELLS_A_FRAME, PROBES_A_FRAME, MAX_FRAMES = 3, 7, 16
 
 
 def sealed(frame: bytes) -> bytes:
@@ -92,9 +92,9 @@ class DalyProtocol(PolledProtocol):
             return self._pack(arrival_s, data)
         if command == STATUS:
             self._cells, self._probes, self._known = data[0] or None, data[1], True
-        elif command in (CELLS, PROBES) and data[0] > MOST_FRAMES:
+        elif command in (CELLS, PROBES) and data[0] > MAX_FRAMES:
             self._count_fault(
-                "length_errors", f"a frame with number {data[0]} comes, and there are at most {MOST_FRAMES}"
+                "length_errors", f"a frame with number {data[0]} comes, and there are at most {MAX_FRAMES}"
             )
         elif command == CELLS:
             self._first = 0 if data[0] == 0 else self._first

@@ -22,7 +22,7 @@ REFUSED = 0x80
 """Status of a successful response."""
 HEAD, TAIL = 4, 3
 """Bytes of a frame before and behind its data."""
-LEAST_BASIC, MOST_DATA = 23, 128
+MIN_BASIC, MAX_DATA = 23, 128
 """Bytes: basic information without a probe; more than 32 cells, or the longest name."""
 ZERO_C = 2731
 """0 degC [0.1 K]."""
@@ -66,7 +66,7 @@ class JbdProtocol(PolledProtocol):
         _, register, status, length = data[at : at + HEAD]
         if register not in (BASIC, CELLS, NAME) or status not in (0, REFUSED):
             return ParseResult.NOISE
-        return HEAD + length + TAIL if length <= MOST_DATA else ParseResult.LENGTH
+        return HEAD + length + TAIL if length <= MAX_DATA else ParseResult.LENGTH
 
     def _is_whole(self, frame: bytes) -> bool:
         return frame[-1] == END and checksum(frame[2:-TAIL]) == frame[-TAIL:-1]
@@ -79,7 +79,7 @@ class JbdProtocol(PolledProtocol):
             self._model = data.decode("ascii", "replace").strip("\0 ")
         elif register == CELLS:
             self._beside.keep(arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])])
-        elif len(data) < LEAST_BASIC:
+        elif len(data) < MIN_BASIC:
             self._count_fault("length_errors", "its basic information is too short")
         else:
             return self._basic(arrival_s, data)
@@ -88,7 +88,7 @@ class JbdProtocol(PolledProtocol):
     def _basic(self, arrival_s: float, data: bytes) -> Reading:
         volts, amperes = struct.unpack_from(">Hh", data)
         self._cells, probes = data[21], data[22]
-        told = data[LEAST_BASIC:][: 2 * probes]
+        told = data[MIN_BASIC:][: 2 * probes]
         return Reading(
             volts / 100,
             amperes / 100,

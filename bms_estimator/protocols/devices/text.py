@@ -7,10 +7,10 @@ import numpy as np
 
 from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import (
-    LEAST_C,
-    LEAST_CELL_V,
-    MOST_C,
-    MOST_CELL_V,
+    MAX_C,
+    MAX_CELL_V,
+    MIN_C,
+    MIN_CELL_V,
     SAMPLE,
     CurrentSign,
     SampleBlock,
@@ -89,14 +89,14 @@ class TextProtocol(DeviceProtocol):
             self._begin_overlong(self._rest)
             self._rest, self._overlong = b"", True
         self.cells = cell_block([reading.cells_v for reading in readings])
-        self._implausible += forget_beyond(self.cells, LEAST_CELL_V, MOST_CELL_V)
+        self._implausible += forget_beyond(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
         if readings:
             self._samples += len(readings)
             block["voltage_v"] = [reading.voltage_v for reading in readings]
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
             block["temperature_c"] = [reading.temperature_c for reading in readings]
-            self._implausible += forget_beyond(block["temperature_c"], LEAST_C, MOST_C)
+            self._implausible += forget_beyond(block["temperature_c"], MIN_C, MAX_C)
             block["status"] = 0
             block["time_s"] = self._times(arrival_s, readings)
         return block

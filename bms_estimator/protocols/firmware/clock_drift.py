@@ -15,7 +15,7 @@ from bms_estimator.numba_cache import njit
 CLOCK_WINDOWS = 60
 """The last ten minutes: a resonator drifts with its temperature."""
 _WINDOW_US = 10_000_000
-_LEAST_US = 60_000_000  # 1 ms, by which the least delays may differ, is 17 ppm of it
+_MIN_US = 60_000_000  # 1 ms, by which the least delays may differ, is 17 ppm of it
 _US = 1e-6
 
 
@@ -53,7 +53,7 @@ def clock_ppm(d: Record) -> float:
         window = (d.clock_windows - count + i) % CLOCK_WINDOWS
         at_s[i] = d.clock_at_us[window] * _US
         late_s[i] = d.clock_late_s[window]
-    if count < 2 or at_s[-1] - at_s[0] < _LEAST_US * _US:
+    if count < 2 or at_s[-1] - at_s[0] < _MIN_US * _US:
         return math.nan
     hull = np.empty(count, np.int64)
     corners = 0

@@ -25,7 +25,7 @@ from bms_estimator.protocols.firmware.scaling import SCALING, reference
 
 DEAF_BYTES = 512
 """Number of bytes without a whole frame that shows a fault of the line: eight times the longest frame."""
-MOST_CLOCK_PPM = 20_000.0
+MAX_CLOCK_PPM = 20_000.0
 """No resonator is so far off: the host slept meanwhile, or the board is a simulated one in a hurry [1e-6]."""
 HELLO_FRAME_BYTES = HELLO_BYTES + 1
 """Length of a COBS-encoded hello without its delimiter [bytes]."""
@@ -131,7 +131,7 @@ class FrameDecoder:
         To 0.1. It changes no time stamp.
         """
         ppm = clock_ppm(self._state[0])
-        return round(ppm, 1) if abs(ppm) < MOST_CLOCK_PPM else None
+        return round(ppm, 1) if abs(ppm) < MAX_CLOCK_PPM else None
 
     @property
     def counters(self) -> FrameCounters:

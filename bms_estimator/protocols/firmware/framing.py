@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import Record, Records
-from bms_estimator.model.sample import LEAST_C, MOST_C, SampleStatus
+from bms_estimator.model.sample import MAX_C, MIN_C, SampleStatus
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.clock_drift import CLOCK_WINDOWS, forget_clock, take_arrival
 from bms_estimator.protocols.firmware.messages import MODULUS, PROTOCOL_VERSION, BoardStatus, MessageType
@@ -92,8 +92,8 @@ HASTE_S = 0.3
 SLOWEST = 0.01
 """No board's clock is slower than the host's by more than this, relative."""
 _REORDER_WINDOW = 64  # a sample further behind belongs to a board whose clock restarted
-_MOST_APART = 0.1  # sequence and clock of one board, relative; beyond this it is another, or has another rate
-LONGEST_DOUBT_S = 5.0
+_MAX_APART = 0.1  # sequence and clock of one board, relative; beyond this it is another, or has another rate
+MAX_DOUBT_S = 5.0
 """Maximum time for which samples wait for the hello that identifies their board [s]; then they are accepted as
 before."""
 _US = 1e-6
@@ -234,7 +234,7 @@ def is_early(d: Record, arrival_s: float, time_s: float) -> bool:
 def is_consistent_with_clock(d: Record, samples: int, step_us: int) -> bool:
     """Return True if one board can have measured that many samples in that time of its clock."""
     apart_us = abs(samples * d.period_us - step_us)
-    return apart_us <= max(_MOST_APART * step_us, _REORDER_WINDOW * d.period_us)
+    return apart_us <= max(_MAX_APART * step_us, _REORDER_WINDOW * d.period_us)
 
 
 @njit(cache=True)
@@ -332,7 +332,7 @@ def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     place = follow_sequence(d, read_unsigned(p, 2, 4), read_unsigned(p, 6, 4), arrival_s)
     if place < 0:
         return 0
-    if d.boot_id < 0 and arrival_s - d.doubted_s < LONGEST_DOUBT_S:
+    if d.boot_id < 0 and arrival_s - d.doubted_s < MAX_DOUBT_S:
         d.withheld |= place
         d.before_hello += 1
         return 0
@@ -354,7 +354,7 @@ def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     out.voltage_v = voltage(s, float(read_unsigned(p, 10, 3)), count, reference_v)
     out.current_a = d.current_sign * current(s, float(read_unsigned(p, 13, 3)), count, reference_v)
     out.temperature_c = temperature(s)
-    if out.temperature_c < LEAST_C or out.temperature_c > MOST_C:
+    if out.temperature_c < MIN_C or out.temperature_c > MAX_C:
         out.temperature_c = math.nan
         d.implausible += 1
     out.status = place | (bits & _SATURATED_OR_OVERRUN)

@@ -17,10 +17,10 @@ from bms_estimator.protocols.base.relay import Relay
 PROTOCOL_VERSION = 1
 BAUD = 500_000
 RATE_HZ = range(1, 1001)
-LEAST_BANDGAP_V, MOST_BANDGAP_V = 1.0, 1.2
+MIN_BANDGAP_V, MAX_BANDGAP_V = 1.0, 1.2
 """Range of the internal reference of an ATmega328P by its data sheet [V]."""
-LEAST_DIVIDER, MOST_DIVIDER = 1.0, 100.0
-LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE = 0.001, 2.0
+MIN_DIVIDER, MAX_DIVIDER = 1.0, 100.0
+MIN_VOLTS_PER_AMPERE, MAX_VOLTS_PER_AMPERE = 0.001, 2.0
 DELIMITER = b"\0"
 MODULUS = 1 << 32
 """Sequence and microseconds count up to here and begin at 0 again."""
@@ -158,7 +158,7 @@ def set_ratiometric_command(ratiometric: int) -> bytes:
 
 RELAY_KEEP, RELAY_LOW, RELAY_HIGH = range(3)
 """Fallback level of the relay when the host is silent."""
-MOST_SILENT_S = 3600
+MAX_SILENT_S = 3600
 
 
 def set_relay_command(relay: Relay) -> bytes:

@@ -26,7 +26,7 @@ from bms_estimator.process.systemd import credential
 from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.line_protocol import lines
 
-MOST_WAITING = 10_000
+MAX_WAITING = 10_000
 """Lines that wait for a server that is away, hours of states at one a second; beyond it the oldest is dropped."""
 BATCH = 1000
 """Lines in one request, a megabyte at most."""
@@ -36,7 +36,7 @@ CLOSING_S = 3.0
 """Timeout of the last request [s]."""
 NEVER = (400, 413, 422)
 """Answers to what will never be taken: the lines are given up. All others may pass."""
-MOST_SHOWN = 200
+MAX_SHOWN = 200
 """Maximum length of a response in the log [characters]."""
 
 log = structlog.get_logger(__name__)
@@ -94,7 +94,7 @@ class InfluxSink:
             self._task.result()  # only an internal error ends the task: raise it
         self._waiting.extend(lines(self._before, snapshot))
         self._before = snapshot
-        while len(self._waiting) > MOST_WAITING:
+        while len(self._waiting) > MAX_WAITING:
             self._waiting.popleft()
             self.dropped += 1
         if len(self._waiting) >= BATCH:
@@ -255,11 +255,11 @@ def _answer(error: urllib.error.HTTPError) -> bytes:
     """Return the start of the server's response; empty without one."""
     try:
         with error:
-            return error.read(MOST_SHOWN * 4)
+            return error.read(MAX_SHOWN * 4)
     except (OSError, http.client.HTTPException):
         return b""
 
 
 def _shown(answer: bytes) -> str:
     """Return the part of a response to log."""
-    return "".join(c for c in answer.decode(errors="replace") if c.isprintable())[:MOST_SHOWN]
+    return "".join(c for c in answer.decode(errors="replace") if c.isprintable())[:MAX_SHOWN]

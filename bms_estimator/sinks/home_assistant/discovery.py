@@ -9,12 +9,12 @@ from bms_estimator.model.payloads import FRESH_PERIODS, Info
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.mqtt import Command
-from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ
+from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.home_assistant.entities import BATTERY, CELL, FUEL_CELL, OF_CELLS, Entity, cell_key, entities
 
 VALUES = "home_assistant"
 """Topic below the device's."""
-LEAST_EXPIRY_S = 30
+MIN_EXPIRY_S = 30
 """Home Assistant calls no value unavailable that is younger than this [s]."""
 ALARM_CLASSES = {
     "soc_low": "battery",
@@ -83,7 +83,7 @@ def discovery(
     if info.board.get("serial"):
         device["serial_number"] = info.board["serial"]
     fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
-    expiry_s = max(LEAST_EXPIRY_S, math.ceil(fresh_s))
+    expiry_s = max(MIN_EXPIRY_S, math.ceil(fresh_s))
     positive = settings.current_sign.removesuffix("_positive")
     numbers = entities(info, described.cells).items()
     components = {
@@ -215,8 +215,8 @@ def _publish_rate(root: str) -> dict[str, Any]:
         "value_template": "{{ value_json.publish_rate_hz }}",
         "command_topic": f"{root}/request/publish_rate",
         "command_template": '{"rate_hz": {{ value }}}',
-        "min": LEAST_RATE_HZ,
-        "max": MOST_RATE_HZ,
+        "min": MIN_RATE_HZ,
+        "max": MAX_RATE_HZ,
         "step": 0.1,
         "mode": "box",
         "unit_of_measurement": "Hz",

@@ -11,7 +11,7 @@ from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs
 from bms_estimator.sinks.home_assistant.entities import Entity, cell_key, entities
 
-MOST_ROWS = 18
+MAX_ROWS = 18
 """Maximum number of default-enabled values published in a minute; two more are reserved for alarms."""
 MINUTE_S = 60.0
 PAUSE_S = 5.0
@@ -50,7 +50,7 @@ def values_to_publish(
     recent_s = tuple(at_s for at_s in shown.rows_s if now_s - at_s < MINUTE_S)
     rows = [key for key in moved if shows[key].enabled and key in shown.values]
     rows.sort(key=lambda key: shown.changed_s[key])
-    for late in rows[MOST_ROWS - len(recent_s) :]:
+    for late in rows[MAX_ROWS - len(recent_s) :]:
         del moved[late]
     if not moved and waited_s < HEARTBEAT_S:
         return shown

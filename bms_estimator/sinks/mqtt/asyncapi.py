@@ -5,9 +5,9 @@ from typing import Any
 from pydantic.json_schema import models_json_schema
 
 from bms_estimator.model.payloads import PAYLOAD_VERSION
-from bms_estimator.settings.pack import DEVICE_NAME, LEAST_RATE_HZ, MOST_RATE_HZ
+from bms_estimator.settings.pack import DEVICE_NAME, MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
-from bms_estimator.sinks.mqtt.requests import MOST_PAYLOAD_BYTES, NAMES
+from bms_estimator.sinks.mqtt.requests import MAX_PAYLOAD_BYTES, NAMES
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from bms_estimator.version import __version__
 
@@ -28,7 +28,7 @@ ARGUMENTS: dict[str, Document] = {
     "set_soc": {"soc": {"type": "number", "minimum": 0, "maximum": 1, "description": "state of charge"}},
     "current_zero": {},
     "acknowledge_alarm": {"name": {"type": ["string", "null"], "description": "of an alarm; all when left out"}},
-    "publish_rate": {"rate_hz": {"type": "number", "minimum": LEAST_RATE_HZ, "maximum": MOST_RATE_HZ}},
+    "publish_rate": {"rate_hz": {"type": "number", "minimum": MIN_RATE_HZ, "maximum": MAX_RATE_HZ}},
 }
 """Fields of each command."""
 OPTIONAL = ("name",)
@@ -119,7 +119,7 @@ def _arguments(name: str) -> Document:
         "type": "object",
         "properties": own | {"transaction": TRANSACTION},
         "required": [field for field in own if field not in OPTIONAL],
-        "description": f"at most {MOST_PAYLOAD_BYTES} bytes; may be empty where nothing is required",
+        "description": f"at most {MAX_PAYLOAD_BYTES} bytes; may be empty where nothing is required",
     }
 
 

@@ -20,14 +20,14 @@ from bms_estimator.settings.mqtt import Command
 COMMANDS = get_args(Command)
 NAMES = ("state", "parameters", "health", *COMMANDS)
 """All requests that there are."""
-MOST_PAYLOAD_BYTES = 4096
+MAX_PAYLOAD_BYTES = 4096
 READS_PER_MIN = 120.0
 """Rate limit of read requests of all clients together; the same number may arrive at once [1/min]."""
 COMMANDS_PER_MIN = 6.0
 """Requests that change something, granted or not [1/min]."""
 LOG_S = 60.0
 """Minimum interval between two log lines for each kind of refusal [s]; all are counted."""
-MOST_SHOWN = 40
+MAX_SHOWN = 40
 """Maximum length of a foreign name in the log [characters]."""
 
 Handler = Callable[[Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
@@ -72,7 +72,7 @@ class RequestDispatcher:
             None where no response is due: to a name that does not exist, and beyond the rate.
         """
         if name not in NAMES:
-            self.count_refusal("unknown", name[:MOST_SHOWN])
+            self.count_refusal("unknown", name[:MAX_SHOWN])
             return None
         if not (self._commands if name in COMMANDS else self._reads).take():
             self.count_refusal("too_many", name)
@@ -164,8 +164,8 @@ def _arguments(payload: bytes) -> Mapping[str, Any]:
     Raises:
         UserError: It is something else, or too long.
     """
-    if len(payload) > MOST_PAYLOAD_BYTES:
-        raise UserError(f"a request's payload must not be longer than {MOST_PAYLOAD_BYTES} bytes")
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise UserError(f"a request's payload must not be longer than {MAX_PAYLOAD_BYTES} bytes")
     if not payload:
         return {}
     try:
@@ -185,7 +185,7 @@ def _finite(token: str) -> float:
     """
     number = float(token)
     if not math.isfinite(number):
-        raise UserError(f"{token[:MOST_SHOWN]}: numbers of a request must be finite")
+        raise UserError(f"{token[:MAX_SHOWN]}: numbers of a request must be finite")
     return number
 
 

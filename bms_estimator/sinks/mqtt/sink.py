@@ -28,7 +28,7 @@ from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.availability import ECHO_S, AvailabilityMonitor
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, MessageBuilder, PublishedState
-from bms_estimator.sinks.mqtt.requests import MOST_SHOWN, RequestDispatcher
+from bms_estimator.sinks.mqtt.requests import MAX_SHOWN, RequestDispatcher
 from bms_estimator.store.outbox import Outbox
 
 BIRTH_DELAY_S = 2.0
@@ -85,7 +85,7 @@ class MqttSink:
         self._messages = MessageBuilder(settings.base_topic, device, sample_period_s, home_assistant, alarms)
         self._birth_topic = (home_assistant or HomeAssistantSettings()).status_topic
         identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.offline_messages()[-1]
-        hello = ConnectOptions(identifier, will, lambda kind, topic: requests.count_refusal(kind, topic[:MOST_SHOWN]))
+        hello = ConnectOptions(identifier, will, lambda kind, topic: requests.count_refusal(kind, topic[:MAX_SHOWN]))
         for warning in check(settings):
             log.warning("a secret that is none", reason=warning)
         self._link = ReconnectLoop(
@@ -205,7 +205,7 @@ class MqttSink:
     async def _answer(self, connection: Connection, message: ReceivedMessage) -> None:
         name = message.topic.rsplit("/", 1)[-1]
         if message.retain:  # it would be granted again with each connection
-            self._requests.count_refusal("retained", name[:MOST_SHOWN])
+            self._requests.count_refusal("retained", name[:MAX_SHOWN])
             return
         response = await self._requests.handle(name, message.payload)
         if response is not None:  # the name is a known request

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 LARGEST = 1e12
 """No number of a battery is larger; longer text would only fill a screen."""
-LONGEST_TEXT = 400
+MAX_TEXT = 400
 """Texts are shown so far [characters]."""
 
 
@@ -69,4 +69,4 @@ def _number(value: object) -> float | None:
 
 
 def _text(value: object) -> str:
-    return "".join(c for c in value[:LONGEST_TEXT] if c.isprintable()) if isinstance(value, str) else ""
+    return "".join(c for c in value[:MAX_TEXT] if c.isprintable()) if isinstance(value, str) else ""

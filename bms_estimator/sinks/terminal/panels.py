@@ -27,9 +27,9 @@ VALUE_CELLS = 8
 SPARKS = "▁▂▃▄▅▆▇█"
 LOG_LINES = 2
 """The last of the log, which the screen hides."""
-MOST_ALARMS = 4
+MAX_ALARMS = 4
 """Maximum number of alarms shown in full."""
-MOST_PACKS = 8
+MAX_PACKS = 8
 """Maximum number of packs listed, around the shown one."""
 NARROW_MARGIN = 0.05
 """A stability margin below is shown as a warning."""
@@ -143,9 +143,9 @@ def sparkline(values: Sequence[float], cells: int) -> str:
 def _packs(scene: ScreenState) -> Table:
     """All packs, a line each, around the one that is shown below."""
     names = [pack.device for pack in scene.packs]
-    first = max(min(names.index(scene.device) - MOST_PACKS // 2, len(names) - MOST_PACKS), 0)
+    first = max(min(names.index(scene.device) - MAX_PACKS // 2, len(names) - MAX_PACKS), 0)
     table = Table.grid(padding=(0, 2))
-    for pack in scene.packs[first : first + MOST_PACKS]:
+    for pack in scene.packs[first : first + MAX_PACKS]:
         here = pack.device == scene.device
         stale, alarms = pack.stale, len(pack.alarms)
         table.add_row(
@@ -265,7 +265,7 @@ def _alarms(alarms: Sequence[JsonFields]) -> FlowLayout:
             f"{alarm.text('severity')}: {alarm.text('text') or _unwatched(alarm)}",
             style="bold red" if alarm.text("severity") == "critical" else "bold yellow",
         )
-        for alarm in worst[:MOST_ALARMS]
+        for alarm in worst[:MAX_ALARMS]
     ]
     more = len(worst) - len(texts)
     return FlowLayout(*texts, *([Text(f"and {more} more", style="bold red")] if more else []))

@@ -41,13 +41,13 @@ from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 
 MAGIC = b"BMSRAW1\n"
 VERSION = 1
-LONGEST_READ_BYTES = 1 << 20
+MAX_READ_BYTES = 1 << 20
 """A record holds no more."""
 CHUNK_BYTES = 1 << 20
 _HEAD = struct.Struct("<dI")
 _LENGTH = struct.Struct("<I")
 _CRC = struct.Struct("<H")
-_LONGEST_HEADER_BYTES = 1 << 20
+_MAX_HEADER_BYTES = 1 << 20
 
 
 @dataclass(config=ConfigDict(strict=True, extra="ignore", frozen=True))
@@ -146,14 +146,14 @@ class CaptureWriter:
 
         Args:
             arrival_s: The very number that the decoder gets [s].
-            data: The bytes, at most ``LONGEST_READ_BYTES``.
+            data: The bytes, at most ``MAX_READ_BYTES``.
 
         Raises:
             ValueError: More bytes.
             OSError: The disk is full or gone.
         """
-        if len(data) > LONGEST_READ_BYTES:
-            raise ValueError(f"a read of {len(data)} bytes: a record holds at most {LONGEST_READ_BYTES}")
+        if len(data) > MAX_READ_BYTES:
+            raise ValueError(f"a read of {len(data)} bytes: a record holds at most {MAX_READ_BYTES}")
         record = _HEAD.pack(arrival_s, len(data)) + data
         self._append(record + _CRC.pack(binascii.crc_hqx(record, 0xFFFF)))
 
@@ -242,7 +242,7 @@ def _split(raw: NDArray[np.uint8]) -> tuple[CaptureBatch, int]:
     most = raw.size // RECORD_OVERHEAD_BYTES + 1
     arrival_bits, ends = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
     payload = np.empty(raw.size, dtype=np.uint8)
-    taken, records, filled, damaged = split_records(raw, LONGEST_READ_BYTES, arrival_bits, ends, payload)
+    taken, records, filled, damaged = split_records(raw, MAX_READ_BYTES, arrival_bits, ends, payload)
     payload.setflags(write=False)  # as bytes from the line are: the decoder is compiled for one of both
     arrivals_s = arrival_bits[:records].view(np.float64)
     return CaptureBatch(arrivals_s, ends[:records], payload[:filled], bool(damaged)), taken
@@ -269,7 +269,7 @@ def _read_header(path: Path, file: IO[bytes]) -> CaptureHeader:
     if len(head) < len(MAGIC) + _LENGTH.size:
         raise UserError(f"{path}: cut off within its header")
     (length,) = _LENGTH.unpack(head[len(MAGIC) :])
-    text, crc = file.read(min(length, _LONGEST_HEADER_BYTES)), file.read(_CRC.size)
+    text, crc = file.read(min(length, _MAX_HEADER_BYTES)), file.read(_CRC.size)
     if len(text) != length or len(crc) != _CRC.size or _CRC.unpack(crc)[0] != binascii.crc_hqx(text, 0xFFFF):
         raise UserError(f"{path}: its header is damaged or cut off")
     return _checked_header(path, text)

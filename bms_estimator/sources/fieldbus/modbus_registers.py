@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.settings.modbus_source import MOST_WORDS, ModbusSource, Register
+from bms_estimator.settings.modbus_source import MAX_WORDS, ModbusSource, Register
 
 GAP_WORDS = 8
 """Maximum number of unwanted registers in one request, so that the values around them are read at the same moment."""
@@ -61,14 +61,14 @@ def values_of(settings: ModbusSource) -> tuple[Value, ...]:
 
 
 def plan(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
-    """Return the requests that read ``values``: as few as their tables, ``gap`` and ``MOST_WORDS`` allow."""
+    """Return the requests that read ``values``: as few as their tables, ``gap`` and ``MAX_WORDS`` allow."""
     requests: list[Request] = []
     for value in sorted(values, key=lambda value: (value.register.table, value.register.address)):
         register, end = value.register, value.register.address + value.register.words
         if requests:
             last = requests[-1]
             near = last.table == register.table and register.address <= last.address + last.words + gap
-            if near and end - last.address <= MOST_WORDS:
+            if near and end - last.address <= MAX_WORDS:
                 words = max(last.words, end - last.address)
                 requests[-1] = last._replace(words=words, values=(*last.values, value))
                 continue

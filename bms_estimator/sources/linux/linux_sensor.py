@@ -13,7 +13,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import SILENT_PERIODS, LineProducer, SourceUnavailableError
 from bms_estimator.sources.linux.sysfs import SYS, Channel, JunkError, find_channel, find_chip, read_number
 
-LEAST_INTERVAL_S = 0.1
+MIN_INTERVAL_S = 0.1
 """Minimum interval between two readings [s]; chips update as often as each 2 ms."""
 HUNG_S = 5.0
 """A second is long for a bus, but not for a machine that swaps [s]."""
@@ -146,7 +146,7 @@ class LinuxSensor(LineProducer):
             raise SourceUnavailableError(
                 f"the chip measures each {own_s:g} s only; say so by source.interval_s = {own_s:g}"
             )
-        return max(own_s, LEAST_INTERVAL_S)
+        return max(own_s, MIN_INTERVAL_S)
 
     def _sample(self, chip: _Chip) -> bytes:
         """Read a line in the thread; empty if voltage or current cannot be read now.

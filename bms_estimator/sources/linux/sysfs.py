@@ -13,7 +13,7 @@ from bms_estimator.model.decimal_text import number
 from bms_estimator.sources.line_source import SourceUnavailableError
 
 SYS = Path("/sys")
-LONGEST_BYTES = 4096
+MAX_BYTES = 4096
 """A page: no file of sysfs holds more."""
 
 
@@ -56,7 +56,7 @@ def read_number(path: Path) -> float:
         JunkError: It is not a number.
     """
     with path.open("rb") as file:
-        text = file.read(LONGEST_BYTES)
+        text = file.read(MAX_BYTES)
     try:
         return number(text.decode("ascii"))
     except ValueError:  # UnicodeDecodeError is one

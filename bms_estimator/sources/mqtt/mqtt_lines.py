@@ -21,9 +21,9 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 
-MOST_WAITING = 2000
+MAX_WAITING = 2000
 """Maximum number of unread messages: a broker sends all retained messages of a wildcard at once."""
-MOST_BYTES = 65_536
+MAX_BYTES = 65_536
 """Maximum size of a battery's message [bytes]."""
 
 log = structlog.get_logger(__name__)
@@ -58,7 +58,7 @@ class MqttReports(LineProducer):
         self._connect = connect or BrokerConnector(mqtt)
         self._conflicting = False
         self._lost: Counter[str] = Counter({"too_long": 0, "overflow": 0})
-        self._hello = ConnectOptions(f"bms-source-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
+        self._hello = ConnectOptions(f"bms-source-{secrets.token_hex(4)}", None, self._lose, MAX_WAITING, MAX_BYTES)
 
     @property
     def name(self) -> str:

@@ -12,7 +12,7 @@ from bms_estimator.settings.mqtt_source import ValueLocation
 
 SHOWN = 40
 """Maximum number of characters of an invalid number that are shown."""
-MOST_CELLS = 400
+MAX_CELLS = 400
 """A path or topic may name no cell beyond."""
 CELL = re.compile(r"\{cell\}")
 
@@ -70,7 +70,7 @@ def _cells(value: Any, path: str) -> Iterator[tuple[int, Any]]:
         listed = _found(value, path)
         if not isinstance(listed, list):
             raise InvalidValueError(f"{path or 'payload'}: no list of cells: {_shown(listed)}")
-        yield from enumerate(listed[:MOST_CELLS], start=1)
+        yield from enumerate(listed[:MAX_CELLS], start=1)
         return
     *above, begin = before.split(".")
     end, *below = after.split(".")
@@ -79,7 +79,7 @@ def _cells(value: Any, path: str) -> Iterator[tuple[int, Any]]:
     pattern = cell_pattern(f"{begin}{{cell}}{end}")
     for key in keys:
         match = pattern.fullmatch(key)
-        if match and 1 <= int(match[1]) <= MOST_CELLS:
+        if match and 1 <= int(match[1]) <= MAX_CELLS:
             yield int(match[1]), _found(among[key], ".".join(below))
 
 

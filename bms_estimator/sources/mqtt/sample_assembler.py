@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from bms_estimator.protocols.base.reading import sample_json_line
 from bms_estimator.settings.mqtt_source import MqttSource, ValueLocation
-from bms_estimator.sources.mqtt.payload_value import MOST_CELLS, InvalidValueError, cell_pattern, read_cells, read_value
+from bms_estimator.sources.mqtt.payload_value import MAX_CELLS, InvalidValueError, cell_pattern, read_cells, read_value
 from bms_estimator.sources.mqtt.publisher_conflict import MIN_JUMPS, PublisherConflict
 
 NEEDED = ("voltage", "current")
@@ -160,7 +160,7 @@ class SampleAssembler:
             self._cells |= {
                 number: _TimestampedValue(v, now_s) for number, v in read_cells(payload, way.place, way.path).items()
             }
-        elif 1 <= cell <= MOST_CELLS:
+        elif 1 <= cell <= MAX_CELLS:
             self._cells[cell] = _TimestampedValue(read_value(payload, way.place, way.path), now_s)
 
     def _drop(self, quantity: str, cell: int | None) -> None:

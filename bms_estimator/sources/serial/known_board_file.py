@@ -14,7 +14,7 @@ REMEMBERED = ("serial", "divider", "volts_per_ampere", "bandgap_v")
 NO_BOARD: Mapping[str, str] = dict.fromkeys(REMEMBERED, "")
 """Content of the file once another board is to be accepted."""
 _SERIAL = re.compile(r"([0-9a-f]{8})?")
-LONGEST_FILE = 4096
+MAX_FILE = 4096
 """Maximum size of the file [bytes]."""
 
 log = structlog.get_logger(__name__)
@@ -42,7 +42,7 @@ class KnownBoardFile:
     def load(self) -> Mapping[str, str]:
         """Load the stored board; empty if it is missing or not valid, which is logged."""
         try:
-            return _checked(json.loads(read_private(self.path, LONGEST_FILE)))
+            return _checked(json.loads(read_private(self.path, MAX_FILE)))
         except FileNotFoundError:
             return {}
         except (OSError, UnsafeFileError, ValueError, RecursionError) as error:

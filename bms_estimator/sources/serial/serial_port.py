@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import structlog
 
 from bms_estimator.model.clock import since_boot
-from bms_estimator.process.backoff import FIRST_RETRY_S, LONGEST_RETRY_S
+from bms_estimator.process.backoff import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.sources.serial.port_list import NoPortError, PortBusyError
 from bms_estimator.sources.source import Chunk
 
@@ -78,7 +78,7 @@ class SerialPort:
         """Path of the port as soon as it can be opened; each attempt waits longer until one was ``confirm``."""
         while True:
             await asyncio.sleep(self._retry_s)
-            self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
+            self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), MAX_RETRY_S)
             try:
                 path, self._port = self._open_next()
             except PortBusyError as error:  # the search for its holder takes time: samples of other packs must not wait

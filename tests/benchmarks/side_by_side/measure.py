@@ -30,7 +30,7 @@ WRONG_SOC, LEARNED_AT = 0.2, 0.1
 """Too low by so much: the SOC that a capture is entered with, that a method is told while it learns."""
 GROWN_BY = 0.5
 """R_s jumps by so much of itself."""
-LEAST_PULSES = 9
+MIN_PULSES = 9
 ROUNDS = 9
 TIMED_ROWS = 20_000
 
@@ -71,7 +71,7 @@ class Bench:
         self.right = at_temperature(cell_file(trial.recipe, folder), trial.temperature_c)
         self.starts = tuple(starts(self.right, trial.temperature_c))
         learned_from, tried_on = (pulse_resistance(b, self.capacity_ah) for b in (self.learn, self.first))
-        shown = learned_from if learned_from.ohm.size >= LEAST_PULSES else tried_on
+        shown = learned_from if learned_from.ohm.size >= MIN_PULSES else tried_on
         self.reference = Reference(trial.name, relaxations(self.learn, self.capacity_ah), shown)
         self.tried_on = tried_on
 
@@ -129,7 +129,7 @@ class Bench:
     def _jump(self, learned: Learned) -> float | None:
         """Minutes until R_s is right again; NaN where it was not before, None where nothing shows it."""
         pulses = self.tried_on
-        if pulses.ohm.size < LEAST_PULSES:
+        if pulses.ohm.size < MIN_PULSES:
             return None
         more_ohm = GROWN_BY * float(np.median(pulses.ohm))
         jumped, jump_s = with_jump(self.first, more_ohm)

@@ -29,7 +29,7 @@ from tests.benchmarks.baselines import fixed_ekf, joint_ekf, rls_arx, simulate_a
 Reader = Callable[[Estimator, CellModel], Floats]
 
 LOWEST_SOC = 0.1
-MOST_MV = 1e4
+MAX_MV = 1e4
 """A model that is off by more has run away."""
 WHOLE = 0.9
 """A prediction that ends before this part of the capture, since a learned capacitance is negative there, is none."""
@@ -92,7 +92,7 @@ class Elements:
         except UserError:
             return None
         rms_mv = 1e3 * _rms(error_v)
-        return rms_mv if error_v.size >= WHOLE * whole and rms_mv < MOST_MV else None
+        return rms_mv if error_v.size >= WHOLE * whole and rms_mv < MAX_MV else None
 
     def elements(self, soc: Floats) -> Floats:
         """As ``Learned``."""
@@ -196,7 +196,7 @@ class Arx:
         predicted_v = simulate_arx(self.coefficients, current_a)
         below = np.flatnonzero(soc < LOWEST_SOC)
         rms_mv = 1e3 * _rms((over_v - predicted_v)[: below[0] if below.size else soc.size])
-        return rms_mv if rms_mv < MOST_MV else None
+        return rms_mv if rms_mv < MAX_MV else None
 
     def elements(self, soc: Floats) -> Floats:
         """As ``Learned``: the same at each SOC."""

@@ -16,8 +16,8 @@ from bms_estimator.model.arrays import Floats
 from tests.benchmarks.pulses import AROUND, pulses
 from tests.benchmarks.side_by_side.trials import Block
 
-LEAST_REST_S, WINDOW_S = 600.0, 1200.0
-LEAST_MOVED = 0.02
+MIN_REST_S, WINDOW_S = 600.0, 1200.0
+MIN_MOVED = 0.02
 """Part of the capacity that the load before has moved: a pulse of seconds leaves the slow branch alone."""
 LOWEST_SOC = 0.1
 FIRST = (0.01, 0.3)
@@ -26,9 +26,9 @@ RANGE = (1.0, 3.0)
 """Time constants are from so many seconds to so many windows."""
 APART = 2.5
 """Two time constants that are nearer are one."""
-LEAST_SIZE = 3.0
+MIN_SIZE = 3.0
 """Each exponential is larger than so many RMS of what the fit leaves."""
-LEAST_RESOLUTION_V = 3e-4
+MIN_RESOLUTION_V = 3e-4
 """No fit leaves less [V]."""
 
 
@@ -58,10 +58,10 @@ def relaxations(block: Block, capacity_ah: float) -> Relaxations:
     for first, end in rests:
         time_s = samples["time_s"][first:end] - samples["time_s"][first - 1]
         moved = abs(soc_before - float(block.soc[first]))
-        if time_s[-1] < LEAST_REST_S:
+        if time_s[-1] < MIN_REST_S:
             continue
         soc_before = float(block.soc[end - 1])
-        if moved > LEAST_MOVED and soc_before > LOWEST_SOC:
+        if moved > MIN_MOVED and soc_before > LOWEST_SOC:
             taus = two_exponentials(time_s, samples["voltage_v"][first:end])
             found += [(soc_before, *taus)] if taus else []
     return Relaxations(*np.array(found).reshape(-1, 3).T)
@@ -92,10 +92,10 @@ def two_exponentials(time_s: Floats, voltage_v: Floats) -> tuple[float, float] |
     )
     sizes, left = solved(fit.x)
     (short, short_v), (long, long_v) = sorted(zip(np.exp(fit.x), sizes[1:], strict=True))
-    rms_v = max(float(np.sqrt(left @ left / (weight @ weight))), LEAST_RESOLUTION_V)
+    rms_v = max(float(np.sqrt(left @ left / (weight @ weight))), MIN_RESOLUTION_V)
     seen = min(short_v, long_v) * np.sign(short_v + long_v)
     same_sign = short_v * long_v > 0.0
-    if not same_sign or abs(seen) < LEAST_SIZE * rms_v or long < APART * short or long > 0.99 * RANGE[1] * window_s:
+    if not same_sign or abs(seen) < MIN_SIZE * rms_v or long < APART * short or long > 0.99 * RANGE[1] * window_s:
         return None
     return float(short), float(long)
 

@@ -32,7 +32,7 @@ REST_S = 900
 """Rest between two phases [s]."""
 TAIL_S = 4 * 3600
 """Longest drive after the charge [s]."""
-LONGEST_CHARGE_S = 8 * 3600
+MAX_CHARGE_S = 8 * 3600
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def capture(cycle: Cycle) -> tuple[SampleBlock, Floats]:
         room_c = np.full(current_a.size, 25.0)
         return current_a, *simulate(1.0, current_a, room_c, cycle.soc, -1.0, CAPACITY_AH, *curves, **limits)
 
-    current_a, _, _ = run(LONGEST_CHARGE_S)
+    current_a, _, _ = run(MAX_CHARGE_S)
     current_a, voltage_v, soc = run(int(np.count_nonzero(current_a[: -REST_S - TAIL_S] < 0.0)))
     empty = np.flatnonzero((soc < EMPTY_SOC) & (np.arange(soc.size) > soc.argmax()))
     end = int(empty[0]) if empty.size else soc.size

@@ -6,10 +6,10 @@ import numpy as np
 
 from bms_estimator.model.arrays import Floats
 
-LONGEST_S = 60.0
+MAX_S = 60.0
 """A pause counts as no longer."""
 LOWEST_SOC = 0.05
-LEAST_ROWS = 10
+MIN_ROWS = 10
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ def score(time_s: Floats, soc: Floats, soc_std: Floats, truth: Floats, after_s: 
         None where that leaves too little.
     """
     judged = (time_s - time_s[0] >= after_s) & (truth >= LOWEST_SOC)
-    weight = np.clip(np.diff(time_s, append=time_s[-1]), 0.0, LONGEST_S)[judged]
-    if judged.sum() < LEAST_ROWS or weight.sum() == 0.0:
+    weight = np.clip(np.diff(time_s, append=time_s[-1]), 0.0, MAX_S)[judged]
+    if judged.sum() < MIN_ROWS or weight.sum() == 0.0:
         return None
     weight /= weight.sum()
     error, std = (soc - truth)[judged], soc_std[judged]

@@ -31,7 +31,7 @@ LIMITS = {
     "generic lfp": (2.7, 4.0),
 }
 """Mean RMSE and mean std of all draws [%]."""
-LEAST_COVER = 95.0
+MIN_COVER = 95.0
 """Mean share of time inside two std [%]."""
 
 
@@ -40,7 +40,7 @@ def test_the_band_is_true_on_other_draws(name: str) -> None:
     case = next(c for c in CASES if c.name == name)
     scores = [row.score for row in rows([replace(case, seed=seed) for seed in SEEDS])]
     rmse, std = LIMITS[name]
-    assert np.mean([score.cover for score in scores]) >= LEAST_COVER
+    assert np.mean([score.cover for score in scores]) >= MIN_COVER
     assert np.mean([score.rmse for score in scores]) <= rmse
     assert np.mean([score.std for score in scores]) <= std
 

@@ -40,7 +40,7 @@ module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 
 PARTITIONS = 8
 STEP_S = 0.05
-MOST_BYTES = 60_000
+MAX_BYTES = 60_000
 """Of all that a browser is given."""
 PACKS = [
     Pack("home-1", HOME, state(soc=0.653, soc_std=0.012, stability_margin=0.6)),
@@ -275,7 +275,7 @@ async def test_it_is_answered_under_names_of_ours_alone(fleet: Fleet) -> None:
 
 def test_all_that_a_browser_is_given_is_small_and_comes_from_here() -> None:
     assert {file.path for file in FILES.values()} >= set(STATIC.iterdir())
-    assert sum(file.path.stat().st_size for file in FILES.values()) <= MOST_BYTES
+    assert sum(file.path.stat().st_size for file in FILES.values()) <= MAX_BYTES
     own = [path.read_text() for path in STATIC.iterdir()]
     assert not any("http://" in text or "https://" in text for text in own)
 

@@ -36,7 +36,7 @@ HELLO = Hello(
     ntc_r25_ohm=10_000,
     ntc_beta_k=3950,
 ).encode()
-LONGEST_PACKET = 64
+MAX_PACKET = 64
 COUNTED = ("crc_errors", "cobs_errors", "length_errors", "version_errors", "type_errors")
 
 
@@ -55,7 +55,7 @@ def slowly(data: bytes) -> list[bytes]:
             packet = cobs.decode(frame)
         except cobs.DecodeError:
             continue
-        if len(packet) >= 4 and len(frame) <= LONGEST_PACKET + 2:
+        if len(packet) >= 4 and len(frame) <= MAX_PACKET + 2:
             (crc,) = struct.unpack("<H", packet[-2:])
             if binascii.crc_hqx(packet[:-2], 0xFFFF) == crc:
                 packets.append(packet[:-2])

@@ -30,7 +30,7 @@ from bms_estimator.protocols.firmware.messages import (
 )
 
 VECTORS = json.loads((Path(__file__).parents[3] / "firmware" / "test_vectors.json").read_text())
-LONGEST_FRAME = 66
+MAX_FRAME = 66
 COMMANDS: dict[str, Callable[..., bytes]] = {
     "hello": hello_command,
     "zero_current": zero_current_command,
@@ -75,7 +75,7 @@ def test_a_command_is_encoded_byte_for_byte(vector: Vector) -> None:
 @pytest.mark.parametrize("vector", VECTORS["bad_frames"], ids=name)
 def test_a_bad_frame_is_refused_by_codec_and_decoder(vector: Vector) -> None:
     frame = bytes.fromhex(vector["frame"])
-    if len(frame) <= LONGEST_FRAME:  # the length of a message is checked once its type is known
+    if len(frame) <= MAX_FRAME:  # the length of a message is checked once its type is known
         with pytest.raises(ProtocolError):
             unseal(frame)
     decoder = FrameDecoder()

@@ -15,7 +15,7 @@ import structlog
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.settings.exports import InfluxSettings
-from bms_estimator.sinks.exports.influx import BATCH, MOST_WAITING, InfluxSink
+from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink
 from bms_estimator.sinks.exports.line_protocol import lines
 from tests.influxdb import INFLUXD, InfluxDB
 from tests.sinks.service import until
@@ -149,9 +149,9 @@ async def test_what_waits_is_bounded_and_goes_out_in_batches(server: Any) -> Non
     async with sink(server.url) as writing:
         writing.publish(at(0))
         await until(lambda: server.asked)
-        for second in range(1, MOST_WAITING + 2 * BATCH):
+        for second in range(1, MAX_WAITING + 2 * BATCH):
             writing.publish(at(second % 3600))
-        assert writing.waiting <= MOST_WAITING + BATCH
+        assert writing.waiting <= MAX_WAITING + BATCH
         assert writing.dropped >= BATCH - 1
         server.answers = [(204, b"")]
         await until(lambda: not writing.waiting)

@@ -27,7 +27,7 @@ def described(found: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 COMPONENTS = described(discovery(HOME, DiscoveryInputs(ONE.info), ROOT, 0.0))
 SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
-MOST_ROWS_PER_MIN = 20
+MAX_ROWS_PER_MIN = 20
 
 
 OF_STACK = described(discovery(HOME, DiscoveryInputs(STACK.info), ROOT, 0.0))
@@ -118,13 +118,13 @@ def test_home_assistant_records_at_most_20_rows_in_any_minute(
     )
     written = np.array(rows(stream(900.0), components))
     assert written.size > 100
-    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
+    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MAX_ROWS_PER_MIN
 
 
 def test_a_fuel_cell_makes_no_more() -> None:
     written = np.array(rows(restless(900.0, one=STACK), OF_STACK))
     assert written.size > 100
-    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
+    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MAX_ROWS_PER_MIN
 
 
 def test_of_a_fuel_cell_home_assistant_shows_what_it_has_and_what_is_learned() -> None:

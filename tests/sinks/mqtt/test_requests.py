@@ -14,7 +14,7 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.sinks.mqtt.requests import (
     COMMANDS_PER_MIN,
     LOG_S,
-    MOST_PAYLOAD_BYTES,
+    MAX_PAYLOAD_BYTES,
     NAMES,
     READS_PER_MIN,
     RequestDispatcher,
@@ -101,8 +101,8 @@ async def test_a_name_that_does_not_exist_gets_no_response_and_is_counted(name: 
 
 async def test_a_payload_of_more_than_4_kb_is_refused_unread() -> None:
     asked = Asked()
-    padded = b'{"x": 1}' + b" " * MOST_PAYLOAD_BYTES
-    assert (await asked("state", padded[:MOST_PAYLOAD_BYTES]))["status"] == "ok"
+    padded = b'{"x": 1}' + b" " * MAX_PAYLOAD_BYTES
+    assert (await asked("state", padded[:MAX_PAYLOAD_BYTES]))["status"] == "ok"
     assert "4096 bytes" in (await asked("state", padded))["error"]
 
 

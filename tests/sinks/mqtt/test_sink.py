@@ -19,9 +19,9 @@ from bms_estimator.mqtt.connection import Connection, ConnectOptions
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
-from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING, ReceiveQueue
+from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING, ReceiveQueue
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.backoff import LONGEST_DELAY_S
+from bms_estimator.process.backoff import MAX_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.availability import CORRECTION_S
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
@@ -33,7 +33,7 @@ from tests.patience import LONG_S
 from tests.sinks.service import Sink, until
 from tests.sinks.snapshots import ONE, snapshot
 
-MOST_KEPT = 4
+MAX_KEPT = 4
 AT_START = len(events(None, ONE))
 RETAINED = ("info", "availability", "sensor/availability", "schema", "health")
 DISCOVERY = "homeassistant/device/bms_pack/config"
@@ -90,7 +90,7 @@ async def test_a_broker_that_comes_late_goes_and_comes_back_is_served_and_drops_
     async with Sink(broker.url) as sink:
         for _ in range(5):
             sink.mqtt.publish(ONE)
-        assert (sink.delivery.drops, sink.delivery.waiting) == (AT_START + 5 - MOST_KEPT, MOST_KEPT)
+        assert (sink.delivery.drops, sink.delivery.waiting) == (AT_START + 5 - MAX_KEPT, MAX_KEPT)
         for _ in range(2):  # persistence is off: each start has forgotten everything
             broker.start()
             try:
@@ -109,7 +109,7 @@ async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_
     async with Sink(broker.url) as sink:
         for _ in range(1000):
             sink.mqtt.publish(ONE)
-    assert sink.delivery.drops == AT_START + 1000 - MOST_KEPT
+    assert sink.delivery.drops == AT_START + 1000 - MAX_KEPT
 
 
 async def test_a_connection_that_comes_after_it_was_given_up_leaves_nothing_to_the_loop(broker: Broker) -> None:
@@ -134,7 +134,7 @@ async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path:
 
     settings = MqttSettings(url=Broker(tmp_path).url)
     await Impatient(brokers(settings), HELLO, BrokerConnector(settings), never, DeliveryStats()).run()
-    assert max(pauses) <= LONGEST_DELAY_S == 30.0
+    assert max(pauses) <= MAX_DELAY_S == 30.0
     assert pauses[0] <= 5.0 < pauses[3]
     assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"
 
@@ -262,9 +262,9 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
             await live.publish("bms/pack/request/current_zero", qos=1)
             for _ in range(20):
                 await live.publish("bms/pack/request/state", b"x" * 1_000_000, qos=1)
-            for _ in range(3 * MOST_WAITING):
+            for _ in range(3 * MAX_WAITING):
                 await live.publish("bms/pack/request/state", b"x" * 4000, qos=1)
-            await until(lambda: sink.delivery.requests["overflow"] > MOST_WAITING)
+            await until(lambda: sink.delivery.requests["overflow"] > MAX_WAITING)
             gate.set()
             await live.wait("bms/pack/response/current_zero")
         assert len(logs) < 10
@@ -275,13 +275,13 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
 
 def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
     delivery = DeliveryStats()
-    inbox = ReceiveQueue(RequestDispatcher(delivery).count_refusal, MOST_BYTES, MOST_WAITING)
-    for length in (MOST_BYTES - 1, 200_000_000) * (2 * MOST_WAITING):
-        payload = bytes(1) * min(length, 2 * MOST_BYTES)
+    inbox = ReceiveQueue(RequestDispatcher(delivery).count_refusal, MAX_BYTES, MAX_WAITING)
+    for length in (MAX_BYTES - 1, 200_000_000) * (2 * MAX_WAITING):
+        payload = bytes(1) * min(length, 2 * MAX_BYTES)
         inbox.put_nowait(aiomqtt.Message("t", payload, 1, retain=False, mid=1, properties=None))
     waiting = [inbox.get_nowait() for _ in range(inbox.qsize())]
-    assert sum(len(message.payload) for message in waiting) <= MOST_WAITING * MOST_BYTES
-    assert delivery.requests == {"too_long": 2 * MOST_WAITING, "overflow": MOST_WAITING}
+    assert sum(len(message.payload) for message in waiting) <= MAX_WAITING * MAX_BYTES
+    assert delivery.requests == {"too_long": 2 * MAX_WAITING, "overflow": MAX_WAITING}
 
 
 async def test_a_fault_of_ours_is_offline_for_the_broker_and_raised(broker: Broker) -> None:
@@ -416,7 +416,7 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
     async with (
         Listener(secure_broker, "bms/#", username="meter", password="s3cret", tls_params=tls) as live,
         MqttSink(
-            settings, "pack", RequestDispatcher(DeliveryStats()), DeliveryStats(), Outbox(None, most=MOST_KEPT)
+            settings, "pack", RequestDispatcher(DeliveryStats()), DeliveryStats(), Outbox(None, most=MAX_KEPT)
         ) as mqtt,
     ):
         mqtt.publish(ONE)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from bms_estimator.settings.modbus_source import MOST_WORDS, PROFILES, CellRegisters, ModbusSource, Register
+from bms_estimator.settings.modbus_source import MAX_WORDS, PROFILES, CellRegisters, ModbusSource, Register
 from bms_estimator.sources.fieldbus.modbus_registers import GAP_WORDS, Value, decode, plan, reading_of, split, values_of
 
 FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
@@ -48,14 +48,14 @@ def test_requests_bring_every_register_once_and_none_is_too_long(wanted: list[tu
     requests = plan(values)
     assert sorted((v for request in requests for v in request.values), key=repr) == sorted(values, key=repr)
     for request in requests:
-        assert 1 <= request.words <= MOST_WORDS
+        assert 1 <= request.words <= MAX_WORDS
         for value in request.values:
             assert value.register.table == request.table
             assert request.address <= value.register.address
             assert value.register.address + value.register.words <= request.address + request.words
     for one, next_ in itertools.pairwise(requests):
         near = next_.table == one.table and next_.address <= one.address + one.words + GAP_WORDS
-        assert not near or next_.address + 2 - one.address > MOST_WORDS - 1
+        assert not near or next_.address + 2 - one.address > MAX_WORDS - 1
 
 
 def test_a_known_device_is_asked_in_as_few_requests_as_possible() -> None:

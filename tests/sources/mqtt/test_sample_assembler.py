@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.mqtt.payload_value import MOST_CELLS, InvalidValueError, read_cells, read_value
+from bms_estimator.sources.mqtt.payload_value import MAX_CELLS, InvalidValueError, read_cells, read_value
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 
 Messages = list[tuple[str, str]]
@@ -206,10 +206,10 @@ def test_paths_units_scales_and_times(where: dict[str, Any], payload: str, sampl
 
 def test_a_pack_with_as_many_cells_as_are_taken_is_a_sample_of_the_dialect() -> None:
     assembly, decoder = SampleAssembler(own(cells="c")), TextProtocol()
-    payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MOST_CELLS})
+    payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELLS})
     assembly.take("home/pack", payload.encode(), 0.0, retained=False)
     assert decoder.feed(0.0, assembly.line(0.0)).size == 1
-    assert decoder.cells.shape == (1, MOST_CELLS)
+    assert decoder.cells.shape == (1, MAX_CELLS)
 
 
 def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ever() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
-from bms_estimator.protocols.firmware.framing import LONGEST_DOUBT_S
+from bms_estimator.protocols.firmware.framing import MAX_DOUBT_S
 from bms_estimator.protocols.firmware.messages import Hello, hello_command
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.settings.sensor import SensorSettings
@@ -87,8 +87,8 @@ def test_a_board_that_tells_nothing_is_taken_after_a_while_and_the_gap_is_told()
     """Its line may have no way back: it cannot be asked."""
     decoder, board = ours(), Running(1, 6.1, 100, 900.0)
     taken = fed(decoder, BEGIN_S + 2.0, board.frames(1000))
-    assert taken.size == decoder.counters.frames_received - 100 == 1000 - LONGEST_DOUBT_S / PERIOD_S
-    assert decoder.counters.before_hello == LONGEST_DOUBT_S / PERIOD_S
+    assert taken.size == decoder.counters.frames_received - 100 == 1000 - MAX_DOUBT_S / PERIOD_S
+    assert decoder.counters.before_hello == MAX_DOUBT_S / PERIOD_S
     assert decoder.hello is None
     lost = ours()
     taken = fed(lost, BEGIN_S + 2.0, Running(1, 6.1, 50_000, 900.0).frames(1000))
