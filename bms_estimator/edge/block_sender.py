@@ -174,7 +174,7 @@ class BlockSender:
                 self._refusals.deny(topic, f"not allowed to read it: {why}")
             async with asyncio.TaskGroup() as tasks:
                 others = [
-                    tasks.create_task(self._hear(connection)),
+                    tasks.create_task(self._receive(connection)),
                     tasks.create_task(self._sending.send(connection)),
                 ]
                 await self._link.closing.wait()
@@ -186,7 +186,7 @@ class BlockSender:
         finally:
             self._refusals.end()
 
-    async def _hear(self, connection: Connection) -> None:
+    async def _receive(self, connection: Connection) -> None:
         while True:
             message = await connection.receive()
             try:

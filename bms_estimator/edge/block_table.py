@@ -84,7 +84,7 @@ class StoreTransaction:
 
     def __call__(self, connection: sqlite3.Connection) -> StoreResult:
         """Do it."""
-        kept = _kept(connection)
+        kept = _stored_state(connection)
         if kept is None or kept.made_s < self.known_s or kept.made_s <= self.after_s:
             kept = self._begin(connection)
         else:
@@ -148,7 +148,7 @@ class Read:
         return Page(blocks[0][0] if blocks else first, blocks)
 
 
-def _kept(connection: sqlite3.Connection) -> StoreState | None:
+def _stored_state(connection: sqlite3.Connection) -> StoreState | None:
     """Read the existing store; None if it is not valid."""
     row = connection.execute("SELECT made_s, next, last_s, bytes, run, taken FROM store").fetchone()
     if row is None or [*map(type, row)] != [int, int, float, int, str, int]:

@@ -46,7 +46,7 @@ class DeniedTopics:
     def deny(self, topic: str, why: str) -> None:
         """Record that a topic is denied."""
         self._denied[topic] = None
-        self._say("broker refuses a topic; see its access list", topic, why)
+        self._log("broker refuses a topic; see its access list", topic, why)
 
     def allow(self, topic: str) -> None:
         """Record that a topic is allowed."""
@@ -57,7 +57,7 @@ class DeniedTopics:
         """Record that the broker accepted or rejected a message."""
         if refusal is not None and refusal.is_retryable:
             self._for_now[message.topic] = None
-            self._say("broker refuses a topic for now; it is tried again", message.topic, refusal.why)
+            self._log("broker refuses a topic for now; it is tried again", message.topic, refusal.why)
             if message.retain and self._again is None:
                 self._again = asyncio.get_running_loop().call_later(self._pauses.next_s(), self._due)
             return
@@ -73,7 +73,7 @@ class DeniedTopics:
         self._again = None
         self._say_again()
 
-    def _say(self, event: str, topic: str, why: str) -> None:
+    def _log(self, event: str, topic: str, why: str) -> None:
         """Report denied topics in log and health."""
         self._show()
         if topic not in self._said:

@@ -73,10 +73,10 @@ class ReconnectLoop:
                 await self._serve(connection)
         except* BrokerConnectionError as errors:
             self._delivery.losses += since_s is not None
-            self._say(broker, "broker not reachable" if since_s is None else "broker lost", errors)
+            self._log_loss(broker, "broker not reachable" if since_s is None else "broker lost", errors)
         return since_s is not None and loop.time() - since_s >= MIN_CONNECTION_S
 
-    def _say(self, broker: Broker, event: str, errors: BaseException) -> None:
+    def _log_loss(self, broker: Broker, event: str, errors: BaseException) -> None:
         """Log why; an absent broker would give the same line each half minute for days."""
         while isinstance(errors, BaseExceptionGroup):
             errors = errors.exceptions[0]

@@ -123,23 +123,23 @@ class Subscriber:
         """Receive until the connection is lost or the subscriber closes."""
         for topic, why in (await connection.subscribe(self._topic, [])).items():
             raise BrokerConnectionError(f"not allowed to read {topic}: {why}")
-        self._say_link(None)
+        self._report_link(None)
         try:
             async with asyncio.TaskGroup() as tasks:
-                hearing = tasks.create_task(self._hear(connection))
+                hearing = tasks.create_task(self._receive(connection))
                 await self._link.closing.wait()
                 hearing.cancel()
         finally:
-            self._say_link(self._clock.wall())
+            self._report_link(self._clock.wall())
 
-    async def _hear(self, connection: Connection) -> None:
+    async def _receive(self, connection: Connection) -> None:
         while True:
             message = await connection.receive()
             heard = self._published.take(message.topic, message.payload, self._clock.wall())
             if heard is not None:
                 self._heard(heard)
 
-    def _say_link(self, lost_since: float | None) -> None:
+    def _report_link(self, lost_since: float | None) -> None:
         self._lost_since = lost_since
         self._linked()
 

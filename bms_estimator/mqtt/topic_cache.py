@@ -96,9 +96,9 @@ class TopicCache:
             return None
         if not payload:
             return self._forget(name, rest)
-        return self._keep(name, rest, payload, now_s)
+        return self._store(name, rest, payload, now_s)
 
-    def _keep(self, name: str, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
+    def _store(self, name: str, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
         value = parsed(payload)
         raised = topic.startswith(ALARM) and isinstance(value, dict) and value.get("active") is True
         device = self.devices.get(name) or DeviceTopics()

@@ -83,12 +83,12 @@ class AlarmMonitor:
         self.alarms.on_silence(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
         if (hooks := self._hooks()) is not None:
             self.alarms.judge_hooks(hooks.failing, passed_s, self._clock.wall())
-        self._tell()
+        self._report_changes()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Acknowledge an alarm, or all with None. Return the acknowledged ones."""
         known = self.alarms.acknowledge(name)
-        self._tell()
+        self._report_changes()
         return known
 
     def _counts(self) -> SampleCounts:
@@ -97,7 +97,7 @@ class AlarmMonitor:
         lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
         return SampleCounts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))
 
-    def _tell(self) -> None:
+    def _report_changes(self) -> None:
         for change in self.alarms.changes():
             alarm = change.alarm
             if change.turn == "watched":

@@ -71,19 +71,19 @@ class SimulatedNode:
 
     async def _serve(self, connection: Connection) -> None:
         """While the broker is there."""
-        await self._say(connection, {"status": "online"})
+        await self._publish(connection, {"status": "online"})
         loop = asyncio.get_running_loop()
         offset_s = loop.time() - self.time_s / self._speed
         while self.time_s + INTERVAL_S <= self._end_s:
             await asyncio.sleep(max(offset_s + (self.time_s + INTERVAL_S) / self._speed - loop.time(), 0.0))
             self.time_s += INTERVAL_S
             said = {f"sensor/{self._prefix}_{name}/state": text for name, text in self._states()}
-            await self._say(connection, said)
+            await self._publish(connection, said)
             self.samples += 1
-        await self._say(connection, {"status": "offline"})
+        await self._publish(connection, {"status": "offline"})
         self._link.closing.set()
 
-    async def _say(self, connection: Connection, states: Mapping[str, str]) -> None:
+    async def _publish(self, connection: Connection, states: Mapping[str, str]) -> None:
         """Each on its topic, retained as ESPHome does."""
         for topic, text in states.items():
             await connection.publish(Message(f"{self._prefix}/{topic}", text.encode(), 0, retain=True))

@@ -84,7 +84,7 @@ class SimulatedMeter(ABC):
             while (now_s := (loop.time() - start_s) * self._speed) < seconds:
                 if now_s >= due_s:
                     due_s += self.period_s
-                    self._tell(now_s)
+                    self._report(now_s)
                 if inbox:
                     said, understood = self.answer(bytes(inbox), self._read(now_s))
                     del inbox[:understood]
@@ -99,7 +99,7 @@ class SimulatedMeter(ABC):
         finally:
             loop.remove_reader(self._master)
 
-    def _tell(self, now_s: float) -> None:
+    def _report(self, now_s: float) -> None:
         if math.isfinite(self.period_s):
             self.send(self.message(self._read(now_s)))
 

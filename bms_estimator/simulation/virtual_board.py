@@ -178,7 +178,7 @@ class VirtualBoard:
     async def run(self, seconds: float = math.inf) -> None:
         """Sample and send for ``seconds`` of the board's time, or until the signal ends."""
         self._loop = loop = asyncio.get_running_loop()
-        loop.add_reader(self._master, self._hear)
+        loop.add_reader(self._master, self._receive)
         try:
             await self._sample_until(self.time_s + seconds, loop)
             with contextlib.suppress(TimeoutError):
@@ -356,7 +356,7 @@ class VirtualBoard:
             ntc_beta_k=parts.ntc_beta_k,
         )
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         """Bytes of the host."""
         with contextlib.suppress(BlockingIOError):
             self._inbox += os.read(self._master, 4096)
@@ -388,11 +388,11 @@ class VirtualBoard:
         elif kind == MessageType.COMMAND_SET_RELAY and len(body) == 4:
             self._set_relay(*struct.unpack("<I", body))
         elif kind in self._kept and len(body) == 4:
-            self._keep(MessageType(kind), *struct.unpack("<I", body))
+            self._store(MessageType(kind), *struct.unpack("<I", body))
         else:
             self._answer(kind, AckResult.UNKNOWN_COMMAND, 0)
 
-    def _keep(self, kind: MessageType, value: int) -> None:
+    def _store(self, kind: MessageType, value: int) -> None:
         """Take a number if it is in its range."""
         good = value in _RANGES[kind]
         if good:

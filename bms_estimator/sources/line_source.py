@@ -189,7 +189,7 @@ class LineSource:
             except (SourceUnavailableError, OSError) as error:
                 reason = str(error)
             self._connected = False
-            self._say(f"{self._bringer.name}: {reason}; trying again")
+            self._report(f"{self._bringer.name}: {reason}; trying again")
 
     async def _pause(self) -> None:
         """Each one is longer until a sample arrives."""
@@ -211,11 +211,11 @@ class LineSource:
             self._tended_s = now_s = self._monotonic()
             if self._connected and now_s - self._heard_s >= self._silent_s:
                 why = self._bringer.fault or self._decoder.fault or "connected, but silent"
-                self._say(f"{self._bringer.name}: {why}")
+                self._report(f"{self._bringer.name}: {why}")
             self._faults.check(self.counters, now_s)
             await asyncio.sleep(self._look_s)
 
-    def _say(self, message: str) -> None:
+    def _report(self, message: str) -> None:
         """Report why no samples arrive; in the log once for each reason, until samples arrive."""
         if message != self._said:
             log.warning("no samples", reason=message)

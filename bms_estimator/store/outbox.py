@@ -75,7 +75,7 @@ class Outbox:
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
         self._queue.put(message)
-        self._tell()
+        self._update_counts()
 
     async def take(self, most: int) -> list[QueuedMessage]:
         """Wait until there is a message, and hand out up to ``most`` of the oldest that were not since ``rewind``."""
@@ -94,9 +94,9 @@ class Outbox:
     def rewind(self) -> None:
         """Hand out again, in order, all messages that were not acknowledged, after a connection was lost."""
         self._queue.rewind()
-        self._tell()
+        self._update_counts()
 
-    def _tell(self) -> None:
+    def _update_counts(self) -> None:
         if self._opened and self._queue.can_hand_out:
             self._filled.set()
 
@@ -141,7 +141,7 @@ class Outbox:
         except StoreError:
             queue.disk_state_known, queue.skip_disk = False, True
         self._opened = True
-        self._tell()
+        self._update_counts()
 
     def _due(self, offset: int, *, write: bool) -> OutboxTransaction:
         queue, stored = self._queue, self._queue.stored

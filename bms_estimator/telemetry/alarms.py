@@ -144,7 +144,7 @@ class AlarmEvaluator:
             self._judge_share(float(samples["time_s"][-1]), counts, suspects, wall_s)
         if trace.size:
             self._judge_estimates(trace, suspects, arrival_s - float(trace["time_s"][-1]))
-        self._keep()
+        self._save_state()
 
     def on_silence(self, silent_s: float, now_s: float, reason: str) -> None:
         """Handle missing samples.
@@ -158,17 +158,17 @@ class AlarmEvaluator:
         if (silent_s >= self._silent_s or goes_on) != bool(self._silence):
             self._silence = "" if self._silence else reason or "no samples come"
             self._see(self._at_s)
-            self._keep()
+            self._save_state()
         state = self._states.get("link_lost")
         if state is None or silent_s < state.watched.limit:
             return
         if state.cause_cleared:  # it latches, and is back
             state.cause_cleared = False
-            self._keep()
+            self._save_state()
         if state.raising is None:
             self._reasons["link_lost"] = Reasons(InputFault(0), (reason,) if reason else ())
             self._note(state, state.raise_at(self._at_s, RaisedAlarm(now_s, silent_s)))
-            self._keep()
+            self._save_state()
 
     def judge_hooks(self, failing: Sequence[str], passed_s: float, now_s: float) -> None:
         """Judge the alarm ``hook_failed``.
@@ -182,7 +182,7 @@ class AlarmEvaluator:
             self._reasons["hook_failed"] = Reasons(InputFault(0), tuple(failing))
         value = np.array([math.inf if failing else 0.0])  # this alarm publishes no value
         self._take("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
-        self._keep()
+        self._save_state()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Acknowledge an alarm, or all. Return the acknowledged ones; those whose cause has ended end now.
@@ -194,7 +194,7 @@ class AlarmEvaluator:
         for state in found:
             if state.acknowledge():
                 self._changes.append(Change(self._at_s, self._alarm(state)))
-        self._keep()
+        self._save_state()
         return [state.watched.name for state in found]
 
     def names(self) -> tuple[AlarmName, ...]:
@@ -245,7 +245,7 @@ class AlarmEvaluator:
                 raise ValueError(f"{name}: value = {value}")
             raising = RaisedAlarm(since_s, None if value is None else float(value))
             state.restore(raising, gone=bool(told["gone"]), acknowledged=bool(told["acknowledged"]))
-        self._keep()
+        self._save_state()
 
     def _judge_samples(self, samples: SampleBlock, extremes_v: Floats, wall_s: float) -> None:
         times_s, lowest_v, highest_v = samples["time_s"], extremes_v[:, 0], extremes_v[:, 1]
@@ -377,7 +377,7 @@ class AlarmEvaluator:
         names = ", ".join(name for name in self._unwatched if quantity in NEEDED.get(name, ()))
         return f"{LOST[quantity]}: {names} cannot be raised" if names else LOST[quantity]
 
-    def _keep(self) -> None:
+    def _save_state(self) -> None:
         """Save the raised alarms, the lost quantities and the silence: a relay that has cut the load stays so over a restart."""
         kept: dict[str, Any] = {
             name: {**state.raising._asdict(), "gone": state.cause_cleared, "acknowledged": state.acknowledged}

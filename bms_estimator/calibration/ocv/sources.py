@@ -150,7 +150,7 @@ def find_sources(
     sources = [_of_slow(curve, slow_ah, known_ah) for curve in slow] + [_of_given(one, series_count) for one in curves]
     rests = [one for one in recordings if not branches[one.name]]
     found = _rests(rests, sources, every, known_ah, initial_soc, series_count)
-    telling = _telling(sources)
+    telling = _informative(sources)
     hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
     if telling is not None and telling.hysteresis_v is not None:
         share = _share(telling, found)
@@ -198,7 +198,7 @@ def _of_given(curve: ExternalCurve, series_count: int) -> Source:
     return Source(curve.name, f"given curve, {curve.soc.size} points", points, float("nan"), hysteresis_v, ())
 
 
-def _telling(sources: Sequence[Source]) -> Source | None:
+def _informative(sources: Sequence[Source]) -> Source | None:
     """Return the source nearest to 25 C that shows hysteresis."""
     telling = [source for source in sources if source.hysteresis_v is not None]
     return min(telling, key=lambda one: _from_reference(one.temperature_c), default=None)

@@ -47,7 +47,7 @@ def run(
     One process may serve several packs, each with its own source and broker connection.
     """
     paths = packs or [Path("pack.toml")]
-    told = partial(_told, port=port, mqtt=mqtt)
+    told = partial(_with_options, port=port, mqtt=mqtt)
     loaded = [(told(settings), cell) for settings, cell in map(load_pack, paths)]
     with startup_signals():
         if len(loaded) == 1:
@@ -58,7 +58,7 @@ def run(
             _run_several(loaded)
 
 
-def _told(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
+def _with_options(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
     """Return the settings with the command line's options."""
     if mqtt:
         settings = with_broker(settings, mqtt)

@@ -80,10 +80,10 @@ async def make_streams(
             "their number stays as it was made"
         )
     for stream in (_raw(partitions, raw_bytes, raw_age_s), _hours(raw_bytes), *_buckets()):
-        await _repeated(_keep, nc, stream | {"num_replicas": replicas})
+        await _repeated(_ensure_stream, nc, stream | {"num_replicas": replicas})
     numbers = range(partitions)
     for first in range(0, partitions, AT_ONCE):
-        await asyncio.gather(*(_repeated(_keep_consumer, nc, n, replicas) for n in numbers[first : first + AT_ONCE]))
+        await asyncio.gather(*(_repeated(_ensure_consumer, nc, n, replicas) for n in numbers[first : first + AT_ONCE]))
 
 
 async def partitions_of(nc: Client) -> int | None:
@@ -151,7 +151,7 @@ def _stream(name: str, *names: str, **more: Any) -> dict[str, Any]:
     return {"name": name, "subjects": list(names), "storage": "file", "retention": "limits", **more}
 
 
-async def _keep(nc: Client, stream: dict[str, Any]) -> None:
+async def _ensure_stream(nc: Client, stream: dict[str, Any]) -> None:
     answer = await _ask(nc, f"STREAM.UPDATE.{stream['name']}", stream)
     if answer.get("error", {}).get("err_code") == NO_SUCH_STREAM:
         answer = await _ask(nc, f"STREAM.CREATE.{stream['name']}", stream)
@@ -159,7 +159,7 @@ async def _keep(nc: Client, stream: dict[str, Any]) -> None:
         raise _refused(stream["name"], answer)
 
 
-async def _keep_consumer(nc: Client, partition: int, replicas: int) -> None:
+async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
     name = consumer(partition)
     config = {
         "durable_name": name,

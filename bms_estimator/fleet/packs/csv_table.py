@@ -143,7 +143,7 @@ class _Reader:
         place = columns.index("pack")
         name = values[place]
         if not re.fullmatch(DEVICE_NAME, name):
-            raise _RowError(_said("pack", name, "must be 1 to 64 letters, digits, _ and -"))
+            raise _RowError(_error_text("pack", name, "must be 1 to 64 letters, digits, _ and -"))
         key = (*values[:place], *values[place + 1 :])
         if key not in self._kinds:
             told = {column: value for column, value in zip(columns, values, strict=True) if value and column != "pack"}
@@ -166,26 +166,28 @@ class _Reader:
             if column not in told:
                 raise _RowError(f"column {column}: is empty; give {described}") from None
             message = detail["msg"].removeprefix("Value error, ")
-            raise _RowError(_said(column, told[column], f"{message} ({described})")) from None
+            raise _RowError(_error_text(column, told[column], f"{message} ({described})")) from None
 
     def _cell_file(self, value: str) -> str:
         """Return the name of the cell in a file."""
         path = self._path.parent / value
         name = path.name.removesuffix(CELL_FILE)
         if not path.is_file():
-            raise _RowError(_said("cell", value, f"no such file beside the table ({path})"))
+            raise _RowError(_error_text("cell", value, f"no such file beside the table ({path})"))
         if not re.fullmatch(DEVICE_NAME, name):
-            raise _RowError(_said("cell", value, "its name before .toml must be 1 to 64 letters, digits, _ and -"))
+            raise _RowError(
+                _error_text("cell", value, "its name before .toml must be 1 to 64 letters, digits, _ and -")
+            )
         if name in known_cells():
-            raise _RowError(_said("cell", value, f"{name} is a cell of the package; give the file another name"))
+            raise _RowError(_error_text("cell", value, f"{name} is a cell of the package; give the file another name"))
         if not self._files.setdefault(name, path).samefile(path):
-            raise _RowError(_said("cell", value, f"another file of this name is {self._files[name]}; rename one"))
+            raise _RowError(_error_text("cell", value, f"another file of this name is {self._files[name]}; rename one"))
         return name
 
 
 def _refuse_again(name: str, packs: Mapping[str, Line]) -> None:
     if name in packs:
-        raise _RowError(_said("pack", name, f"is on line {packs[name].number} already; take one away"))
+        raise _RowError(_error_text("pack", name, f"is on line {packs[name].number} already; take one away"))
 
 
 def _value(column: str, value: str) -> object:
@@ -193,11 +195,11 @@ def _value(column: str, value: str) -> object:
         return value
     if not _NUMBER.fullmatch(value):
         hint = ", with a point and not a comma" if "," in value else ""
-        raise _RowError(_said(column, value, f"must be a number{hint}"))
+        raise _RowError(_error_text(column, value, f"must be a number{hint}"))
     return int(value) if column in _WHOLE and value.isdecimal() else float(value)
 
 
-def _said(column: str, value: str, wrong: str) -> str:
+def _error_text(column: str, value: str, wrong: str) -> str:
     return f"column {column} = {value!r}: {wrong}"
 
 

@@ -102,31 +102,31 @@ class FleetFeed:
         """
         server, name = self._server, "bms-estimator fleet page"
         self._nc = await connect(server.urls, name, creds=server.creds, ca=server.ca, linked=self._on_link)
-        for subject, heard in self._heard().items():
+        for subject, heard in self._handlers().items():
             await self._nc.subscribe(subject, cb=heard)
         self._on_link(None)
         # no group of tasks: it cancels its own once only, and the library may swallow that
         await asyncio.gather(self._follow_table(self._nc), self._read_hours(self._nc))
 
-    def _heard(self) -> dict[str, Callable[[Msg], Coroutine[Any, Any, None]]]:
+    def _handlers(self) -> dict[str, Callable[[Msg], Coroutine[Any, Any, None]]]:
         view, clock = self._view, time.monotonic
 
         async def state(message: Msg) -> None:
             if len(message.data) <= MAX_BYTES:
-                view.packs.hear_state(_pack(message), message.data, clock())
+                view.packs.receive_state(_pack(message), message.data, clock())
 
         async def parameters(message: Msg) -> None:
             if len(message.data) <= MAX_BYTES:
-                view.packs.hear_parameters(_pack(message), message.data)
+                view.packs.receive_parameters(_pack(message), message.data)
 
         async def hour(message: Msg) -> None:
-            view.packs.hear_hour(_pack(message), message.data)
+            view.packs.receive_hour(_pack(message), message.data)
 
         async def worker(message: Msg) -> None:
-            view.hear_worker(message.data, clock())
+            view.receive_worker(message.data, clock())
 
         async def unknown(message: Msg) -> None:
-            view.hear_unknown(message.subject.rpartition(".")[2], message.data[:MAX_REASON].decode(errors="replace"))
+            view.receive_unknown(message.subject.rpartition(".")[2], message.data[:MAX_REASON].decode(errors="replace"))
 
         return {
             subjects.published("*", "state"): state,
@@ -157,7 +157,7 @@ class FleetFeed:
         async def read() -> None:
             async for batch in read_stream(nc, subjects.HOURS_STREAM, subjects.hours(), since_s=since_s):
                 for message in batch:
-                    self._view.packs.hear_hour(message.subject.split(".")[1], message.data)
+                    self._view.packs.receive_hour(message.subject.split(".")[1], message.data)
 
         await self._patiently(read)
 

@@ -83,7 +83,7 @@ class FleetPacks:
         row["listed"] = kind is not None
         row["type"] = self._types.setdefault(kind or UNLISTED, min(len(self._types), 65_535))
 
-    def hear_state(self, name: str, state: bytes, now_s: float) -> None:
+    def receive_state(self, name: str, state: bytes, now_s: float) -> None:
         """Take what a pack has published."""
         self.states += 1
         values = _object(state)
@@ -96,12 +96,12 @@ class FleetPacks:
             row[column] = _number(values.get(field))
         self._states[self._places[name]] = state
 
-    def hear_parameters(self, name: str, parameters: bytes) -> None:
+    def receive_parameters(self, name: str, parameters: bytes) -> None:
         """Take what a pack has published; it is stored compressed, since it has some kilobytes."""
         self._row(name)
         self._parameters[name] = zlib.compress(parameters, 1)
 
-    def hear_hour(self, name: str, hour: bytes) -> None:
+    def receive_hour(self, name: str, hour: bytes) -> None:
         """Take the summary of a pack's hour."""
         values = _object(hour)
         suspects = values.get("suspects") if values else None

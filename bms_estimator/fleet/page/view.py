@@ -41,14 +41,14 @@ class FleetView:
         """Mark the server as lost."""
         self.listening = False
 
-    def hear_worker(self, data: bytes, now_s: float) -> None:
+    def receive_worker(self, data: bytes, now_s: float) -> None:
         """Take a heartbeat."""
         try:
             self.workers.hear(Heartbeat.model_validate_json(data), now_s)
         except ValidationError:
             self.damaged += 1
 
-    def hear_unknown(self, name: str, why: str) -> None:
+    def receive_unknown(self, name: str, why: str) -> None:
         """Record that a worker holds blocks of an unknown pack."""
         self._unknown.pop(name, None)
         self._unknown[name] = why

@@ -112,7 +112,7 @@ def node_of(place: NodeLocation, told: ServerSpec) -> Node:
         nats=server.listen,
         mqtt=server.mqtt,
         monitor=server.monitor,
-        cluster=Cluster(_heard(own), place.nodes) if place.nodes else None,
+        cluster=Cluster(_listen_address(own), place.nodes) if place.nodes else None,
         tls=_tls(tls) if tls else None,
         accounts=told.accounts,
         partitions=server.partitions,
@@ -348,7 +348,7 @@ def _scheme(node: Node) -> str:
     return "tls" if node.tls else "nats"
 
 
-def _heard(own: str) -> str:
+def _listen_address(own: str) -> str:
     """Return the address on which a node listens for others; ``own`` may resolve to any of its addresses."""
     listen = reachable(own)
     return own if listen.loopback else f"0.0.0.0:{listen.port}"

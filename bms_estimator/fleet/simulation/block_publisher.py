@@ -77,7 +77,7 @@ class _Connection:
         self._client.reconnect_delay_set(MIN_WAIT_S, MAX_WAIT_S)
         self._client.on_connect = self._subscribe
         self._client.on_publish = self._count
-        self._client.on_message = self._hear
+        self._client.on_message = self._on_message
         self._client.on_connect_fail = self._client.on_disconnect = self._turn
         self._turn()
         self._client.loop_start()
@@ -109,7 +109,7 @@ class _Connection:
     def _count(self, *_: object) -> None:
         self.acknowledged += 1  # by the connection's own thread alone
 
-    def _hear(self, _client: mqtt.Client, _data: Any, message: mqtt.MQTTMessage) -> None:
+    def _on_message(self, _client: mqtt.Client, _data: Any, message: mqtt.MQTTMessage) -> None:
         if self._heard is not None:
             self._heard.append((message.topic, bytes(message.payload)))
 

@@ -164,13 +164,13 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
             f"{BLOCK_S / SPEED:g} s"
         )
         await processes.until(lambda: seen.held >= seen.partitions, stop)  # workers hold those without a pack, too
-        await _tell(demo, seen, processes, stop)
+        await _report_progress(demo, seen, processes, stop)
         if not stop.is_set():
             await processes.stop("edges")
             demo.say(await _counted(nc, seen, processes, stop))
 
 
-async def _tell(demo: Demo, seen: DemoObserver, processes: "Processes", stop: asyncio.Event) -> None:
+async def _report_progress(demo: Demo, seen: DemoObserver, processes: "Processes", stop: asyncio.Event) -> None:
     """Report the progress, and kill a worker in the middle; the other one takes over with the packs' next blocks."""
     begin_s, kill_s, gone_s, spoke, done = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
     while not stop.is_set():

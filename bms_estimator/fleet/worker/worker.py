@@ -157,7 +157,7 @@ class Worker:
         Raises:
             UserError: The server has closed the connection permanently.
         """
-        await self._nc.subscribe(subjects.worker(), cb=self._hear)
+        await self._nc.subscribe(subjects.worker(), cb=self._receive_heartbeat)
         await self._nc.subscribe(f"{self._inbox}.*.*", cb=self._receive)
         await self._beat()
         await asyncio.sleep(LISTEN_S)
@@ -189,7 +189,7 @@ class Worker:
     def _holdings(self) -> list[PartitionLease]:
         return [holding for holding, _ in self._held.values()]
 
-    async def _hear(self, message: Msg) -> None:
+    async def _receive_heartbeat(self, message: Msg) -> None:
         try:
             heard = Heartbeat.model_validate_json(message.data)
         except ValidationError as error:
@@ -219,10 +219,10 @@ class Worker:
         if self._nc.is_connected:
             heartbeat = self._heartbeat()
             await self._nc.publish(subjects.worker(self._options.name), heartbeat.model_dump_json().encode())
-            await self._tell_unknown()
+            await self._publish_unknown()
         self._notifier.alive(self._options.name)
 
-    async def _tell_unknown(self) -> None:
+    async def _publish_unknown(self) -> None:
         """Publish once for each unknown pack that the table lacks it, with the reason."""
         unknown = {pack for holding in self._holdings if holding.partition for pack in holding.partition.unknown}
         for pack in unknown - self._told:

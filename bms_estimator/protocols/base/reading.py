@@ -69,9 +69,9 @@ def read_line(line: bytes) -> Reading | None:
         line = line.replace(b",", b".")
     try:
         if line.lstrip().startswith(b"{"):
-            return _told(_members(line))
+            return _combined(_members(line))
         if b"=" in line or b":" in line:
-            return _told(_pairs(line.decode("ascii", "replace")))
+            return _combined(_pairs(line.decode("ascii", "replace")))
         columns = line.translate(_SEPARATORS).decode("ascii").split()
         if len(columns) not in (2, 3):
             return None
@@ -96,7 +96,7 @@ def _members(line: bytes) -> Iterable[Said]:
             yield name, [float(v) for v in values], ""
 
 
-def _told(said: Iterable[Said]) -> Reading | None:
+def _combined(said: Iterable[Said]) -> Reading | None:
     """Return the reading of named values.
 
     Raises:

@@ -114,14 +114,14 @@ class PylontechProtocol(ReadingProtocol):
             return None
         try:
             if lines[header][0] == "Battery":
-                self._keep_cells(arrival_s, answer, rows)
+                self._store_cells(arrival_s, answer, rows)
                 return None
             return self._stack(arrival_s, lines[header], rows)
         except (ValueError, LookupError):
             self._count_fault("text_errors", "a table with a row that cannot be read")
             return None
 
-    def _keep_cells(self, arrival_s: float, answer: str, rows: Sequence[Sequence[str]]) -> None:
+    def _store_cells(self, arrival_s: float, answer: str, rows: Sequence[Sequence[str]]) -> None:
         """Store the cell voltages of a response; raises ValueError or LookupError if a row cannot be parsed."""
         echo = ECHO.search(answer)
         battery = int(echo[1]) if echo else 1

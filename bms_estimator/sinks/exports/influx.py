@@ -145,7 +145,7 @@ class InfluxSink:
             try:
                 await loop.run_in_executor(self._thread, partial(_post, self._settings, "\n".join(self._batch)))
             except RefusedError as error:
-                self._say(str(error))
+                self._log(str(error))
                 if error.for_now:
                     return False
                 self.dropped += len(self._batch)
@@ -154,7 +154,7 @@ class InfluxSink:
             self._batch = []
         return True
 
-    def _say(self, why: str) -> None:
+    def _log(self, why: str) -> None:
         """Log a reason, once."""
         if why != self._said:
             self._said = why

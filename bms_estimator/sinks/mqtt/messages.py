@@ -88,8 +88,8 @@ class MessageBuilder:
             before: The snapshot before this one; None of the first.
             snapshot: The snapshot.
         """
-        happened = [self._kept("event", event) for event in events(before, snapshot)]
-        return happened + ([self._kept("state", snapshot.estimate)] if snapshot.estimate else [])
+        happened = [self._queued("event", event) for event in events(before, snapshot)]
+        return happened + ([self._queued("state", snapshot.estimate)] if snapshot.estimate else [])
 
     def live_messages(
         self, sent: PublishedState, snapshot: Snapshot, now_s: float
@@ -148,7 +148,7 @@ class MessageBuilder:
         """Empty, which removes the device, if discovery is disabled."""
         return _json(discovery(self._home, described, self.root, self._sample_period_s)) if self._home.enabled else b""
 
-    def _kept(self, topic: str, report: Payload) -> Message:
+    def _queued(self, topic: str, report: Payload) -> Message:
         return Message(f"{self.root}/{topic}", report.json_bytes, 1, retain=False)
 
     def _live(self, topic: str, payload: bytes) -> Message:

@@ -79,7 +79,7 @@ class MqttSink:
         echo_s: float = ECHO_S,
     ) -> None:
         self._requests, self._delivery = requests, delivery
-        self._refusals = DeniedTopics(delivery, self._say_again, first_delay_s)
+        self._refusals = DeniedTopics(delivery, self._republish, first_delay_s)
         self._backlog = OutboxSender(outbox, delivery, self._refusals, first_delay_s)
         self._birth_delay_s = birth_delay_s
         self._messages = MessageBuilder(settings.base_topic, device, sample_period_s, home_assistant, alarms)
@@ -195,7 +195,7 @@ class MqttSink:
             message = await connection.receive()
             if message.topic == self._birth_topic:
                 if message.payload == b"online" and not message.retain:
-                    asyncio.get_running_loop().call_later(self._birth_delay_s, self._say_again)
+                    asyncio.get_running_loop().call_later(self._birth_delay_s, self._republish)
             elif message.topic in (self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)):
                 if not message.retain:  # retained messages are not news
                     self._availability.on_message(message.topic, message.payload)
@@ -212,7 +212,7 @@ class MqttSink:
             # not at QoS 1: in a flood the broker acknowledges late, and waiting for that would stop reading
             await connection.publish(Message(self._topic(f"response/{name}"), response, 0, retain=False))
 
-    def _say_again(self) -> None:
+    def _republish(self) -> None:
         """Send all retained messages again with the next snapshot."""
         self._again = True
 

@@ -54,13 +54,13 @@ class TerminalSink:
         Raises:
             OSError: Standard output could not be written.
         """
-        for message in self._said(snapshot):
+        for message in self._messages_of(snapshot):
             heard = self._published.take(message.topic, message.payload, self._clock.wall())
             if heard is not None:
                 self._view.on_message(heard)
         self._view.show()
 
-    def _said(self, snapshot: Snapshot) -> list[Message]:
+    def _messages_of(self, snapshot: Snapshot) -> list[Message]:
         """Return the messages that a broker would get."""
         greeting: list[Message] = []
         if self._messages is None:

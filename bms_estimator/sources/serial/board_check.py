@@ -112,15 +112,15 @@ class BoardCheck:
         if not board:
             return
         if not board.get("serial"):
-            self._say_nameless()
+            self._log_without_serial()
             return
         before, self._known = self._known, {name: board.get(name, "") for name in REMEMBERED}
         if self._known != before:
-            self._say_new(before)
+            self._log_new_board(before)
             self._tried_s = -math.inf
         self._remember(now_s)
 
-    def _say_new(self, before: Mapping[str, str]) -> None:
+    def _log_new_board(self, before: Mapping[str, str]) -> None:
         changes = [name for name in REMEMBERED if before.get(name) and before[name] != self._known[name]]
         if changes:
             changed = {name: f"{before[name]} to {self._known[name]}" for name in changes}
@@ -135,9 +135,9 @@ class BoardCheck:
         if self._memory is None or self._keeping or now_s - self._tried_s < RETRY_S:
             return
         self._keeping, self._tried_s = True, now_s
-        Thread(target=self._keep, args=(self._memory, self._known), daemon=True).start()
+        Thread(target=self._store, args=(self._memory, self._known), daemon=True).start()
 
-    def _keep(self, memory: KnownBoardFile, board: Mapping[str, str]) -> None:
+    def _store(self, memory: KnownBoardFile, board: Mapping[str, str]) -> None:
         """Store the board in a thread of its own."""
         try:
             if board != self._kept or memory.is_gone():
@@ -174,7 +174,7 @@ class BoardCheck:
             f"board {found or 'without a serial number'} is not the pack's, {self.serial}: plug that in, {accept}"
         )
 
-    def _say_nameless(self) -> None:
+    def _log_without_serial(self) -> None:
         if not self._nameless:
             self._nameless = True
             log.warning(

@@ -82,7 +82,7 @@ class SerialSource:
         self._where = PortDiscovery(settings.port, monotonic)
         self._line = SerialPort(
             self._open_next,
-            say=self._say,
+            say=self._report,
             wall=wall,
             monotonic=monotonic,
             first_retry_s=first_retry_s,
@@ -177,7 +177,7 @@ class SerialSource:
 
     def _leave(self, message: str) -> None:
         """Reject the device on the port and search elsewhere."""
-        self._say(message)
+        self._report(message)
         self._refused = True
         self._where.skip_port(self._path, WRONG_PORT_RETRY_S)
         self._line.lost.set()
@@ -271,7 +271,7 @@ class SerialSource:
             finally:
                 self._line.close()
             if not self._refused:
-                self._say(f"{path}: lost, opening it again")
+                self._report(f"{path}: lost, opening it again")
 
     async def _attend(self, path: str) -> None:
         """Watch the line until it is lost."""
@@ -289,15 +289,15 @@ class SerialSource:
             elif self._refused:
                 continue
             elif fault := self._listener.fault:
-                self._say_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
+                self._report_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
             elif now_s - heard_s >= max(self._silent_s, self._listener.allowed_silence_s):
-                self._say_or_leave(f"{path}: open, but silent")
+                self._report_or_leave(f"{path}: open, but silent")
             self._faults.check(counters, now_s)
 
-    def _say_or_leave(self, message: str) -> None:
+    def _report_or_leave(self, message: str) -> None:
         """Report why no samples arrive, and try other ports if the board may be elsewhere."""
         if self._where.is_preferred:
-            self._say(message)
+            self._report(message)
         else:
             self._leave(message)
 
@@ -311,7 +311,7 @@ class SerialSource:
                     await self._line.lost.wait()
                     return
 
-    def _say(self, message: str) -> None:
+    def _report(self, message: str) -> None:
         """Report why no samples arrive, once for each reason."""
         self._tended_s = self._monotonic()
         if message != self._message:

@@ -23,14 +23,14 @@ def heard(states: dict[str, bytes], now_s: float = 0.0) -> FleetPacks:
     packs = FleetPacks()
     for name, data in states.items():
         packs.list_pack(name, "lfp 16s1p")
-        packs.hear_state(name, data, now_s)
+        packs.receive_state(name, data, now_s)
     return packs
 
 
 def test_packs_are_alive_for_three_minutes_then_silent():
     packs = heard({"a": fine(), "b": fine()})
     packs.list_pack("c", "lfp 16s1p")
-    packs.hear_state("b", fine(), 100.0)
+    packs.receive_state("b", fine(), 100.0)
     shown = packs.picture(100.0 + ALIVE_S - 1.0, 0.0)
     assert shown["packs"] == {"known": 3, "alive": 1, "silent": 2, "unlisted": 0}
     assert shown["concerns"]["silent"]["packs"] == [["c", None], ["a", 279.0]]
@@ -45,9 +45,9 @@ def test_who_has_not_been_listened_for_long_enough_is_not_called_silent():
 
 def test_a_pack_that_is_in_no_table_counts_once_it_is_heard_and_one_that_was_taken_out_no_more():
     packs = FleetPacks()
-    packs.hear_parameters("guest", b"{}")
+    packs.receive_parameters("guest", b"{}")
     assert packs.picture(1.0, 0.0)["packs"]["known"] == 0
-    packs.hear_state("guest", fine(), 1.0)
+    packs.receive_state("guest", fine(), 1.0)
     packs.list_pack("a", "lfp 16s1p")
     packs.list_pack("a", None)
     shown = packs.picture(1.0, 0.0)
@@ -57,7 +57,7 @@ def test_a_pack_that_is_in_no_table_counts_once_it_is_heard_and_one_that_was_tak
 
 def test_packs_are_spread_by_type_over_soc_and_its_uncertainty():
     packs = heard({"a": fine(soc=-0.01), "b": fine(soc=0.05), "c": fine(soc=1.0), "d": fine(soc=None, soc_std=None)})
-    packs.hear_state("e", fine(soc_std=0.7), 0.0)
+    packs.receive_state("e", fine(soc_std=0.7), 0.0)
     home, guests = packs.picture(1.0, 0.0)["types"]
     assert (home["packs"], home["alive"]) == (4, 4)
     assert {i: n for i, n in enumerate(home["soc"]) if n} == {0: 1, 1: 1, 19: 1}
@@ -87,8 +87,8 @@ def test_who_needs_attention_is_listed_by_how_much_and_counted_once():
         }
     )
     both = InputFault.CAPACITY | InputFault.SIGN_OF_CURRENT
-    packs.hear_hour("wide", json.dumps({"suspects": int(both)}).encode())
-    packs.hear_hour("fine", json.dumps({"suspects": int(InputFault.OCV)}).encode())
+    packs.receive_hour("wide", json.dumps({"suspects": int(both)}).encode())
+    packs.receive_hour("fine", json.dumps({"suspects": int(InputFault.OCV)}).encode())
     shown = packs.picture(1.0, 0.0)
     concerns = shown["concerns"]
     assert {kind: each["count"] for kind, each in concerns.items()} == {
@@ -126,8 +126,8 @@ def test_names_are_found_by_how_they_begin():
 
 def test_all_that_is_known_of_one_pack():
     packs = heard({"a": fine()}, 5.0)
-    packs.hear_parameters("a", ONE.parameters.model_dump_json().encode())
-    packs.hear_hour("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
+    packs.receive_parameters("a", ONE.parameters.model_dump_json().encode())
+    packs.receive_hour("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
     found = packs.one("a", 7.0)
     assert found
     assert (found["pack"], found["type"], found["heard_s"]) == ("a", "lfp 16s1p", 2.0)
@@ -140,9 +140,9 @@ def test_all_that_is_known_of_one_pack():
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b"1", b'{"soc": NaN}', b"\xff", b"[" * 60_000])
 def test_what_is_no_state_is_counted_and_left_out(data: bytes) -> None:
     packs = FleetPacks()
-    packs.hear_state("a", data, 0.0)
-    packs.hear_hour("a", data)
-    packs.hear_parameters("b", data)
+    packs.receive_state("a", data, 0.0)
+    packs.receive_hour("a", data)
+    packs.receive_parameters("b", data)
     assert packs.damaged == 1
     assert packs.picture(0.0, 0.0)["packs"]["known"] == 0
     assert packs.one("b", 0.0)["parameters"] is None
@@ -188,15 +188,15 @@ def test_rates_are_of_late_and_begin_anew_with_a_worker():
 
 def test_unknown_packs_are_named_until_the_table_knows_them_or_no_worker_has_any():
     view = FleetView(1, 0.0)
-    view.hear_worker(beat("w", 0, unknown=("x", "held"), unknown_count=7).model_dump_json().encode(), 0.0)
-    view.hear_unknown("x", "no row")
-    view.hear_unknown("y", "")
+    view.receive_worker(beat("w", 0, unknown=("x", "held"), unknown_count=7).model_dump_json().encode(), 0.0)
+    view.receive_unknown("x", "no row")
+    view.receive_unknown("y", "")
     shown = view.picture(3.0, 0.0)
     assert shown["concerns"]["unknown"] == {"count": 7, "packs": [["y", ""], ["x", "no row"], ["held", ""]]}
     assert shown["attention"] == 7
     view.know("y", "lfp 1s1p")
     assert len(view.picture(3.0, 0.0)["concerns"]["unknown"]["packs"]) == 2
-    view.hear_worker(beat("w", 0).model_dump_json().encode(), 4.0)
+    view.receive_worker(beat("w", 0).model_dump_json().encode(), 4.0)
     assert view.picture(4.0, 0.0)["concerns"]["unknown"] == {"count": 0, "packs": []}
 
 
@@ -204,21 +204,21 @@ def test_states_are_counted_by_the_second():
     view = FleetView(1, 0.0)
     for second in range(20):
         for _ in range(5):
-            view.packs.hear_state("a", fine(), float(second))
+            view.packs.receive_state("a", fine(), float(second))
         shown = view.picture(second + 1.0, 0.0)
     assert shown["states_per_s"] == 5.0
 
 
 def test_heartbeats_of_others_are_counted_and_left_out():
     view = FleetView(1, 0.0)
-    view.hear_worker(b"{}", 0.0)
+    view.receive_worker(b"{}", 0.0)
     assert view.picture(0.0, 0.0)["damaged"] == 1
 
 
 def test_after_a_break_workers_are_heard_anew_and_packs_are_as_they_were():
     view = FleetView(1, 0.0)
-    view.hear_worker(beat("w", 0).model_dump_json().encode(), 0.0)
-    view.packs.hear_state("a", fine(), 0.0)
+    view.receive_worker(beat("w", 0).model_dump_json().encode(), 0.0)
+    view.packs.receive_state("a", fine(), 0.0)
     view.begin(1000.0)
     shown = view.picture(1001.0, 0.0)
     assert shown["workers"] == []
