@@ -46,7 +46,6 @@ prepared: apt venv
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant
 
 demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
-	@if .ci/can-simulate; then $(MAKE) --no-print-directory --silent firmware || echo "the firmware does not build here: the Python board serves"; fi
 	@$(BIN)/bms-estimator demo $(ARGS)
 
 demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of which one is killed, the page: a minute

@@ -3,11 +3,10 @@
 import asyncio
 import sys
 import time
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import asynccontextmanager
 from typing import Self
 
-from bms_estimator.demo.board import running_board
 from bms_estimator.demo.broker import LOOPBACK, DemoBroker, choose_port
 from bms_estimator.demo.true_soc import TrueSoc
 from bms_estimator.model.cell import load_cell
@@ -21,6 +20,7 @@ from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings, parse_listen
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
+from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sinks.terminal.panels import BAND_STDS
 from bms_estimator.sinks.terminal.sink import TerminalSink
 
@@ -37,7 +37,6 @@ LAMBDA = 1e4
 
 
 async def run_demo(
-    build: Path | None,
     *,
     rate_hz: int,
     speed: float,
@@ -50,7 +49,6 @@ async def run_demo(
     """Run until a signal or the time's end.
 
     Args:
-        build: Folder of the built firmware; None: the board in Python.
         rate_hz: Samples per second of the board's time.
         speed: The board's seconds per second.
         port: Of the broker; None: 1883, or a free one.
@@ -66,19 +64,31 @@ async def run_demo(
     cell = load_cell(CELL)
     truth = TrueSoc(SimulatedPack(cell, random_steps(LOAD_A), soc=TRUE_SOC))
     totals = Totals(TOLD_SOC - TRUE_SOC, truth.soc)
-    async with DemoBroker(port) as broker, running_board(build, truth, rate_hz=rate_hz, speed=speed) as board:
+    async with DemoBroker(port) as broker, _running_board(truth, rate_hz, speed) as board:
         page = f"{LOOPBACK}:{choose_port(page_port, parse_listen(DEFAULT_LISTEN).port)}"
-        hint = f"live page: http://{page}/  {board.name}; in a second terminal: {broker.look_command}"
+        hint = f"live page: http://{page}/; in a second terminal: {broker.look_command}"
         if not sys.stdout.isatty():
             sys.stdout.write(f"{hint}\n")
         if seconds is not None:
             asyncio.get_running_loop().call_later(seconds, stop.set)
-        settings = _settings(board.path, broker.url, page, rate_hz)
+        settings = _settings(board, broker.url, page, rate_hz)
         view = TerminalSink(log=log, hint=hint, true_soc=truth.soc)
         pages = Pages(opened)
         # no state folder: start from the beginning each time
         await run_pack_service(settings, cell, sinks=[view, totals], tap=truth, stop=stop, pages=pages)
     return totals.summary()
+
+
+@asynccontextmanager
+async def _running_board(truth: TrueSoc, rate_hz: int, speed: float) -> AsyncIterator[str]:
+    """Run a simulated board, and yield the path of its pseudo-terminal."""
+    with VirtualBoard(truth, rate_hz=rate_hz, speed=speed) as board:
+        task = asyncio.create_task(board.run_for_host())
+        try:
+            yield board.path
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
 
 def _settings(path: str, url: str, page: str, rate_hz: int) -> Settings:

@@ -3,7 +3,6 @@
 import asyncio
 import sys
 from collections import deque
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,7 +10,6 @@ import typer
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.page_options import open_browser
-from bms_estimator.demo.board import find_build
 from bms_estimator.demo.demo import run_demo
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
@@ -38,19 +36,14 @@ def demo(
     speed: Annotated[
         float, typer.Option(parser=decimal(0.1, 10.0), help="speed of the board's clock relative to real time")
     ] = 1.0,
-    firmware: Annotated[
-        Path | None, typer.Option(help="folder of the built firmware and its simulator", show_default=False)
-    ] = None,
-    python_board: Annotated[bool, typer.Option("--python-board", help="simulate the board in Python")] = False,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
 ) -> None:
     """Run broker, board, service and live page in one terminal, until Ctrl-C.
 
-    The board measures a simulated 275 mAh cell under a changing load. It is the real firmware in simavr if that is built
-    (make firmware), otherwise a simulation in Python. The real service reads it from a pseudo-terminal and publishes to
-    a broker on loopback. The initial SOC is 20 % wrong; the true SOC is shown beside the estimate.
+    A simulated board measures a simulated 275 mAh cell under a changing load. The real service reads it from a
+    pseudo-terminal and publishes to a broker on loopback. The initial SOC is 20 % wrong; the true SOC is shown beside the
+    estimate.
     """
-    build = None if python_board else find_build(firmware)
     log = deque[str](maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)
     with show_compile_progress():
@@ -58,7 +51,6 @@ def demo(
     with flush_logs():
         totals = asyncio.run(
             run_demo(
-                build,
                 rate_hz=rate_hz,
                 speed=speed,
                 port=port,

@@ -11,9 +11,6 @@ import aiohttp
 import aiomqtt
 import pytest
 
-from bms_estimator.cli.main import main
-from bms_estimator.demo.board import FIRMWARE_BUILD
-from bms_estimator.simulation.firmware_board import FirmwareBoard
 from tests.command_line import PROGRAM
 from tests.free_port import free_port
 from tests.mosquitto import Listener
@@ -43,13 +40,10 @@ async def listening(port):
             await asyncio.sleep(0.1)
 
 
-@pytest.mark.parametrize("board", ["firmware", pytest.param("python", marks=pytest.mark.thorough)])
-async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
-    if board == "firmware" and not FirmwareBoard.is_built(FIRMWARE_BUILD):
-        pytest.skip("the firmware is not built (make firmware)")
+async def test_a_client_of_its_broker_sees_the_service_come_work_and_go():
     port, page = free_port(), free_port()
     where = ("--port", port, "--page-port", page)
-    async with demo("--seconds", 4, *where, *(["--python-board"] if board == "python" else [])) as process:
+    async with demo("--seconds", 4, *where) as process:
         listener = await listening(port)
         try:
             assert await listener.wait("bms/demo/availability") == b"online"
@@ -76,7 +70,6 @@ async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
     assert {"demo/state", "demo/health", "demo/info"} <= json.loads(first[-1].removeprefix(b"data: ")).keys()
     assert f"live page: http://127.0.0.1:{page}/" in out
     assert f"mosquitto_sub -p {port} -t 'bms/#' -v" in out
-    assert ("firmware in simavr" if board == "firmware" else "board in Python") in out
     assert re.search(r" soc \d+\.\d\d ± \d+\.\d\d %  true \d+\.\d\d %  ", out)
     assert re.search(
         r"\d+\.\d s: \d+ frames, 0 lost, 0 CRC errors; SOC at first -20\.00% wrong, at last [+-]\d\.\d\d%: "
@@ -89,7 +82,7 @@ async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
 @pytest.mark.thorough
 async def test_a_board_whose_time_passes_faster_takes_the_estimate_with_it():
     port = free_port()
-    async with demo("--python-board", "--speed", 5, "--port", port):
+    async with demo("--speed", 5, "--port", port):
         listener = await listening(port)
         try:
             info = await listener.wait_json("bms/demo/info")
@@ -114,11 +107,3 @@ async def test_a_port_that_is_taken_is_said():
             _, err = await process.communicate()
     assert process.returncode == 2
     assert err.decode().splitlines()[-1].startswith(f"error: port {port}: taken by another program")
-
-
-def test_a_folder_without_firmware_is_said(tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["demo", "--seconds", "1", "--firmware", str(tmp_path)])
-    out, err = capsys.readouterr()
-    assert (ended.value.code, out) == (2, "")
-    assert err.startswith(f"error: --firmware {tmp_path}: no built firmware")

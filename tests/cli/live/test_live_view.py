@@ -15,7 +15,7 @@ SIZES = [(40, 15), (60, 20), (80, 24), (120, 40)]
 
 @pytest.fixture(scope="module")
 def demo() -> Iterator[PseudoTerminal]:
-    with PseudoTerminal("demo", "--python-board", "--port", str(free_port())) as terminal:
+    with PseudoTerminal("demo", "--port", str(free_port())) as terminal:
         yield terminal
 
 
@@ -30,7 +30,7 @@ def test_soc_band_voltage_current_and_health_are_on_a_screen_of_any_size(
 
 
 def test_a_demo_that_is_interrupted_says_what_came_of_it_and_leaves_the_terminal_as_it_was() -> None:
-    with PseudoTerminal("demo", "--python-board", "--port", str(free_port())) as terminal:
+    with PseudoTerminal("demo", "--port", str(free_port())) as terminal:
         terminal.until(lambda: "true " in "".join(terminal.screen()))
         terminal.process.send_signal(signal.SIGINT)
         terminal.until(terminal.ended)

@@ -17,7 +17,7 @@ def test_a_first_start_says_which_kernel_it_compiles_and_can_be_interrupted(comm
     pack.write_text('[sensor]\nport = "/dev/none"\n')
     table.write_text("time_s,current_a,voltage_v\n0,0,3.7\n1,0,3.7\n")
     arguments = {
-        "demo": ["--python-board"],
+        "demo": [],
         "replay": [table, "--cell", "ncr18650"],
         "run": [pack],
     }

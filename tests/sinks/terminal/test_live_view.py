@@ -17,7 +17,7 @@ TEN_SCREENS = 300
 
 async def test_a_terminal_that_nobody_reads_does_not_stop_the_estimate() -> None:
     port = free_port()
-    with PseudoTerminal("demo", "--python-board", "--port", str(port)) as terminal:
+    with PseudoTerminal("demo", "--port", str(port)) as terminal:
         listener = await listening(port)
         try:
             await listener.wait_json("bms/demo/state", lambda s: s["frames_received"] > TEN_SCREENS)
