@@ -14,7 +14,7 @@ KINDS: Mapping[str, str] = {
     "can": "fieldbus.can",
     "ble": "bluetooth.source",
 }
-"""Modules by ``source.kind``, with a ``bringer(settings)`` that creates the line producer."""
+"""Modules by ``source.kind``, with a ``producer(settings)`` that creates the line producer."""
 
 
 def make_line_producer(settings: Settings) -> LineProducer | None:
@@ -27,7 +27,7 @@ def make_line_producer(settings: Settings) -> LineProducer | None:
     if settings.source is None:
         return None
     module = importlib.import_module(f"{__package__}.{KINDS[settings.source.kind]}")
-    made: LineProducer = module.bringer(settings)
+    made: LineProducer = module.producer(settings)
     return made
 
 
@@ -37,7 +37,7 @@ def open_line_source(settings: Settings, *, tap: ReadTap | None = None) -> LineS
     Raises:
         UserError, ModuleNotFoundError: As ``make_line_producer``.
     """
-    bringer = make_line_producer(settings)
-    if bringer is None:
+    producer = make_line_producer(settings)
+    if producer is None:
         return None
-    return LineSource(bringer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)
+    return LineSource(producer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)

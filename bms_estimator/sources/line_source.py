@@ -1,4 +1,4 @@
-"""Sources that are no serial line: what brings values is a ``LineProducer``; all else is the same for each of them."""
+"""Sources other than serial lines: a ``LineProducer`` for each kind, and the common rest."""
 
 import asyncio
 import contextlib
@@ -20,7 +20,7 @@ from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
 
 LOOK_S = 1.0
-"""Often enough for a line of the log [s]."""
+"""Interval of the check for samples [s]."""
 SILENT_PERIODS = 3.0
 """Number of expected sample periods without a sample that counts as a fault."""
 
@@ -32,7 +32,7 @@ class SourceUnavailableError(Exception):
 
 
 class LineProducer(ABC):
-    """The I/O part of a source that is no serial line."""
+    """I/O part of a source other than a serial line."""
 
     @property
     @abstractmethod
@@ -66,15 +66,15 @@ class LineProducer(ABC):
 
 
 class LineSource:
-    """Async source of SAMPLE blocks from a bringer, which is restarted whenever it ends.
+    """Async source of SAMPLE blocks from a producer, which is restarted whenever it ends.
 
-    All that makes a sample passes ``decoder.feed(arrival_s, line)``: a capture of these calls replays to the same bits.
+    All lines pass ``decoder.feed(arrival_s, line)``, so a capture of these calls replays bit-identically.
 
     Args:
-        bringer: What brings lines.
+        producer: Produces the lines.
         sensor: Sign of the current; ``protocol`` must be ``text``.
-        period_s: Between two samples, as expected [s].
-        tap: Gets the same (arrival time, line) as the decoder.
+        period_s: Expected sample period [s].
+        tap: Receives each (arrival time, line) of the decoder.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Delay before a missing or lost device is retried; doubles with each attempt [s].
@@ -83,7 +83,7 @@ class LineSource:
 
     def __init__(
         self,
-        bringer: LineProducer,
+        producer: LineProducer,
         sensor: SensorSettings,
         *,
         period_s: float = 1.0,
@@ -93,7 +93,7 @@ class LineSource:
         first_retry_s: float = FIRST_RETRY_S,
         look_s: float = LOOK_S,
     ) -> None:
-        self._bringer, self._decoder, self._tap = bringer, make_protocol(sensor), tap
+        self._producer, self._decoder, self._tap = producer, make_protocol(sensor), tap
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
         self._look_s, self._silent_s = look_s, SILENT_PERIODS * max(period_s, look_s)
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
@@ -109,8 +109,8 @@ class LineSource:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The decoder's and the bringer's, ``reconnects``, and of a tap ``missed_reads``."""
-        counters = {**self._decoder.counters, **self._bringer.counters, "reconnects": max(self._openings - 1, 0)}
+        """Counters of decoder and producer, ``reconnects``, and ``missed_reads`` of the tap."""
+        counters = {**self._decoder.counters, **self._producer.counters, "reconnects": max(self._openings - 1, 0)}
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
 
     @property
@@ -121,11 +121,11 @@ class LineSource:
     @property
     def board(self) -> Mapping[str, str]:
         """Hello of the device."""
-        return self._bringer.board
+        return self._producer.board
 
     @property
     def cells(self) -> CellBlock:
-        """Beside the samples of the last block."""
+        """Cell voltages of the last block."""
         return self._decoder.cells
 
     @property
@@ -136,7 +136,7 @@ class LineSource:
     current_zero: None = None
     """Function that sets the zero of the current; None: lines have no such command."""
     relay: None = None
-    """Nor is there a relay."""
+    """Function that switches a relay; None: there is none."""
 
     def pulse(self) -> SourceHealth:
         """Health of the task that produces lines."""
@@ -144,16 +144,16 @@ class LineSource:
         return SourceHealth(now_s - self._tended_s, self._epoch_s + now_s - self._arrived_s, self._lines.qsize())
 
     async def __aenter__(self) -> Self:
-        """Begin to have lines brought; nothing need be there yet."""
-        self._task = asyncio.create_task(self._have_brought(), name=self._bringer.name)
+        """Start producing lines; the device may still be missing."""
+        self._task = asyncio.create_task(self._produce(), name=self._producer.name)
         self._task.add_done_callback(lambda _: self._lines.put_nowait(None))
-        self._watcher = asyncio.create_task(self._watch(), name=f"watch {self._bringer.name}")
+        self._watcher = asyncio.create_task(self._watch(), name=f"watch {self._producer.name}")
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Have no more brought."""
+        """Stop producing lines."""
         tasks: set[asyncio.Task[None]] = {task for task in (self._watcher, self._task) if task is not None}
-        while tasks:  # wait_for of Python 3.11, in what a bringer calls, may swallow that it is to end
+        while tasks:  # wait_for of Python 3.11, in what a producer calls, may swallow that it is to end
             for task in tasks:
                 task.cancel()
             _done, tasks = await asyncio.wait(tasks, timeout=LOOK_S)
@@ -177,19 +177,19 @@ class LineSource:
             self._heard_s = self._monotonic()
         return block
 
-    async def _have_brought(self) -> None:
+    async def _produce(self) -> None:
         """Produce lines and restart after an error. Only an internal error ends it and is raised to the reader."""
         while True:
             await self._pause()
             reason = "it ended"
             try:
-                async with contextlib.aclosing(self._bringer.iter_lines()) as lines:
+                async with contextlib.aclosing(self._producer.iter_lines()) as lines:
                     async for line in lines:
                         self._take(line)
             except (SourceUnavailableError, OSError) as error:
                 reason = str(error)
             self._connected = False
-            self._report(f"{self._bringer.name}: {reason}; trying again")
+            self._report(f"{self._producer.name}: {reason}; trying again")
 
     async def _pause(self) -> None:
         """Each one is longer until a sample arrives."""
@@ -202,16 +202,16 @@ class LineSource:
             return
         self._openings += 1
         self._connected, self._heard_s = True, self._monotonic()
-        self._message = f"{self._bringer.name}: connected, nothing has come yet"
-        log.info("connected", source=self._bringer.name)
+        self._message = f"{self._producer.name}: connected, nothing has come yet"
+        log.info("connected", source=self._producer.name)
 
     async def _watch(self) -> None:
-        """Report why nothing arrives; have faults logged."""
+        """Report why nothing arrives, and log faults."""
         while True:
             self._tended_s = now_s = self._monotonic()
             if self._connected and now_s - self._heard_s >= self._silent_s:
-                why = self._bringer.fault or self._decoder.fault or "connected, but silent"
-                self._report(f"{self._bringer.name}: {why}")
+                why = self._producer.fault or self._decoder.fault or "connected, but silent"
+                self._report(f"{self._producer.name}: {why}")
             self._faults.check(self.counters, now_s)
             await asyncio.sleep(self._look_s)
 

@@ -21,7 +21,7 @@ SCAN_S = 15.0
 """A BMS advertises every few seconds at least; one that a phone is connected to does not [s]."""
 
 
-class BleBringer(LineProducer):
+class BleProducer(LineProducer):
     """Polls a BMS. It stays connected: most take seconds to connect.
 
     Args:

@@ -11,7 +11,7 @@ NEEDED_PYTHON = 0x030C0000
 """3.12, as aiobmsble needs it."""
 
 
-def bringer(settings: Settings) -> LineProducer:
+def producer(settings: Settings) -> LineProducer:
     """Make the line producer of ``[source]``.
 
     Raises:
@@ -21,6 +21,6 @@ def bringer(settings: Settings) -> LineProducer:
     assert isinstance(settings.source, BleSource)  # noqa: S101 - as KINDS has it
     if sys.hexversion < NEEDED_PYTHON:
         raise UserError(f'source.kind = "ble" needs Python 3.12 or newer; this is {sys.version.split()[0]}')
-    from bms_estimator.sources.bluetooth.client import BleBringer  # noqa: PLC0415 - needs that Python, and an extra
+    from bms_estimator.sources.bluetooth.client import BleProducer  # noqa: PLC0415 - needs that Python, and an extra
 
-    return BleBringer(settings.source)
+    return BleProducer(settings.source)

@@ -27,7 +27,7 @@ BUS_OFF = 0x40
 Deliver = Callable[[bytes | Exception], None]
 
 
-class CanBringer(LineProducer):
+class CanProducer(LineProducer):
     """Listens to a bus in a thread of its own: most adapters can only be waited for.
 
     Args:
@@ -153,11 +153,11 @@ class CanBringer(LineProducer):
         )
 
 
-def bringer(settings: Settings) -> CanBringer:
+def producer(settings: Settings) -> CanProducer:
     """Make the line producer of ``[source]``.
 
     Raises:
-        UserError: As ``CanBringer``.
+        UserError: As ``CanProducer``.
     """
     assert isinstance(settings.source, CanSource)  # noqa: S101 - as KINDS has it
-    return CanBringer(settings.source)
+    return CanProducer(settings.source)

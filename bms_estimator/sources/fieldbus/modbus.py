@@ -43,7 +43,7 @@ class _RefusedError(Exception):
         self.code = code
 
 
-class ModbusBringer(LineProducer):
+class ModbusProducer(LineProducer):
     """Polls a device for its registers.
 
     Quantities that a device rejects are found by separate requests: without voltage or current there are no samples;
@@ -200,7 +200,7 @@ def _client(settings: ModbusSource) -> Client:
     )
 
 
-def bringer(settings: Settings) -> ModbusBringer:
+def producer(settings: Settings) -> ModbusProducer:
     """Make the line producer of ``[source]``."""
     assert isinstance(settings.source, ModbusSource)  # noqa: S101 - as KINDS has it
-    return ModbusBringer(settings.source)
+    return ModbusProducer(settings.source)

@@ -184,7 +184,7 @@ class LinuxSensor(LineProducer):
         return None
 
 
-def bringer(settings: Settings) -> LinuxSensor:
+def producer(settings: Settings) -> LinuxSensor:
     """Make the line producer of ``[source]``."""
     assert isinstance(settings.source, LinuxSource)  # noqa: S101 - as KINDS has it
     return LinuxSensor(settings.source)

@@ -143,7 +143,7 @@ class MqttReports(LineProducer):
         self._lost[kind] += 1
 
 
-def bringer(settings: Settings) -> MqttReports:
+def producer(settings: Settings) -> MqttReports:
     """Make the line producer of ``[source]``.
 
     Raises:

@@ -25,8 +25,8 @@ TOLD = {"voltage_v": 15.6, "current_a": -2.87, "temperature_c": 22.133, "cells_v
 """Charge is positive."""
 
 
-def bringer(**told: object) -> LineProducer:
-    made: LineProducer = ble_bms.BleBringer(BleSource.model_validate({"kind": "ble", "poll_s": 0.5} | told))
+def producer(**told: object) -> LineProducer:
+    made: LineProducer = ble_bms.BleProducer(BleSource.model_validate({"kind": "ble", "poll_s": 0.5} | told))
     return made
 
 
@@ -39,7 +39,7 @@ async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeyp
     async with asyncio.timeout(LONG_S), bluez.system_bus(tmp_path) as bus:
         stack = bluez.BlueZ(bus)
         await bus.request_name("org.bluez")
-        asked = bringer(address=bluez.ADDRESS.lower())
+        asked = producer(address=bluez.ADDRESS.lower())
         async with aclosing(asked.iter_lines()) as brought:
             assert await anext(brought) == CONNECTED
             assert [json.loads(await anext(brought)) for _ in range(2)] == 2 * [TOLD]
@@ -51,11 +51,11 @@ async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeyp
             await to_the_end(asked.iter_lines())
         monkeypatch.undo()
         stack.near = True
-        async with aclosing(bringer(name=bluez.NAME, bms="jbd").iter_lines()) as brought:
+        async with aclosing(producer(name=bluez.NAME, bms="jbd").iter_lines()) as brought:
             assert await anext(brought) == CONNECTED
             assert json.loads(await anext(brought)) == TOLD
 
 
 def test_a_bms_that_nobody_knows() -> None:
     with pytest.raises(UserError, match=r"source\.bms = 'jbdd': aiobmsble knows abc, .*jbd"):
-        bringer(address=bluez.ADDRESS, bms="jbdd")
+        producer(address=bluez.ADDRESS, bms="jbdd")

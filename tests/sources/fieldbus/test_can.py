@@ -15,7 +15,7 @@ from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.factory import open_line_source
-from bms_estimator.sources.fieldbus.can import BUS_OFF, CanBringer
+from bms_estimator.sources.fieldbus.can import BUS_OFF, CanProducer
 from bms_estimator.sources.line_source import SourceUnavailableError
 from tests.patience import LONG_S
 from tests.serial_line import Line
@@ -54,11 +54,11 @@ def sender(channel: str) -> Iterator[can.BusABC]:
 
 
 async def test_frames_of_a_bus_become_lines(channel: str, sender: can.BusABC) -> None:
-    bringer = CanBringer(source(interface="virtual", channel=channel))
-    async with aclosing(bringer.iter_lines()) as brought:
+    producer = CanProducer(source(interface="virtual", channel=channel))
+    async with aclosing(producer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
-        assert bringer.fault is not None
-        assert "source.voltage (frame 0x356)" in bringer.fault
+        assert producer.fault is not None
+        assert "source.voltage (frame 0x356)" in producer.fault
         for message in (
             can.Message(arbitration_id=0x355, is_extended_id=False, data=b"\x64\x00\x63\x00"),
             can.Message(arbitration_id=0x356, is_extended_id=True, data=PYLONTECH.data),
@@ -68,32 +68,32 @@ async def test_frames_of_a_bus_become_lines(channel: str, sender: can.BusABC) ->
         ):
             sender.send(message)
         assert json.loads(await next_of(brought)) == TOLD
-    assert bringer.counters == {"short_frames": 1, "not_measured": 0, "error_frames": 0, "junk": 0}
+    assert producer.counters == {"short_frames": 1, "not_measured": 0, "error_frames": 0, "junk": 0}
 
 
 async def test_a_controller_that_is_bus_off_is_said_until_it_is_back(channel: str, sender: can.BusABC) -> None:
-    bringer = CanBringer(source(interface="virtual", channel=channel))
-    async with aclosing(bringer.iter_lines()) as brought:
+    producer = CanProducer(source(interface="virtual", channel=channel))
+    async with aclosing(producer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         assert PYLONTECH.arbitration_id & BUS_OFF  # the virtual bus filters error frames, too
         sender.send(can.Message(arbitration_id=0x356, is_extended_id=False, is_error_frame=True))
         async with asyncio.timeout(LONG_S):
-            while bringer.counters["error_frames"] == 0:  # noqa: ASYNC110 - it has no event for it
+            while producer.counters["error_frames"] == 0:  # noqa: ASYNC110 - it has no event for it
                 await asyncio.sleep(0.001)
-        assert "bus off" in (bringer.fault or "")
+        assert "bus off" in (producer.fault or "")
         sender.send(PYLONTECH)
         await next_of(brought)
-        assert "bus off" not in (bringer.fault or "")
+        assert "bus off" not in (producer.fault or "")
 
 
 async def test_an_adapter_that_is_unplugged_and_plugged_in_again(line: Line) -> None:
-    bringer = CanBringer(slcan(line))
+    producer = CanProducer(slcan(line))
     with pytest.raises(SourceUnavailableError, match=r"cannot be opened: .*No such file"):
-        async with aclosing(bringer.iter_lines()) as brought:
+        async with aclosing(producer.iter_lines()) as brought:
             await next_of(brought)
     for _ in range(2):
         line.plug()
-        async with aclosing(bringer.iter_lines()) as brought:
+        async with aclosing(producer.iter_lines()) as brought:
             assert await next_of(brought) == CONNECTED
             line.write(SLCAN)
             assert json.loads(await next_of(brought)) == TOLD
@@ -104,16 +104,16 @@ async def test_an_adapter_that_is_unplugged_and_plugged_in_again(line: Line) -> 
 
 async def test_junk_of_an_adapter_is_no_frame(line: Line) -> None:
     line.plug()
-    bringer = CanBringer(slcan(line))
-    async with aclosing(bringer.iter_lines()) as brought:
+    producer = CanProducer(slcan(line))
+    async with aclosing(producer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         line.write(b"t35z6zz\r\a" + b"t3568721485FF\r" + SLCAN)  # of the second, bytes are missing
         assert json.loads(await next_of(brought)) == TOLD
-        assert bringer.counters["junk"] == 2
+        assert producer.counters["junk"] == 2
         line.write(b"\xff\xfe\r")
         with pytest.raises(SourceUnavailableError, match="lost: "):
             await next_of(brought)
-    async with aclosing(bringer.iter_lines()) as brought:
+    async with aclosing(producer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         line.write(SLCAN)
         assert json.loads(await next_of(brought)) == TOLD
@@ -135,15 +135,15 @@ async def test_samples_are_positive_on_discharge(channel: str, sender: can.BusAB
 
 
 async def test_an_option_that_the_interface_does_not_have() -> None:
-    bringer = CanBringer(source(interface="socketcand", channel="can0", options={"hots": "127.0.0.1"}))
+    producer = CanProducer(source(interface="socketcand", channel="can0", options={"hots": "127.0.0.1"}))
     with pytest.raises(SourceUnavailableError, match=r"cannot be opened: .*host"):
-        async with aclosing(bringer.iter_lines()) as brought:
+        async with aclosing(producer.iter_lines()) as brought:
             await next_of(brought)
 
 
 def test_an_interface_that_python_can_does_not_have() -> None:
     with pytest.raises(UserError, match=r"source.interface = 'canbus': python-can has .*socketcan"):
-        CanBringer(source(interface="canbus"))
+        CanProducer(source(interface="canbus"))
 
 
 @pytest.fixture
@@ -161,8 +161,8 @@ def vcan() -> Iterator[str]:
 
 
 async def test_an_interface_of_the_kernel_that_goes_down(vcan: str) -> None:
-    bringer = CanBringer(source(channel=vcan))
-    async with aclosing(bringer.iter_lines()) as brought:
+    producer = CanProducer(source(channel=vcan))
+    async with aclosing(producer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         with can.Bus(interface="socketcan", channel=vcan, ignore_config=True) as bus:
             bus.send(PYLONTECH)

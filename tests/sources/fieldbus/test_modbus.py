@@ -14,7 +14,7 @@ from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.factory import open_line_source
-from bms_estimator.sources.fieldbus.modbus import ModbusBringer
+from bms_estimator.sources.fieldbus.modbus import ModbusProducer
 from bms_estimator.sources.line_source import SourceUnavailableError
 from tests.free_port import free_port
 from tests.patience import LONG_S
@@ -32,34 +32,34 @@ def victron() -> Registers:
     return Registers({259: 5234, 260: 1200, 261: 0x10000 - 123, 262: 215})
 
 
-async def lines(bringer: ModbusBringer, count: int) -> list[dict[str, object]]:
+async def lines(producer: ModbusProducer, count: int) -> list[dict[str, object]]:
     """The first lines that it brings, after it has said that it is connected."""
-    async with asyncio.timeout(LONG_S), aclosing(bringer.iter_lines()) as brought:
+    async with asyncio.timeout(LONG_S), aclosing(producer.iter_lines()) as brought:
         assert await anext(brought) == CONNECTED
         return [json.loads(await anext(brought)) for _ in range(count)]
 
 
-async def failure(bringer: ModbusBringer) -> str:
+async def failure(producer: ModbusProducer) -> str:
     """Why nothing comes."""
     with pytest.raises(SourceUnavailableError) as raised:
-        await lines(bringer, 1_000_000)
+        await lines(producer, 1_000_000)
     return str(raised.value)
 
 
 async def test_a_known_device_is_read_over_tcp_in_one_request() -> None:
     registers, port = victron(), free_port()
-    bringer = ModbusBringer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
+    producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
     async with tcp_device(registers, UNIT, port):
-        assert await lines(bringer, 3) == 3 * [{"voltage_v": 52.34, "current_a": -12.3, "temperature_c": 21.5}]
+        assert await lines(producer, 3) == 3 * [{"voltage_v": 52.34, "current_a": -12.3, "temperature_c": 21.5}]
     assert set(registers.asked) == {(3, 259, 4)}
-    assert not any(bringer.counters.values())
+    assert not any(producer.counters.values())
 
 
 async def test_a_known_device_is_read_over_a_serial_line(tmp_path: Path) -> None:
     registers = Registers(input_={0x1000 + i: 0 for i in range(17)} | {0x1100 + i: 3300 + i for i in range(26)})
     registers.input |= {0x1000: 5320, 0x1001: 150, 0x1009: 2981}
     async with serial_device(registers, UNIT, tmp_path) as path:
-        (line,) = await lines(ModbusBringer(source(profile="seplos-v3", unit=UNIT, port=str(path))), 1)
+        (line,) = await lines(ModbusProducer(source(profile="seplos-v3", unit=UNIT, port=str(path))), 1)
     assert line.pop("cells_v") == [round(3.3 + i / 1000, 3) for i in range(16)]
     assert line == {"voltage_v": 53.2, "current_a": 1.5, "temperature_c": 24.95}
     assert set(registers.asked) == {(4, 0x1000, 10), (4, 0x1100, 16)}
@@ -68,8 +68,8 @@ async def test_a_known_device_is_read_over_a_serial_line(tmp_path: Path) -> None
 async def test_a_gateway_that_hands_on_serial_frames() -> None:
     port = free_port()
     async with tcp_device(victron(), UNIT, port, FramerType.RTU):
-        bringer = ModbusBringer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port, framing="rtu"))
-        assert (await lines(bringer, 1))[0]["voltage_v"] == 52.34
+        producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port, framing="rtu"))
+        assert (await lines(producer, 1))[0]["voltage_v"] == 52.34
 
 
 async def test_what_a_device_does_not_have_is_named_or_left_out() -> None:
@@ -77,26 +77,26 @@ async def test_what_a_device_does_not_have_is_named_or_left_out() -> None:
     del registers.holding[260], registers.holding[262]  # the register between two that are wanted, and a temperature
     given = source(profile="victron-gx", host="127.0.0.1", tcp_port=port)
     async with tcp_device(registers, UNIT, port):
-        bringer = ModbusBringer(given)
-        assert await lines(bringer, 2) == 2 * [{"voltage_v": 52.34, "current_a": -12.3}]
-        assert bringer.counters["refused"] == 2
+        producer = ModbusProducer(given)
+        assert await lines(producer, 2) == 2 * [{"voltage_v": 52.34, "current_a": -12.3}]
+        assert producer.counters["refused"] == 2
         assert registers.asked == [(3, 259, 4), (3, 259, 1), (3, 261, 1), (3, 262, 1), (3, 259, 1), (3, 261, 1)]
         del registers.holding[261]
-        said = await failure(ModbusBringer(given))
+        said = await failure(ModbusProducer(given))
     assert said == "source.current (holding register 261): illegal data address: the device has no such register"
 
 
 async def test_a_wrong_unit_behind_a_gateway_says_so() -> None:
     port = free_port()
     async with tcp_device(victron(), UNIT, port):
-        said = await failure(ModbusBringer(source(profile="victron-gx", unit=9, host="127.0.0.1", tcp_port=port)))
+        said = await failure(ModbusProducer(source(profile="victron-gx", unit=9, host="127.0.0.1", tcp_port=port)))
     assert said.endswith("gateway target device failed to respond: is source.unit right?")
 
 
 async def test_a_wrong_unit_on_a_serial_line_is_silence(tmp_path: Path) -> None:
     async with serial_device(victron(), UNIT, tmp_path) as path:
         given = source(profile="victron-gx", unit=9, port=str(path), timeout_s=0.2)
-        said = await failure(ModbusBringer(given))
+        said = await failure(ModbusProducer(given))
     assert said == (
         "no answer within 0.2 s, asked for source.voltage, source.current, source.temperature"
         " (holding registers 259 to 262)"
@@ -104,9 +104,9 @@ async def test_a_wrong_unit_on_a_serial_line_is_silence(tmp_path: Path) -> None:
 
 
 async def test_no_device_and_no_port_are_said(tmp_path: Path) -> None:
-    there = ModbusBringer(source(profile="victron-gx", host="127.0.0.1", tcp_port=free_port()))
+    there = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=free_port()))
     assert await failure(there) == "no connection"
-    assert await failure(ModbusBringer(source(profile="victron-gx", port=str(tmp_path / "none")))) == (
+    assert await failure(ModbusProducer(source(profile="victron-gx", port=str(tmp_path / "none")))) == (
         "the port cannot be opened"
     )
 
@@ -140,7 +140,7 @@ async def test_what_is_no_answer_brings_nothing(answer: bytes) -> None:
     async with server, asyncio.timeout(LONG_S):
         port = server.sockets[0].getsockname()[1]
         given = source(profile="victron-gx", host="127.0.0.1", tcp_port=port, timeout_s=0.1)
-        assert await failure(ModbusBringer(given))
+        assert await failure(ModbusProducer(given))
         await served.wait()
 
 
@@ -153,22 +153,22 @@ async def until(brought: AsyncGenerator[bytes, None], condition: Callable[[], bo
 
 async def test_a_device_that_goes_and_comes_back() -> None:
     registers, port = victron(), free_port()
-    bringer = ModbusBringer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
-    async with aclosing(bringer.iter_lines()) as brought:
+    producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
+    async with aclosing(producer.iter_lines()) as brought:
         async with tcp_device(registers, UNIT, port):
             await until(brought, lambda: len(registers.asked) > 2)
         with pytest.raises(SourceUnavailableError):
             await until(brought, lambda: False)
-    assert await failure(bringer) == "no connection"
+    assert await failure(producer) == "no connection"
     async with tcp_device(registers, UNIT, port):
-        assert (await lines(bringer, 1))[0]["voltage_v"] == 52.34
+        assert (await lines(producer, 1))[0]["voltage_v"] == 52.34
 
 
 async def test_a_device_that_is_busy_brings_nothing_and_is_not_split() -> None:
     registers, port = victron(), free_port()
     registers.refusal = ExcCodes.DEVICE_BUSY
     async with tcp_device(registers, UNIT, port):
-        said = await failure(ModbusBringer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port)))
+        said = await failure(ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port)))
     assert said.endswith("server device busy")
     assert len(registers.asked) == 1
 
@@ -178,17 +178,17 @@ async def test_floats_that_are_no_numbers_are_no_samples_until_they_are() -> Non
     registers = Registers(dict(enumerate((*float_words(13.25), *float_words(float("nan"))))))
     current = {"address": 2, "type": "float32"}
     given = source(voltage={"address": 0, "type": "float32"}, current=current, host="127.0.0.1", tcp_port=port)
-    bringer = ModbusBringer(given)
-    async with tcp_device(registers, UNIT, port), aclosing(bringer.iter_lines()) as brought, asyncio.timeout(LONG_S):
+    producer = ModbusProducer(given)
+    async with tcp_device(registers, UNIT, port), aclosing(producer.iter_lines()) as brought, asyncio.timeout(LONG_S):
         assert await anext(brought) == CONNECTED
         coming = asyncio.ensure_future(anext(brought))
         await registers.was_asked(4)
-        assert bringer.counters["not_measured"] >= 2
+        assert producer.counters["not_measured"] >= 2
         assert not coming.done()
-        assert bringer.fault is not None
+        assert producer.fault is not None
         registers.holding |= dict(zip((2, 3), float_words(-2.5), strict=True))
         assert json.loads(await coming) == {"voltage_v": 13.25, "current_a": -2.5}
-        assert bringer.fault is None
+        assert producer.fault is None
 
 
 async def test_samples_are_positive_on_discharge_and_come_again_after_the_device_was_away() -> None:
