@@ -51,17 +51,17 @@ class Anchor:
     """A rest whose voltage gives the SOC.
 
     Attributes:
-        capture: Where it is.
+        capture: Name of its capture.
         part: Number of the continuous part, over all captures.
-        time_s: Of its end, on the capture's clock [s].
+        time_s: Time of its end, on the capture's clock [s].
         rest: As it was found.
         soc: By its voltage.
-        soc_std: Of that, errors of the curve included.
+        soc_std: Standard deviation of soc, with the error of the curve.
         counted_ah: Drawn since the part began [Ah].
         moved_ah: Magnitude of the charge moved since then [Ah].
-        slope_v: Of the curve there [V].
+        slope_v: Slope of the curve there [V].
         own_v: Standard deviation of its voltage that is its own [V].
-        curve_v: Of the curve there [V].
+        curve_v: Value of the curve there [V].
     """
 
     capture: str
@@ -83,11 +83,11 @@ class Capacity:
 
     Attributes:
         capacity_ah: [Ah].
-        std_ah: Its standard deviation [Ah].
+        std_ah: Standard deviation [Ah].
         offset_a: Offset of the current sensor, if the anchors determine it [A].
-        offset_std_a: Of that [A].
+        offset_std_a: Standard deviation of the offset [A].
         anchors: Used.
-        residual: Of each anchor, SOC by its voltage less that by the charge.
+        residual: Residual of each anchor: SOC by its voltage minus SOC by the charge.
         rejected: Why other rests were not, one line each.
     """
 
@@ -104,7 +104,7 @@ def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std
     """Capacity from the anchors of one or more captures of a cell.
 
     Args:
-        captures: Of the same cell, within weeks.
+        captures: Captures of one cell, within weeks.
         cell: Its open-circuit voltage counts, with its error; its capacity defines small currents only.
         offset_std_a: Standard deviation of the offset of the current sensor [A]; None: as the identifier takes it.
 

@@ -52,7 +52,7 @@ class Source:
         name: For people.
         time_s: Increasing [s]; None: a polarisation curve, where each point has settled.
         current_a: Positive when the stack delivers [A].
-        voltage_v: Of the stack [V].
+        voltage_v: Voltage of the stack [V].
         temperature_c: NaN without a sensor [C].
     """
 

@@ -25,7 +25,7 @@ class Errors:
     """Measured against simulated voltage over some samples; NaN of none.
 
     Attributes:
-        samples: How many.
+        samples: Number of samples.
         voltage_rms_v: Root mean square [V].
         mean_abs_percent: Mean magnitude, of the measured voltage [%].
         max_abs_percent: Largest magnitude, of the measured voltage [%].
@@ -42,15 +42,15 @@ class Validation:
     """One capture against one cell.
 
     Attributes:
-        samples: How many the capture had.
-        glitches: How many were left out as glitches.
+        samples: Number of samples in the capture.
+        glitches: Number of dropped glitches.
         initial_soc: SOC at the first sample that was used, 0..1.
         initial_soc_from: ``given``, ``first rest`` or ``first sample under load``.
         final_soc: SOC at the last sample, counted.
         all: Over all samples.
         above: Over the samples at SOC above ``LOW_SOC``.
         resting: Those without current: error of the open-circuit voltage, and remaining relaxation.
-        loaded: Of these, those with current.
+        loaded: Samples above SOC 0.1 with current.
         extra_ohm: Series resistance that would make the error over ``above`` least: contacts, temperature, age [ohm].
         without_extra_ohm: The error over ``above`` with that resistance.
         warnings: What in the capture contradicts the cell.

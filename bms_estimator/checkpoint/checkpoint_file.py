@@ -84,7 +84,7 @@ class CheckpointFile:
     """One pack's checkpoint, ``<pack.name>-<identity>.npz``.
 
     Args:
-        folder: Where it is; must exist.
+        folder: Location; must exist.
         settings: The pack's settings.
         cell: The pack as one object.
         now: The present moment.
@@ -111,7 +111,7 @@ class CheckpointFile:
 
         Args:
             state: Shape (1,), dtype ESTIMATOR_STATE.
-            ledger: Of this run and those before.
+            ledger: Counters of this and earlier runs.
 
         Raises:
             OSError: The file cannot be written.

@@ -51,8 +51,8 @@ async def run_demo(
     Args:
         rate_hz: Samples per second of the board's time.
         speed: The board's seconds per second.
-        port: Of the broker; None: 1883, or a free one.
-        page_port: Of the live page; None: 8765, or a free one.
+        port: Port of the broker; None: 1883, or a free one.
+        page_port: Port of the live page; None: 8765, or a free one.
         seconds: How long; None: until a signal.
         log: Log lines for the live view.
         opened: Called with the address of the live page once it is served.

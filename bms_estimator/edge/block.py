@@ -48,7 +48,7 @@ class Block:
 
     Attributes:
         store: When the edge's store was made [ns since 1970].
-        number: Of this block, from 1.
+        number: Number of this block, from 1.
         oldest: The oldest number that the edge can still send; at most ``number``.
         arrival_s: Wall clock at the arrival of the last sample [s since 1970].
         samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MAX_SAMPLES`` of them.

@@ -50,15 +50,15 @@ class BlockSender:
     """Sends samples of one pack.
 
     Args:
-        settings: Where they go.
+        settings: Destination and storage of the blocks.
         pack: Name of the pack.
         folder: Folder of the blocks, in ``<pack>.edge.sqlite``.
         connect: Makes a connection; over TCP when left out.
         clock: Its wall clock dates samples.
         steady: A clock that never steps and continues during suspend [s].
-        most_samples: Of a block.
-        first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
-        retry_s: Before a disk that failed is tried again [s].
+        most_samples: Maximum number of samples of a block.
+        first_delay_s: Delay before a lost broker, or a temporary rejection, is retried [s].
+        retry_s: Delay before a failed disk is retried [s].
         handover_s: Time for sending the remaining blocks at the end [s].
 
     Attributes:

@@ -39,7 +39,7 @@ class BlockStore:
     Args:
         database: With ``EDGE_TABLES``, synced at each transaction; opened and closed by its owner.
         topic: Where blocks are published.
-        most_bytes: Of blocks on disk; beyond it the oldest is dropped.
+        most_bytes: Maximum size of blocks on disk; beyond it the oldest is dropped.
         wall: Wall clock [s since 1970].
         resend_s: Between two times that the same block is sent again on request [s].
 

@@ -27,7 +27,7 @@ class SampleClock:
     step is a gap. One that is set back is not.
 
     Args:
-        last_s: Of the last sample that was placed, in an earlier run, too [s since 1970]; none: minus infinity.
+        last_s: Time of the last sample that was placed, in an earlier run, too [s since 1970]; none: minus infinity.
 
     Attributes:
         steps: Number of times that a clock was set, or the source restarted.

@@ -94,7 +94,7 @@ class Estimator:
             current_a: Current [A], positive on discharge.
             voltage_v: Terminal voltage [V].
             status: Bits of ``SampleStatus``.
-            temperature_c: Of the cell [C]; NaN without a sensor.
+            temperature_c: Temperature of the cell [C]; NaN without a sensor.
 
         Returns:
             Whether it was accepted, else why not; the state counts each kind.

@@ -136,8 +136,8 @@ def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArra
     """Return the weight of each node of the correction at each SOC, and the error of the curve there [V].
 
     Args:
-        settings: Of a record of EKF_SETTINGS, as all that it depends on.
-        socs: Of float64.
+        settings: Settings of a record of EKF_SETTINGS, as all that it depends on.
+        socs: SOC values of float64.
     """
     p, soc = np.frombuffer(bytearray(settings), EKF_SETTINGS)[0], np.frombuffer(socs)
     rows, own_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
@@ -153,9 +153,9 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
     """Return a cell file's values with the learned OCV, capacity and resistances, each with its error.
 
     Args:
-        estimator: Of a pack of that cell, after samples, identifying.
+        estimator: Estimator of a pack of that cell, after samples, identifying.
         cell: As its file has it, before ``CellModel.pack``.
-        series: Of them in the pack.
+        series: Number of them in the pack.
     """
     record, settings = estimator.record[0], estimator.settings_record[0]
     capacity = relative_capacity(record)

@@ -33,7 +33,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
 
     Args:
         cell: The pack as one object.
-        observer: Its ``[observer]`` section.
+        observer: Section ``[observer]``.
         of_observer: Record of dtype ``OBSERVER_SETTINGS``.
 
     Returns:

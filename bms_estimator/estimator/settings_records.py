@@ -54,8 +54,8 @@ def estimator_settings(
 
     Args:
         cell: The pack as one object.
-        observer: Its ``[observer]`` section.
-        identifier: Its ``[identifier]`` section.
+        observer: Section ``[observer]``.
+        identifier: Section ``[identifier]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
         initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
@@ -93,7 +93,7 @@ def observer_settings(
 
     Args:
         cell: The pack as one object.
-        observer: Its ``[observer]`` section.
+        observer: Section ``[observer]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
 
@@ -118,7 +118,7 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
     Args:
         p: Record of dtype ``OBSERVER_SETTINGS``; written.
         cell: The pack's ratings.
-        observer: Its ``[observer]`` section.
+        observer: Section ``[observer]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
     """
     p["nussbaum"] = Nussbaum[observer.nussbaum.replace("-", "_").upper()]

@@ -77,7 +77,7 @@ def pack(words: Words, mirror: Mirror, out: Words) -> int:
 
     Args:
         words: Shape (n,).
-        mirror: Of its layout.
+        mirror: Mirrored words of its layout.
         out: As ``room`` made it.
 
     Returns:
@@ -104,7 +104,7 @@ def unpack(packed: Words, mirror: Mirror, words: Words) -> bool:
 
     Args:
         packed: As ``pack`` left it.
-        mirror: Of its layout.
+        mirror: Mirrored words of its layout.
         words: Shape (n,), n words of a record.
 
     Returns:

@@ -78,7 +78,7 @@ def step(
         current_a: Current [A], positive on discharge.
         voltage_v: Terminal voltage [V].
         status: Bits of ``SampleStatus``.
-        temperature_c: Of the cell [C]; NaN without a sensor.
+        temperature_c: Temperature of the cell [C]; NaN without a sensor.
 
     Returns:
         A ``SampleOutcome``.

@@ -17,7 +17,7 @@ class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):
 
     Args:
         lose: Called with reason and topic of each lost message.
-        most_bytes: Of a message with its topic.
+        most_bytes: Maximum size of a message with its topic.
         maxsize: Messages.
     """
 

@@ -42,7 +42,7 @@ class Subscriber:
         connect: Makes a connection; over TCP when left out.
         left_out: Called with the name of a device that is not stored, because there are too many.
         clock: The clocks.
-        first_delay_s: Before a lost broker is tried once more; then longer, as ``Backoff`` has it [s].
+        first_delay_s: Delay before a lost broker is retried; it grows as in ``Backoff`` [s].
 
     Raises:
         UserError: A URL or a file of ``settings`` cannot be used.

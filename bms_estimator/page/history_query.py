@@ -66,8 +66,8 @@ class HistoryQuery:
         """Read a span of a pack's history as JSON columns; call it in ``thread``.
 
         Args:
-            pack: Its name.
-            name: Of ``SPANS``.
+            pack: Name of the pack.
+            name: One of ``SPANS``.
 
         Raises:
             UserError: The file is missing or cannot be read.

@@ -55,7 +55,7 @@ class PackTopics(LatestValues):
         """Take what a pack publishes, of the topics that are shown.
 
         Args:
-            pack: Its name.
+            pack: Name of the pack.
             topic: Below the pack's.
             value: The payload as JSON has it, or text; None: the topic was emptied.
         """

@@ -22,8 +22,8 @@ class PageSink:
 
     Args:
         pages: The servers of this process.
-        settings: Where it is shown.
-        pack: Its name.
+        settings: Settings of the page.
+        pack: Name of the pack.
         history: Location of its history; None: nowhere.
     """
 

@@ -25,7 +25,7 @@ class BootTimestamp:
     Attributes:
         wall_s: Wall clock [s since 1970]. Without a battery the clock stops while the machine is off.
         synchronised: Whether the wall clock is known to be right.
-        boot_s: Since the machine was started, its sleep included [s].
+        boot_s: Time since the machine started, including suspend [s].
         boot: Identifier of the boot; empty if unknown.
     """
 

@@ -14,7 +14,7 @@ class DiskThread(Executor):
     """Runs calls one after the other. The process ends without it: ``ThreadPoolExecutor`` would wait for a hung disk.
 
     Args:
-        name: Of the thread.
+        name: Name of the thread.
     """
 
     def __init__(self, name: str) -> None:

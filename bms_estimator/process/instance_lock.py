@@ -34,7 +34,7 @@ def instance_lock(folder: Path, pack: str) -> Iterator[None]:
 
     Args:
         folder: Folder of the pack's state.
-        pack: Its name.
+        pack: Name of the pack.
 
     Raises:
         UserError: Another process serves it.

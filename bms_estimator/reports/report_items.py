@@ -30,7 +30,7 @@ class Table:
 
     Attributes:
         key: "5" for Table 5 of the thesis; the name of one that is not in it.
-        title: Its caption.
+        title: Caption.
         columns: Headings.
         rows: One list of cells for each row.
         verdict: What became of it.
@@ -55,7 +55,7 @@ class Figure:
 
     Attributes:
         key: "19" for Figure 19 of the thesis.
-        title: Its caption.
+        title: Caption.
         svg: The plot, one ``<svg>`` element; empty for a diagram or photograph.
         verdict: What became of it.
         reason: Content, and difference from print with its reason.

@@ -35,7 +35,7 @@ class SensorChain:
     """Divider, current sensor, converter.
 
     Attributes:
-        bits: Of the converter: 10 for an Arduino, 16 for the dSpace board of the thesis.
+        bits: Number of bits of the converter: 10 for an Arduino, 16 for the dSpace board of the thesis.
     """
 
     bits: int

@@ -66,8 +66,8 @@ class OneStart:
     Attributes:
         start_v: x2(t0) + x3(t0), each half of it [V].
         start_error_v: e(t0) [V].
-        lambda_: Of (3.10).
-        alpha: Of (3.10), chosen and not fitted.
+        lambda_: lambda of (3.10).
+        alpha: Exponent alpha of (3.10), chosen and not fitted.
         scheme_1: The run of (3.16).
         scheme_2: The run of (3.17).
     """

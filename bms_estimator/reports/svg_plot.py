@@ -47,8 +47,8 @@ def plot(draw: Callable[[Any], None], *, rows: int = 1, columns: int = 1, salt: 
 
     Args:
         draw: Is given the axes: one, or an array of rows x columns.
-        rows: Of axes.
-        columns: Of axes.
+        rows: Number of rows of axes.
+        columns: Number of columns of axes.
         salt: Makes the ids of the SVG's parts its own, and the same at every run.
     """
     import matplotlib as mpl  # noqa: PLC0415  (an optional dependency)

@@ -30,7 +30,7 @@ class Result:
     """One claim on one capture.
 
     Attributes:
-        capture: Its name.
+        capture: Name of the capture.
         found: Measured value, in the claim's unit.
         limit: Limit of the value.
     """
@@ -53,7 +53,7 @@ class Claim:
         key: Mark in the tables: "mean, constant loads".
         where: Table or figure.
         criterion: Condition for more than half of the captures.
-        results: Of each capture that the claim can be tested on.
+        results: Results of each capture that the claim can be tested on.
     """
 
     key: str

@@ -29,12 +29,12 @@ class CheckpointWriter:
     """Saves what samples have taught; the disk is waited for in a thread, and nothing else waits for it.
 
     Args:
-        checkpoint: Where to.
+        checkpoint: Destination.
         estimator: Read only.
         publisher: Gets the result.
         tally: Totals over restarts.
         restarts: Starts that found a checkpoint.
-        every_s: How often is saved at least [s].
+        every_s: Maximum interval between two saves [s].
 
     Attributes:
         every_s: May be changed.

@@ -46,8 +46,8 @@ async def run(command: Sequence[str], text: bytes, variables: Mapping[str, str],
 
     Args:
         command: The program and its arguments.
-        text: Its standard input.
-        variables: Its environment.
+        text: Standard input.
+        variables: Environment.
         timeout_s: All that still runs after this time is killed [s].
 
     Returns:

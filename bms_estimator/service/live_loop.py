@@ -66,7 +66,7 @@ async def run_estimation_loop(
         settings: The pack's settings.
         cell: The pack as one object (``CellModel.pack``).
         source: Supplies samples; opened and closed here.
-        sinks: Where snapshots go; opened and closed here.
+        sinks: Destinations of the snapshots; opened and closed here.
         stop: Set to end cleanly.
         checkpoint: Where the state outlives a restart; None: it does not.
         requests: Dispatcher at which this loop registers its handlers.

@@ -55,7 +55,7 @@ class Publisher:
         cell: The pack as one object.
         estimator: Read only.
         source: Its counters, message and board are read.
-        sinks: Where snapshots go.
+        sinks: Destinations of the snapshots.
         clock: The clocks.
         tally: Totals over restarts; default: new totals.
         restarts: Starts that found a checkpoint.
@@ -63,14 +63,14 @@ class Publisher:
         delivery: Counters of sent messages and received requests.
         pulse: Whether the source lives; None: not reported.
         recording: State of a recording; None where nothing is recorded.
-        edge: Of raw samples on their way to a fleet; None where none are sent.
+        edge: State of the fleet edge; None without one.
         hooks: Successes and failures of alarm hooks; None without hooks.
         on_alarm: Called with each alarm that is raised or cleared.
 
     Attributes:
-        watch: Its alarms.
+        watch: Alarm monitor.
         checkpoint: Result of restoring the last checkpoint.
-        disk_free_mib: Where it is [MiB].
+        disk_free_mib: Free space in the state folder [MiB].
         log_lines_lost: Since start.
         kept: Charge and energy as the next start will find them; None: nothing will be found.
         latest: The last estimate that there was.

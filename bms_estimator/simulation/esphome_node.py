@@ -26,11 +26,11 @@ class SimulatedNode:
 
     Args:
         signal: What the pack has, by time [s].
-        cells: In series.
+        cells: Number of cells in series.
         mqtt: The broker.
         prefix: Name of the node.
-        speed: Its seconds per second.
-        seed: Of what its cells differ by.
+        speed: Speed relative to real time.
+        seed: Seed of the differences between the cells.
 
     Raises:
         UserError: The broker's URL cannot be used.

@@ -33,11 +33,11 @@ class SimulatedBms(SimulatedMeter):
     Args:
         protocol: A key of ``BMS_ANSWERS``.
         signal: The simulated pack.
-        cells: In series.
-        speed: Its seconds per second.
+        cells: Number of cells in series.
+        speed: Speed relative to real time.
         soc: SOC that it reports, 0..1.
         capacity_ah: Capacity that it reports.
-        seed: Of the differences between the cells, and of noise.
+        seed: Seed of the differences between the cells, and of noise.
 
     Raises:
         ValueError: No BMS of this protocol has that many cells.

@@ -23,7 +23,7 @@ class SimulatedMeter(ABC):
 
     Args:
         signal: The simulated pack.
-        speed: Its seconds per second.
+        speed: Speed relative to real time.
     """
 
     period_s = math.inf
@@ -169,8 +169,8 @@ class SimulatedPylontech(SimulatedMeter):
 
     Args:
         signal: The simulated pack.
-        speed: Its seconds per second.
-        cells: In series.
+        speed: Speed relative to real time.
+        cells: Number of cells in series.
     """
 
     def __init__(self, signal: Signal, *, speed: float = 1.0, cells: int = 15) -> None:

@@ -66,7 +66,7 @@ class VirtualConverter:
     Args:
         parts: The board as built.
         noise_lsb: Standard deviation of a conversion [steps of the converter].
-        seed: Of the noise.
+        seed: Seed of the noise.
     """
 
     def __init__(self, parts: BoardParts, noise_lsb: float, seed: int) -> None:

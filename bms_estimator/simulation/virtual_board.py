@@ -107,9 +107,9 @@ class VirtualBoard:
         speed: Board seconds per second; ``math.inf``: as fast as the host reads.
         parts: Its parts as built.
         noise_lsb: Noise of its converter [steps].
-        serial: Its serial number.
+        serial: Serial number.
         clock_us: Where its microseconds begin at each reset.
-        seed: Of noise and garbage.
+        seed: Seed of noise and garbage.
     """
 
     def __init__(

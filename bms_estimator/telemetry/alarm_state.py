@@ -33,7 +33,7 @@ class AlarmState:
 
     Attributes:
         watched: Definition of the alarm.
-        raising: Of an alarm that is active; None of one that is not.
+        raising: Time and value of an active alarm; None if inactive.
         cause_cleared: The cause is gone, but it is latched.
         acknowledged: True if acknowledged: the alarm ends once its cause is gone.
         known: A value has arrived.

@@ -18,7 +18,7 @@ def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parame
     """Return the values of ``[fuel_cell]`` as learned now, at the file's temperature.
 
     Args:
-        estimator: Of a fuel cell, after a sample; read only.
+        estimator: Estimator of a fuel cell, after a sample; read only.
         now_s: Wall clock [s since 1970].
     """
     a, covariance = estimator.state[0]["a"], ln_covariance(estimator)

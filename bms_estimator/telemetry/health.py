@@ -92,7 +92,7 @@ def make_health_payload(
         settings: Record of dtype ESTIMATOR_SETTINGS.
         line: The source's counters.
         now_s: Wall clock [s since 1970].
-        uptime_s: Since the service started [s].
+        uptime_s: Time since the service started [s].
         loop_lag_s: By how much the event loop woke too late at worst since the last report [s].
         restarts: Starts that found a checkpoint.
         checkpoint: Result of restoring the last checkpoint.
@@ -103,7 +103,7 @@ def make_health_payload(
         unseen_s: length of the last unmeasured gap [s]; None if there was none or it is unknown.
         loop: Delays of the event loop.
         recording: The state of one; None: nothing is recorded.
-        edge: Of raw samples on their way; None: none are sent.
+        edge: State of the fleet edge; None without one.
         hooks: Successes and failures of alarm hooks; None: none.
     """
     state = record["observer"]

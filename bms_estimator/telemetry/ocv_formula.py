@@ -16,7 +16,7 @@ class OcvFormulaFit(NamedTuple):
 
     Attributes:
         a: a16..a21.
-        std: Their standard errors; NaN for one at its bound.
+        std: Standard errors; NaN for one at its bound.
         rms_v: How far the formula lies off the table, RMS over SOC [V].
     """
 

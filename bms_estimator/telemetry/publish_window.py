@@ -17,7 +17,7 @@ class WindowSummary:
 
     Attributes:
         arrival_s: Wall clock at the arrival of the last block [s since 1970].
-        samples: How many.
+        samples: Number of samples.
         voltage_v: Mean [V].
         current_a: Mean [A], positive on discharge.
         power_w: Mean of voltage times current [W].

@@ -15,7 +15,7 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
     The error of ``r_s_ohm`` is the scatter of (4.2) about (2.9); before the fit it is not known.
 
     Args:
-        estimator: Of a battery, after a sample, with R_s by (4.2).
+        estimator: Estimator of a battery, after a sample, with R_s by (4.2).
     """
     from bms_estimator.calibration.thesis.series_resistance import LOWEST_SOC, fit_series_resistance, summed  # noqa: PLC0415 - most packs do not need it
 

@@ -41,7 +41,7 @@ def make_state_payload(
         counters: The source's.
         now_s: Wall clock [s since 1970].
         flow: Charge and energy at the terminals.
-        capacity_ah: Of the pack, rated; None of a fuel cell.
+        capacity_ah: Capacity of the pack, rated; None of a fuel cell.
     """
     values = zip(
         TRACE.names or (), window.last.item(), strict=True

@@ -34,8 +34,8 @@ class CleanCapture:
         temperature_c: Shape (n,), of the cell [C]; NaN where it was not measured.
         discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
         resting_samples: How many of the first samples are at rest.
-        samples: How many samples the capture had.
-        glitches: How many of them were left out as glitches.
+        samples: Number of samples in the capture.
+        glitches: Number of dropped glitches.
     """
 
     name: str

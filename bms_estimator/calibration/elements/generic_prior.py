@@ -46,9 +46,9 @@ def scaled_generic_ladder(
     """Return the generic resistances over SOC, scaled to those of the rests. Rests do not show growth in the cold and near empty.
 
     Args:
-        generic: Of ``nearest_generic_cell``.
+        generic: Result of ``nearest_generic_cell``.
         rests: None: as large as the generic cell's.
-        temperature_c: Of the rests [C].
+        temperature_c: Temperature of the rests [C].
     """
     ladder = generic.ladder
     if ladder is None:

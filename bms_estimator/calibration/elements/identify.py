@@ -86,8 +86,8 @@ class CaptureFit:
 
     Attributes:
         name: Name of the capture.
-        samples: How many it had.
-        glitches: How many were left out as glitches.
+        samples: Number of samples in the capture.
+        glitches: Number of dropped glitches.
         initial_soc: At the first sample, 0..1.
         temperature_c: Lowest and highest [C]; None without a sensor.
         miscount: Relative charge that the samples miss; the SOC of the fit has it.
@@ -175,7 +175,7 @@ def identify(
             show.
         refine_ocv: Correct the open-circuit voltage as well where that makes the replays better.
         initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
-        temperature_c: Of captures without a sensor; None: 25 C.
+        temperature_c: Temperature of captures without a sensor; None: 25 C.
 
     Raises:
         UserError: No capture with excitation; one that contradicts the cell: sign of the current, capacity, OCV; a

@@ -34,9 +34,9 @@ class InitialElements:
     Attributes:
         r_s_ohm: Series resistance, all that is faster than the capture's sampling [ohm].
         r_ts_ohm: Resistance of the short branch [ohm].
-        tau_ts_s: Its time constant [s].
+        tau_ts_s: Time constant [s].
         r_tl_ohm: Resistance of the long branch [ohm].
-        tau_tl_s: Its time constant [s].
+        tau_tl_s: Time constant [s].
     """
 
     r_s_ohm: float

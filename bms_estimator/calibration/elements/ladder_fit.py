@@ -118,7 +118,7 @@ class LadderFit:
         per_kelvin_v: u at ``KELVIN_NODES`` [V/K].
         weak_ohm: Shape (RESISTANCES, SOC_NODES.size) [ohm].
         strong_ohm: The same.
-        covariance: Of weak and strong resistances in this order, each by rows; None of the bounds counted.
+        covariance: Covariance of weak and strong resistances in this order, each by rows; None of the bounds counted.
     """
 
     correction: Floats
@@ -149,7 +149,7 @@ class Prior:
     Attributes:
         ocv_error_v: Shape (201,), std of the OCV at evenly spaced SOC [V]; tiny: held.
         per_kelvin_v: Std of u [V/K]; tiny: held.
-        scale_ohm: Of the resistances [ohm].
+        scale_ohm: Scale of the resistances [ohm].
         series: Cells in series.
         shapes: Shape (2, RESISTANCES, SOC_NODES.size), how the weak and the strong part of each resistance usually go along SOC.
         weak_share: Shape (RESISTANCES, SOC_NODES.size), of each resistance; None: only the captures count.
@@ -194,7 +194,7 @@ def moments(
         given_v: Shape (n,), the given OCV at SOC and temperature [V].
         slope_v: Shape (n,), its slope dE_o/dSOC [V].
         temperature_c: Shape (n,) [C].
-        scale_ohm: Of the resistances [ohm].
+        scale_ohm: Scale of the resistances [ohm].
         series: Cells in series.
         miscount: What the count was taken to be off, relative.
 

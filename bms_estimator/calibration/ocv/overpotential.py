@@ -60,7 +60,7 @@ def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Fl
     """Return the steady voltage drop across resistances ``first`` and later of a current that has flowed for hours [V].
 
     Args:
-        ladder: Of the cell.
+        ladder: RC ladder of the cell.
         current_a: Positive on discharge [A].
         soc: Shape (n,).
         temperature_c: Shape (n,) [C].

@@ -54,7 +54,7 @@ class Rest:
 
     Attributes:
         start_s: Time of its first sample on the capture's clock [s].
-        duration_s: How long it lasted [s].
+        duration_s: Duration [s].
         soc: State of charge 0..1 by coulomb counting.
         voltage_v: Voltage at its end [V].
         ocv_v: Voltage after an infinite rest, by exponential extrapolation [V].

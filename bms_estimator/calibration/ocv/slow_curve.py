@@ -61,7 +61,7 @@ class SlowBranch:
     """One slow discharge or charge.
 
     Attributes:
-        name: Of its capture.
+        name: Name of its capture.
         charge: Which of the two.
         ah: Shape (n,), charge moved since its start, increasing [Ah].
         voltage_v: Shape (n,) [V].
@@ -176,7 +176,7 @@ def slow_curves(
     """Pairs, and the remaining unpaired branches.
 
     Args:
-        branches: Of all captures.
+        branches: Branches of all captures.
         capacity_ah: Capacity that SOC is counted against [Ah].
         initial_soc: SOC at the first sample of each capture, 0..1.
         series_count: Cells in series, for values per cell.

@@ -67,9 +67,9 @@ class Source:
     """One source of points.
 
     Attributes:
-        name: Of its captures.
+        name: Name of its captures.
         kind: Recognized kind, such as "38 rests".
-        points: Its points.
+        points: Points.
         temperature_c: Mean [C]; NaN where it is not known.
         hysteresis_v: At ``GRID`` [V]; None if unknown.
         notes: Remarks.
@@ -97,7 +97,7 @@ class OcvSources:
         hysteresis_v: At ``NODES`` and 25 C [V], from the nearest source that shows it, as far as rests keep it; None
             when
             none does.
-        hysteresis_std_v: Its standard deviation [V].
+        hysteresis_std_v: Standard deviation [V].
         usual_hysteresis: It is no source's: ``center_on_typical_hysteresis``.
     """
 
@@ -287,7 +287,7 @@ def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
     """Lone slow curves without what their current takes in the branches: a pair has it twice, with both signs.
 
     Args:
-        found: Of ``find_sources``.
+        found: Result of ``find_sources``.
         ladder: RC ladder with its relative standard deviation, if known.
     """
     return replace(found, sources=tuple(_without_branches(one, ladder) for one in found.sources))
@@ -312,7 +312,7 @@ def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSourc
     """Shift sources that do not show hysteresis by half of a typical one, because discharges alone lie below the mean.
 
     Args:
-        found: Of ``find_sources``.
+        found: Result of ``find_sources``.
         usual_v: That of cells of the kind, as rests keep it, at ``NODES`` and 25 C [V].
     """
     on_grid_v = np.interp(GRID, NODES, usual_v)

@@ -42,7 +42,7 @@ class AdaptiveRun:
     """One run of the observer. Arrays over time have shape (n,), n the number of snapshots.
 
     Attributes:
-        time_s: Of the snapshots [s].
+        time_s: Time of the snapshots [s].
         soc: Counted, 0..1.
         current_a: Positive on discharge [A].
         voltage_v: y [V].
@@ -53,9 +53,9 @@ class AdaptiveRun:
         a: Shape (n, 16), a1..a15 at index 1..15.
         window: t_int and t_unst of (3.19).
         average: Shape (16,), (3.19).
-        crossings: Of a8 and a11.
+        crossings: Crossings of a8 and a11.
         epsilon_v: eps2 of Algorithm 1 [V].
-        lock_losses: How often the observer lost track.
+        lock_losses: Number of times that the observer lost track.
         outcome: "converged", or why not.
     """
 
@@ -90,7 +90,7 @@ def adaptive_run(
     Args:
         estimator: Fresh, or with a state to go on from.
         samples: Dtype ``SAMPLE``.
-        t_int_s: Of (3.19), instead of the one found [s].
+        t_int_s: t_int of (3.19), instead of the one found [s].
         t_unst_s: As above.
 
     Raises:

@@ -52,8 +52,8 @@ class SeriesResistanceFit:
 
     Attributes:
         a: a13 [ohm], a14, a15 [ohm].
-        std: Their standard errors; NaN for one at its bound.
-        rms_ohm: Of the residual, weighted as the fit is [ohm].
+        std: Standard errors; NaN for one at its bound.
+        rms_ohm: RMS of the residual, weighted as the fit is [ohm].
     """
 
     a: Floats

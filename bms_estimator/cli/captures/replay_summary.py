@@ -85,8 +85,8 @@ class Summary:
 
         Args:
             estimator: After the last sample.
-            read: How many samples the capture had.
-            wall_s: How long it took [s].
+            read: Number of samples in the capture.
+            wall_s: Duration [s].
         """
         record, settings = estimator.record[0], estimator.settings_record[0]
         state = record["observer"]

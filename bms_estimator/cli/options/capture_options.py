@@ -59,7 +59,7 @@ def check_once(captures: Sequence[Path]) -> None:
     """Refuse a capture that is given twice, under one name or two.
 
     Raises:
-        UserError: Which one.
+        UserError: The name of the duplicate.
     """
     for i, path in enumerate(captures):
         for other in captures[:i]:

@@ -28,7 +28,7 @@ def settings_file(model: type[BaseModel], given: Given = MappingProxyType({})) -
     """TOML text with each section and setting of ``model``: meaning, unit, constraint, default.
 
     Args:
-        model: Of the sections.
+        model: Model of the sections.
         given: Settings that are not left at their defaults.
     """
     lines = [HEAD]

@@ -124,7 +124,7 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
 
     Args:
         nc: Connected as the tenant.
-        pack: Its name.
+        pack: Name of the pack.
         since_s: Samples from then on, by the edge's clock [s since 1970].
         until_s: Samples before it.
 

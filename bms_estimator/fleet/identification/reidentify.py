@@ -51,7 +51,7 @@ class HoldoutError:
     """One cell on the samples that judge.
 
     Attributes:
-        rms_v: Of measured less predicted voltage, of one object of the cell file [V]; infinite where its SOC left 0..1.
+        rms_v: RMS of measured minus predicted voltage of one cell-file object [V]; infinite if its SOC left 0..1.
         samples: Number of samples above SOC 0.1.
     """
 
@@ -64,13 +64,13 @@ class ReidentificationResult:
     """Result for one pack.
 
     Attributes:
-        pack: Its name.
+        pack: Name of the pack.
         reason: Why it has no new cell; empty where it has one.
         method: ``learned`` or ``fitted``: how the best new cell was found; empty without any.
         cell_file: The text of the new cell's file; empty without one that is better.
         hours: From its first to its last sample.
-        capacity_ah, capacity_std_ah: Of the best new cell, one object of its file; NaN without any.
-        capacity_before_ah: Of the one that it had.
+        capacity_ah, capacity_std_ah: Capacity of the best new cell, one object of its file; NaN without any.
+        capacity_before_ah: Capacity of the old cell.
         r_s_ohm, r_s_before_ohm: Series resistance at SOC 0.5 and 25 C of the same.
         rms_before_v, rms_v: Judged: of the cell that it had, and of the best new one.
         judged: Samples that judged.
@@ -106,7 +106,7 @@ def reidentify(pack: str, samples: SampleBlock, kind: PackSpec, cell_file: str |
     """Identify one pack.
 
     Args:
-        pack: Its name.
+        pack: Name of the pack.
         samples: Dtype ``SAMPLE``, as the pack has sent them.
         kind: Row of the pack's kind.
         cell_file: The text of the cell file that it names, if it does.

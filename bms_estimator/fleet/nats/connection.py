@@ -87,7 +87,7 @@ async def connect(
 
     Args:
         servers: ``nats://`` or ``tls://`` and host:port; several with commas between.
-        name: Of this connection, in the server's lists.
+        name: Name of this connection, in the server's lists.
         creds: File of the tenant's credentials, as ``fleet serve`` made it; None: none are required.
         ca: Certificate of the authority that has signed the server's; None: those of the system.
         linked: Called with why there is no connection, and with None when there is one again.

@@ -19,7 +19,7 @@ async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -
 
     Args:
         nc: Connected.
-        stream: Its name; it must allow direct gets.
+        stream: Name of the stream; it must allow direct gets.
         subject: May have wildcards.
         first: Sequence in the stream.
         last: That of a message which the subject covers.

@@ -40,8 +40,8 @@ async def read_stream(
 
     Args:
         nc: Connected.
-        stream: Its name; it must allow direct gets.
-        subject: Of the messages; may have wildcards.
+        stream: Name of the stream; it must allow direct gets.
+        subject: Subject of the messages; may have wildcards.
         first: Sequence number from which on.
         since_s: Wall clock from which stored messages are read, in place of ``first`` [s since 1970].
 

@@ -64,7 +64,7 @@ async def make_streams(
 
     Args:
         nc: Connected as the tenant.
-        partitions: Of ``RAW``; it has them for ever.
+        partitions: Number of partitions of ``RAW``, which cannot change.
         replicas: 1, or 3 in a cluster of three.
         raw_bytes: ``RAW`` keeps no more; beyond it the oldest is dropped.
         raw_age_s: Nor anything older.

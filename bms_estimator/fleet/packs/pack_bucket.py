@@ -41,7 +41,7 @@ class PackBucket:
 
     Attributes:
         packs: Known packs, as a function of the name.
-        faults: How often the server could not be read.
+        faults: Number of times that the server could not be read.
         fault: Why, the last time; empty while it can.
     """
 
@@ -118,7 +118,7 @@ async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, 
 
     Args:
         nc: Connected.
-        bucket: Its name.
+        bucket: Name of the bucket.
         values: By key.
         remove: Remove entries that are not in ``values``.
 

@@ -26,12 +26,12 @@ class PackType:
     """Settings, estimator and digests that packs of one type share.
 
     Attributes:
-        settings: Of the packs, but for the name.
+        settings: Settings of the packs, but for the name.
         made_of: Digest of all that the estimator is made of.
         state_digest: Digest of all that gives a state its meaning; under another one it restarts.
         estimator: Works on the record of the partition.
         meter: Counts for one pack after the other.
-        capacity_ah: Of the pack, rated; None of a fuel cell.
+        capacity_ah: Capacity of the pack, rated; None of a fuel cell.
     """
 
     settings: PackSettings
@@ -74,7 +74,7 @@ class PackTypes:
         """Return the type of packs with these settings; cached by the identity of both objects.
 
         Args:
-            settings: Of the packs.
+            settings: Settings of the packs.
             cell: A pack as one object (``CellModel.pack``).
         """
         key = id(settings), id(cell)
@@ -109,7 +109,7 @@ def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
     """Return the estimator of packs with these settings, shared by all partitions of a process.
 
     Args:
-        settings: Of the packs.
+        settings: Settings of the packs.
         cell: A pack as one object (``CellModel.pack``).
     """
     return _estimator(_Recipe(config_digest(settings, cell), settings, cell))

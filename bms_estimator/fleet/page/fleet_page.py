@@ -44,7 +44,7 @@ async def fleet_page(
     """Serve while the context lasts.
 
     Args:
-        server: Of the fleet.
+        server: Address of the fleet's server.
         settings: Where the page is served.
         hours: Folder of the Parquet files for queries; None: none are.
         step_s: Between two pictures of the fleet [s].

@@ -18,8 +18,8 @@ def answer(folder: Path, name: str) -> dict[str, Any]:
     """Return the result of one of the queries in ``ASKED``.
 
     Args:
-        folder: Of the hours, as ``fleet collect`` writes it.
-        name: Of the question.
+        folder: Folder of the hours, as ``fleet collect`` writes it.
+        name: Name of the question.
 
     Returns:
         ``columns``, the first ``rows``, and their number (``count``); or the reason why they are missing (``reason``).

@@ -47,9 +47,9 @@ class Collector:
 
     Args:
         nc: Connected as the tenant; it reconnects by itself.
-        folder: Of the days.
+        folder: Folder of the days.
         period_s: Maximum time that a row waits for its file [s].
-        clock: Of wall and monotonic time.
+        clock: Wall and monotonic clock.
 
     Attributes:
         counters: ``rows`` written, ``files``, ``unreadable`` messages, ``faults`` of server and disk.
@@ -157,7 +157,7 @@ def compact_days(folder: Path, now_s: float) -> None:
     """Make one file of the many of days that need it; disk errors are logged, and retried later.
 
     Args:
-        folder: Of the days.
+        folder: Folder of the days.
         now_s: Wall clock [s since 1970].
     """
     for day in to_compact(folder, now_s):

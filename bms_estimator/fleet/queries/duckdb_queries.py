@@ -98,8 +98,8 @@ def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limit
     """Answer one of ``QUESTIONS``.
 
     Args:
-        folder: Of the days, as ``fleet collect`` writes it.
-        name: Of the question.
+        folder: Folder of the days, as ``fleet collect`` writes it.
+        name: Name of the question.
         days: Number of last days with rows, whole days UTC; None: all.
         limits: Assumed limits.
 

@@ -43,7 +43,7 @@ def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
     """Rows into a new file for each of their days; they are on the disk when this returns.
 
     Args:
-        folder: Of the days; made where it is missing.
+        folder: Folder of the days; created if missing.
         rows: In any order.
 
     Returns:
@@ -98,7 +98,7 @@ def to_compact(folder: Path, now_s: float) -> list[Path]:
     """Folders of days whose files should be merged: closed for the first time, or with ``MANY`` files.
 
     Args:
-        folder: Of the days.
+        folder: Folder of the days.
         now_s: Wall clock [s since 1970].
     """
     closed = datetime.fromtimestamp(now_s - CLOSED_S, UTC).date().isoformat()

@@ -39,7 +39,7 @@ def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: date
     """Claims of the operator and of all tenants, with what keys are missing for them made.
 
     Args:
-        folder: Of the keys; made where it is missing.
+        folder: Folder of the keys; created if missing.
         tenants: By name.
         now: When credentials that are made are made.
 
@@ -75,7 +75,7 @@ def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: dat
     """Make the token that an edge sends as MQTT password.
 
     Args:
-        folder: Of the keys.
+        folder: Folder of the keys.
         tenant: Tenant of the pack.
         pack: The only one that it may write.
         now: Revocation looks at it.

@@ -196,7 +196,7 @@ def user(signer: Key, account_key: str, role: Role, name: str, made: datetime, e
         signer: That of the role.
         account_key: The account's public key.
         role: What the user is; the bearer of an edge's token is the edge.
-        name: Of the user; of an edge, its pack's.
+        name: Name of the user; of an edge, its pack's.
         made: Revocation looks at it.
         expires: From when on it is refused; None: never.
     """

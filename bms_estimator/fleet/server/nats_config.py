@@ -74,7 +74,7 @@ class Node:
         cluster: The other nodes; None: it is alone.
         tls: For all ports but the monitor's; None: none.
         accounts: Accounts of the tenants; None: whoever reaches it, as one tenant.
-        partitions: Of the stream ``RAW``.
+        partitions: Number of partitions of the stream ``RAW``.
         disk_bytes: The most that streams take; None: the server's default, three quarters of the free space.
         memory_bytes: As above.
         sync_s: Interval between two fsyncs [s]; None: each message before it is acknowledged.

@@ -94,7 +94,7 @@ class ServerSpec:
     """Settings of the server.
 
     Attributes:
-        settings: Of the fleet.
+        settings: Settings of the fleet.
         accounts: Accounts of the tenants; None: whoever reaches it.
     """
 
@@ -151,7 +151,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], say: Callab
     """Run a node until it ends. SIGHUP reloads its settings: tenants, limits, revoked users.
 
     Args:
-        place: Of this node.
+        place: Location of this node.
         read: Its settings; called at start and at each SIGHUP.
         say: Receives lines for people: addresses and created streams.
 

@@ -102,9 +102,9 @@ class Demo:
     """Parameters of a demo.
 
     Attributes:
-        packs: How many.
+        packs: Number of packs.
         seconds: How long edges send.
-        page_port: Of the page.
+        page_port: Port of the page.
         folder: For the server's files and all logs.
         say: Receives the progress, line by line.
         opened: Called with the page's address.

@@ -108,13 +108,13 @@ class SimulatedFleet:
     """A fleet of ``packs`` packs.
 
     Args:
-        packs: How many.
+        packs: Number of packs.
         seed: Another seed, another fleet.
         begin_ns: When the first edge's store was made [ns since 1970]; the others' follow within a minute.
-        prefix: Of the packs' names.
+        prefix: Prefix of the packs' names.
 
     Attributes:
-        names: Of the packs.
+        names: Names of the packs.
         store: When each edge's store was made [ns since 1970], shape (packs,).
         truth: The true values.
     """

@@ -92,7 +92,7 @@ def edge_reply(order: BlockOrder, d: np.void, block: Block, *, first: bool) -> B
         order: Order of the block.
         d: As in ``classify_block``, after the block.
         block: The received block.
-        first: Of this pack, since these partitions were taken over.
+        first: True for the first block of this pack since the takeover.
     """
     store, number = int(d["store"]), int(d["awaited"])
     if order is BlockOrder.AHEAD:

@@ -52,7 +52,7 @@ class BlockProcessor:
         """Take the pack's next block.
 
         Args:
-            pack: Its name.
+            pack: Name of the pack.
             block: It; time stamps that cannot be become NaN.
             of_type: The pack's type; its estimator works on the bench.
             former: Fields of its estimator as another version left them; None: they are on the bench.

@@ -86,8 +86,8 @@ class PartitionCheckpoint:
     """A partition at one moment.
 
     Attributes:
-        number: Of the partition.
-        sequence: Of the last message of the stream that it holds.
+        number: Number of the partition.
+        sequence: Stream sequence of the last included message.
         counters: By name.
         packs: Packed records by pack, of this version's layout.
         former: The same for packs with a record of another version.

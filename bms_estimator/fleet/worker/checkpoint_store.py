@@ -141,7 +141,7 @@ class CheckpointStore:
 
         Args:
             claim: As the last write left it.
-            sequence: Of the stream: the last message that is in it.
+            sequence: Stream sequence of the last included message.
             chunks: Its bytes; taken in a thread.
 
         Raises:

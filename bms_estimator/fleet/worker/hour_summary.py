@@ -57,7 +57,7 @@ def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> No
         sums: Updated in place.
         trace: What the estimator made of the block's samples.
         block: The same.
-        estimator: Of the pack, or of any of its type: only its settings are read.
+        estimator: Estimator of the pack, or of any of its type: only its settings are read.
     """
     settings = estimator.settings[0]
     rest_a = REST_C * float(settings["capacity_as"]) / HOUR_S
@@ -72,7 +72,7 @@ def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour
     Args:
         pack: Type of the pack, from its settings.
         hour: Hours since 1970.
-        sums: Of the hour; read only.
+        sums: Sums of the hour; read only.
         estimator: With the pack's state at the hour's end; read only.
     """
     h, record = sums[0], estimator.record[0]

@@ -96,7 +96,7 @@ class WorkRecord:
         """Store a pack's record of another layout, except for its estimator, as far as the fields match.
 
         Args:
-            dtype: Of its record.
+            dtype: Dtype of its record.
             packed: It.
 
         Returns:

@@ -61,7 +61,7 @@ class Partition:
     """The packs of one partition.
 
     Args:
-        number: Of the partition.
+        number: Number of the partition.
         table: The packs' settings.
         wall: Wall clock of the publications [s since 1970].
 

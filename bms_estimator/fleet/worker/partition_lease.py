@@ -51,7 +51,7 @@ class PartitionLease:
 
     Args:
         nc: Connected.
-        number: Of the partition.
+        number: Number of the partition.
         table: What each pack is.
         keeping: Where checkpoints are.
         inbox: As ``PinnedConsumer`` has it.

@@ -52,7 +52,7 @@ def nernst(temperature_k: float, hydrogen_atm: float, oxygen_atm: float) -> floa
     """Reversible voltage of one cell [V].
 
     Args:
-        temperature_k: Of the cell [K].
+        temperature_k: Temperature of the cell [K].
         hydrogen_atm: Partial pressure at the anode [atm].
         oxygen_atm: Partial pressure at the cathode [atm].
     """

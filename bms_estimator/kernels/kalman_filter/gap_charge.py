@@ -71,7 +71,7 @@ def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
     """Variance of the charge that moved in ``dt_s`` beside the straight line between two samples [A^2 s^2].
 
     Args:
-        change_a: Of the current from the one to the other [A].
+        change_a: Change of the current between the two [A].
         dt_s: Between them [s].
     """
     return BETWEEN * (change_a * dt_s) ** 2 if dt_s > SLOW_S else 0.0

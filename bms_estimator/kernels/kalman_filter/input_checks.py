@@ -132,8 +132,8 @@ def passes_innovation_gate(
         f: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
         e: Record of EQUIVALENT.
-        dt_s: Since the sample before [s].
-        change_a: Of the current since then [A].
+        dt_s: Time since the sample before [s].
+        change_a: Change of the current since then [A].
         current_a: Current [A].
         voltage_v: Voltage [V].
     """

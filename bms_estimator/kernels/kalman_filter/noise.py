@@ -177,7 +177,7 @@ def add_gap_noise(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: fl
         p: Record of EKF_SETTINGS.
         cov: Shape (STATES, STATES), updated.
         f: Diagonal of F over that time.
-        std_a: Of the current [A].
+        std_a: Standard deviation of the current [A].
         soc_per_a: SOC drawn per ampere [1/A].
     """
     for j in range(SOC, X + BRANCHES):

@@ -41,10 +41,10 @@ class PolledProtocol(ReadingProtocol):
     cut into reads changes no value but the times.
 
     Args:
-        name: Of the device, for people.
+        name: Name of the device, for people.
         start: What a frame begins with.
         current_sign: What the device calls positive; samples are positive on discharge.
-        address: Of several devices on one line, the one that is taken; None: the first that answers.
+        address: Address of the device on a shared line; None: the first that responds.
     """
 
     def __init__(

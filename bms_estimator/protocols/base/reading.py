@@ -130,10 +130,10 @@ def sample_json_line(
     """Return the JSON line of one sample.
 
     Args:
-        voltage_v: Of the pack's terminals [V].
+        voltage_v: Voltage of the pack's terminals [V].
         current_a: As the device counts it [A]; ``sensor.current_sign`` gives the sign.
         temperature_c: None or NaN: not measured [degC].
-        cells_v: Of single cells, from the first on; None or NaN: this one was not measured [V].
+        cells_v: Cell voltages, from the first on; None or NaN: not measured [V].
         time_s: Time of measurement by the device's clock, with any origin; None: not reported [s].
 
     Raises:

@@ -44,7 +44,7 @@ class DalyProtocol(PolledProtocol):
 
     Args:
         current_sign: Direction of positive current; by its documentation discharge.
-        address: Of several BMS on one line, the one that is taken; None: the first that answers.
+        address: Address of the BMS on a shared line; None: the first that responds.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive", address: int | None = None) -> None:

@@ -77,7 +77,7 @@ class JkProtocol(PolledProtocol):
 
     Args:
         current_sign: Direction of positive current; by its documentation charge.
-        address: Of several packs on one line, the one that is taken; None: the first that answers.
+        address: Address of the pack on a shared line; None: the first that responds.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive", address: int | None = None) -> None:

@@ -34,7 +34,7 @@ class JunctekProtocol(ReadingProtocol):
     """Lines of a battery monitor to samples. It is polled once a second.
 
     Args:
-        current_sign: Of the current that its direction makes positive on charge.
+        current_sign: Direction of positive current; by its documentation charge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:

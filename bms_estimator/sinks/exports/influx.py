@@ -63,7 +63,7 @@ class InfluxSink:
 
     Args:
         settings: The server.
-        first_delay_s: Before a server that is away is tried once more; then longer, as ``Backoff`` has it [s].
+        first_delay_s: Delay before a server that is away is retried; it grows as in ``Backoff`` [s].
 
     Raises:
         UserError: A file of ``settings`` cannot be used.

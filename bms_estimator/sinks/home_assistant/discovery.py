@@ -70,7 +70,7 @@ def discovery(
         settings: Settings of Home Assistant.
         described: What there is of it.
         root: Topic of the device, ``bms/<device>``.
-        sample_period_s: Between two samples [s].
+        sample_period_s: Sample period [s].
     """
     info = described.info
     device = {

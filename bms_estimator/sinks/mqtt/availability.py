@@ -28,7 +28,7 @@ class AvailabilityMonitor:
         delivery: Corrections are counted there.
         refusals: Reports an ``online`` that does not come back.
         wake: Called when it is time to ``correct``.
-        echo_s: Until a broker has given back ``online`` [s].
+        echo_s: Time within which a broker must return ``online`` [s].
     """
 
     def __init__(

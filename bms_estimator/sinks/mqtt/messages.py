@@ -39,13 +39,13 @@ class MessageBuilder:
     Args:
         base_topic: First part of all topics.
         device: Name of the pack.
-        sample_period_s: Between two samples, where that may be longer than the publish period [s].
+        sample_period_s: Sample period, where that may be longer than the publish period [s].
         home_assistant: Settings of Home Assistant.
-        alarms: Those that are watched: what a broker keeps of others, from other settings, is removed.
+        alarms: Monitored alarms; retained messages of others are removed.
 
     Attributes:
-        root: Of all topics.
-        commands: Those that are allowed.
+        root: Root of all topics.
+        commands: Allowed commands.
 
     Raises:
         UserError: ``home_assistant`` names what there is not.

@@ -40,7 +40,7 @@ class RequestDispatcher:
 
     Args:
         delivery: Requests are counted there, by what became of them.
-        commands: Those that are allowed.
+        commands: Allowed commands.
         monotonic: Monotonic clock [s].
     """
 
@@ -96,7 +96,7 @@ class RequestDispatcher:
 
         Args:
             kind: Counter.
-            name: Of the request.
+            name: Name of the request.
             why: Fields for the log.
         """
         self._counts[kind] += 1
@@ -122,7 +122,7 @@ class RateLimiter:
     """Rate limiter: a number of requests in a minute, at once or spread.
 
     Args:
-        per_minute: How many.
+        per_minute: Number of requests.
         monotonic: Monotonic clock [s].
     """
 

@@ -51,12 +51,12 @@ class MqttSink:
         delivery: Counters of sent messages.
         outbox: What must reach the broker.
         connect: Makes a connection; over TCP when left out.
-        sample_period_s: Between two samples, where that may be longer than the publish period [s].
+        sample_period_s: Sample period, where that may be longer than the publish period [s].
         home_assistant: Settings of Home Assistant.
-        alarms: Those that are watched.
-        first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
-        birth_delay_s: From Home Assistant's birth message to the retained messages [s].
-        echo_s: Until a broker has given back ``online`` [s].
+        alarms: Monitored alarms.
+        first_delay_s: Delay before a lost broker, or a temporary rejection, is retried [s].
+        birth_delay_s: Delay from Home Assistant's birth message to the retained messages [s].
+        echo_s: Time within which a broker must return ``online`` [s].
 
     Raises:
         UserError: A URL or a file of ``settings`` cannot be used.

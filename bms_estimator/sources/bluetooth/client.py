@@ -25,7 +25,7 @@ class BleProducer(LineProducer):
     """Polls a BMS. It stays connected: most take seconds to connect.
 
     Args:
-        settings: Of the BMS.
+        settings: Settings of the BMS.
 
     Raises:
         UserError: aiobmsble does not support this BMS.

@@ -39,7 +39,7 @@ class CaptureRecorder:
         sync_s: Interval at which data are synced to the disk [s].
 
     Attributes:
-        bytes: Of the line, taken so far.
+        bytes: Number of recorded bytes.
         ended: Done when the recording has ended; holds the ``OSError`` if one has ended it.
 
     Raises:

@@ -80,7 +80,7 @@ class CsvTable:
 
     Args:
         path: The file.
-        sign: Of its current.
+        sign: Sign of its current.
     """
 
     def __init__(self, path: Path, sign: Sign) -> None:
@@ -167,7 +167,7 @@ class ParquetTable:
 
     Args:
         path: The file.
-        sign: Of its current.
+        sign: Sign of its current.
     """
 
     def __init__(self, path: Path, sign: Sign) -> None:

@@ -31,7 +31,7 @@ class CanProducer(LineProducer):
     """Listens to a bus in a thread of its own: most adapters can only be waited for.
 
     Args:
-        settings: Of the bus.
+        settings: Settings of the bus.
 
     Raises:
         UserError: There is no such interface, or the DBC file does not fit.

@@ -127,7 +127,7 @@ class CanMap:
 
         Args:
             arrival_s: On any clock that never steps back [s].
-            identifier: Of the frame.
+            identifier: Identifier of the frame.
             extended: Whether it has 29 bits.
             data: What the frame holds.
         """

@@ -50,7 +50,7 @@ class ModbusProducer(LineProducer):
     temperature and cells are left out.
 
     Args:
-        settings: Of the device.
+        settings: Settings of the device.
     """
 
     def __init__(self, settings: ModbusSource) -> None:

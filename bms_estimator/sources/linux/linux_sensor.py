@@ -39,7 +39,7 @@ class LinuxSensor(LineProducer):
 
     Args:
         settings: Which chip, its files, divider and shunt.
-        root: Of sysfs.
+        root: Root of sysfs.
         hung_s: Timeout of the bus [s].
     """
 

@@ -67,8 +67,8 @@ def find_chip(chip: str, root: Path = SYS) -> Path:
     """Folder of a chip of hwmon or iio.
 
     Args:
-        chip: Its name (``ina226``), its place on the bus (``1-0040``), or the folder itself.
-        root: Of sysfs.
+        chip: Name (``ina226``), its place on the bus (``1-0040``), or the folder itself.
+        root: Root of sysfs.
 
     Raises:
         SourceUnavailableError: No chip, or more than one, has this name.
@@ -94,7 +94,7 @@ def find_channel(name: str, chip: str, root: Path = SYS) -> Channel:
     Args:
         name: As ``LinuxSource.voltage``: a file or iio channel of the chip, ``other_chip/name``, or a path.
         chip: The chip.
-        root: Of sysfs.
+        root: Root of sysfs.
 
     Raises:
         SourceUnavailableError: No such channel.

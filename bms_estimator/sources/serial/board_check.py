@@ -32,7 +32,7 @@ class BoardCheck:
 
     Args:
         make: Creates a decoder for pending chunks.
-        serial: Of the pack's board, as the settings have it; empty: the stored one, otherwise that of the first
+        serial: Serial number of the pack's board, as the settings have it; empty: the stored one, otherwise that of the first
             board.
         memory: What outlives a restart; None: nothing does.
     """

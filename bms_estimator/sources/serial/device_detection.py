@@ -137,7 +137,7 @@ class BoardClient:
 
     Args:
         port: Device path; opened for ourselves alone.
-        baud: Of the board [1/s].
+        baud: Baud rate of the board [1/s].
 
     Raises:
         NoPortError: The port cannot be opened.

@@ -99,7 +99,7 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
     """Open a port for ourselves alone.
 
     Args:
-        path: Of the device.
+        path: Path of the device.
         baud: [1/s].
         timeout_s: How long a read waits [s].
 

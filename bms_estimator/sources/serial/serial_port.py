@@ -35,10 +35,10 @@ class SerialPort:
         say: Called with the reason why the port is not open.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
-        first_retry_s: Before a missing or lost port is tried again [s].
+        first_retry_s: Delay before a missing or lost port is retried [s].
 
     Attributes:
-        openings: How often it was opened.
+        openings: Number of times that it was opened.
         lost: Set when the port has died, or to request its end.
     """
 

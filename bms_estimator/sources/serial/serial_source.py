@@ -54,7 +54,7 @@ class SerialSource:
         tap: Gets the same (arrival time, bytes) as the decoder.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
-        first_retry_s: Before a missing or lost port is tried again [s].
+        first_retry_s: Delay before a missing or lost port is retried [s].
         silent_s: Time without a frame that counts as a fault of the line [s].
     """
 
