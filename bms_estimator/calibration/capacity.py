@@ -54,8 +54,8 @@ class Anchor:
         capture: Name of its capture.
         part: Number of the continuous part, over all captures.
         time_s: Time of its end, on the capture's clock [s].
-        rest: As it was found.
-        soc: By its voltage.
+        rest: The detected rest.
+        soc: SOC by its voltage.
         soc_std: Standard deviation of soc, with the error of the curve.
         counted_ah: Drawn since the part began [Ah].
         moved_ah: Magnitude of the charge moved since then [Ah].
@@ -105,7 +105,7 @@ def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std
 
     Args:
         captures: Captures of one cell, within weeks.
-        cell: Its open-circuit voltage counts, with its error; its capacity defines small currents only.
+        cell: Supplies the open-circuit voltage with its error; its capacity defines small currents only.
         offset_std_a: Standard deviation of the offset of the current sensor [A]; None: as the identifier takes it.
 
     Raises:

@@ -75,7 +75,7 @@ class FuelCellFit:
 
     Attributes:
         model: The stack with its parameters, and their errors in ``std``.
-        rms_v: By the name of each source, what the fit leaves of its voltage [V].
+        rms_v: Residual voltage by the name of each source, RMS [V].
         not_told: Reason why a parameter kept the value of the file, by its key in ``[fuel_cell]``.
     """
 

@@ -49,7 +49,7 @@ class Validation:
         final_soc: SOC at the last sample, counted.
         all: Over all samples.
         above: Over the samples at SOC above ``LOW_SOC``.
-        resting: Those without current: error of the open-circuit voltage, and remaining relaxation.
+        resting: Samples without current: error of the open-circuit voltage, and remaining relaxation.
         loaded: Samples above SOC 0.1 with current.
         extra_ohm: Series resistance that would make the error over ``above`` least: contacts, temperature, age [ohm].
         without_extra_ohm: The error over ``above`` with that resistance.

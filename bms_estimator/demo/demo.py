@@ -53,7 +53,7 @@ async def run_demo(
         speed: The board's seconds per second.
         port: Port of the broker; None: 1883, or a free one.
         page_port: Port of the live page; None: 8765, or a free one.
-        seconds: How long; None: until a signal.
+        seconds: Duration; None: until a signal.
         log: Log lines for the live view.
         opened: Called with the address of the live page once it is served.
 

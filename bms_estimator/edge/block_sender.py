@@ -54,7 +54,7 @@ class BlockSender:
         pack: Name of the pack.
         folder: Folder of the blocks, in ``<pack>.edge.sqlite``.
         connect: Makes a connection; over TCP when left out.
-        clock: Its wall clock dates samples.
+        clock: Clock; its wall time dates samples.
         steady: A clock that never steps and continues during suspend [s].
         most_samples: Maximum number of samples of a block.
         first_delay_s: Delay before a lost broker, or a temporary rejection, is retried [s].

@@ -37,11 +37,11 @@ class BlockStore:
     """Keeps blocks in order until a worker has them, as ``mqtt.queue_sender.MessageQueue``.
 
     Args:
-        database: With ``EDGE_TABLES``, synced at each transaction; opened and closed by its owner.
-        topic: Where blocks are published.
+        database: Database with ``EDGE_TABLES``, synced at each transaction; opened and closed by its owner.
+        topic: Topic of the blocks.
         most_bytes: Maximum size of blocks on disk; beyond it the oldest is dropped.
         wall: Wall clock [s since 1970].
-        resend_s: Between two times that the same block is sent again on request [s].
+        resend_s: Minimum interval between two resends of one block [s].
 
     Attributes:
         connected: True if a broker is connected, as set by the sender.

@@ -51,7 +51,7 @@ class SampleClock:
         """Return timestamps of samples that have just arrived [s since 1970].
 
         Args:
-            told_s: By the source's clock [s], shape (n,); a non-finite time counts as that of the previous sample.
+            told_s: Times on the source's clock [s], shape (n,); a non-finite time counts as that of the previous sample.
             wall_s: Wall clock now [s since 1970].
             steady_s: A clock that never steps and continues during suspend [s].
         """

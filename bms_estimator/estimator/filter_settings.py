@@ -56,7 +56,7 @@ def filter_settings(
 
     Args:
         cell: The pack as one object.
-        grid: Its open-circuit voltage and the slope of that, as ``records.ocv_grid`` makes them [V].
+        grid: Open-circuit voltage and its slope, from ``records.ocv_grid`` [V].
         identifier: Section ``[identifier]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.

@@ -107,7 +107,7 @@ class FuelCellModel(Strict):
         """Return the model of ``series`` x ``parallel`` stacks: voltages, resistance, capacitance and currents scaled.
 
         Raises:
-            UserError: Their exchange current is 1 A and more: no activation loss at 1 A is left to be learned.
+            UserError: The exchange current is 1 A or more, which leaves no activation loss at 1 A to learn.
         """
         if series == parallel == 1:
             return self

@@ -76,8 +76,8 @@ class Client(aiomqtt.Client):
 
     Args:
         arguments: Address, name, password and TLS for aiomqtt.
-        protocol: Which MQTT.
-        hello: How it begins.
+        protocol: MQTT version.
+        hello: Connect options.
         patience: When it is taken as lost.
     """
 

@@ -19,7 +19,7 @@ class DeniedTopics:
     Args:
         delivery: The topics are named there.
         say_again: Sends all retained messages again.
-        first_delay_s: From a refusal for now to that; doubles with each time [s].
+        first_delay_s: Delay after a temporary rejection; doubles each time [s].
     """
 
     def __init__(self, delivery: DeliveryStats, say_again: Callable[[], object], first_delay_s: float) -> None:

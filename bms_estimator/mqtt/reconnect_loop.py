@@ -26,7 +26,7 @@ class ReconnectLoop:
 
     Args:
         brokers: In the order in which they are tried.
-        hello: How each connection begins.
+        hello: Connect options.
         connect: Makes a connection.
         serve: Uses it until it is lost or the link is closed.
         delivery: What went wrong is noted there.

@@ -18,9 +18,9 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
     """Serve while the context lasts.
 
     Args:
-        broker: Where packs publish.
-        settings: Where the page is served.
-        folder: Where histories are, of the packs that are served on this machine.
+        broker: Settings of the broker.
+        settings: Address and access of the page.
+        folder: State folder of packs served on this machine, for their histories.
 
     Yields:
         The page's address.

@@ -33,7 +33,7 @@ class PageServer(WebServer):
     """Serves a hub while the context lasts.
 
     Args:
-        settings: Where, and to whom.
+        settings: Address and access of the page.
         hub: Present state of the packs.
         past: History of the packs.
         opened: Called with its address once it is served.

@@ -60,7 +60,7 @@ class WebServer:
     """Serves while the context lasts.
 
     Args:
-        settings: Where, and to whom.
+        settings: Address and access of the page.
         files: Static files by the path of their URL.
         newest: Content of the event stream ``/events``.
         handlers: What else is answered, by path.

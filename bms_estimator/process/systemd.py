@@ -17,7 +17,7 @@ class SystemdNotifier:
 
     Args:
         packs: Names of the packs.
-        environment: Where ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC`` are looked up.
+        environment: Environment with ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC``.
         doing: Text for people.
     """
 

@@ -94,8 +94,7 @@ class Procedure:
     """Chapter 5 on one pack.
 
     Args:
-        cell: Its capacity, its limits, and the bounds of (3.18) where it has any, else those of Table 10; its elements
-            and OCV are not used but estimated.
+        cell: Supplies capacity, limits, and the bounds of (3.18) if it has any, otherwise those of Table 10; its elements and OCV are not used.
         captures: At least one relaxation test, and one constant load or steps; discharging.
         voltage_step_v: One step of the voltage converter [V].
     """

@@ -34,11 +34,11 @@ class Measured:
     """One run.
 
     Attributes:
-        bounds: Which.
+        bounds: Description of the bounds.
         c_rate: Current over capacity [1/h].
         tracking_v: Largest |e| from ``SETTLED_FROM_S`` to t_unst [V].
         error_percent: Mean error over SOC of R_ts C_ts and R_tl C_tl [%].
-        limit_percent: The same of the products at the Lemma 4.1.3 limits [%].
+        limit_percent: Error of the products at the Lemma 4.1.3 limits [%].
     """
 
     bounds: str

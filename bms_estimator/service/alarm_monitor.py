@@ -36,7 +36,7 @@ class AlarmMonitor:
         settings: The pack's settings.
         cell: The pack as one object.
         estimator: Read only.
-        source: Its counters, cells and message are read.
+        source: Supplies counters, cells and message.
         clock: The clocks.
         on_alarm: Called with each change of an alarm, as soon as it occurs.
         hooks: Successes and failures of alarm hooks; None without hooks.

@@ -68,7 +68,7 @@ async def run_estimation_loop(
         source: Supplies samples; opened and closed here.
         sinks: Destinations of the snapshots; opened and closed here.
         stop: Set to end cleanly.
-        checkpoint: Where the state outlives a restart; None: it does not.
+        checkpoint: File of the state; None: the state is not saved.
         requests: Dispatcher at which this loop registers its handlers.
         delivery: Counters of sent messages and received requests.
         current_zero: Has the board take the present current as zero; None: it cannot.

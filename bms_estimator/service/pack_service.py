@@ -59,7 +59,7 @@ async def run_pack_service(
         sinks: Further sinks, such as the console.
         tap: Gets all that the source is decoded from, with its arrival times.
         stop: Set by someone else to end as a signal does.
-        folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
+        folder: State folder (``state_folder``); None: the state is not saved.
         notifier: Is notified that the loop is ready and alive.
         pages: The live pages of this process.
 

@@ -54,7 +54,7 @@ class Publisher:
         settings: The pack's settings.
         cell: The pack as one object.
         estimator: Read only.
-        source: Its counters, message and board are read.
+        source: Supplies counters, message and board.
         sinks: Destinations of the snapshots.
         clock: The clocks.
         tally: Totals over restarts; default: new totals.
@@ -71,7 +71,7 @@ class Publisher:
         watch: Alarm monitor.
         checkpoint: Result of restoring the last checkpoint.
         disk_free_mib: Free space in the state folder [MiB].
-        log_lines_lost: Since start.
+        log_lines_lost: Dropped log lines since start.
         kept: Charge and energy as the next start will find them; None: nothing will be found.
         latest: The last estimate that there was.
         snapshot: The last snapshot.

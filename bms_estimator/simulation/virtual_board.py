@@ -105,10 +105,10 @@ class VirtualBoard:
         rate_hz: Samples per second until the host requests another rate.
         mode: ``text`` prints ``voltage,current,temperature`` lines and takes no commands.
         speed: Board seconds per second; ``math.inf``: as fast as the host reads.
-        parts: Its parts as built.
+        parts: Parts of the board as built.
         noise_lsb: Noise of its converter [steps].
         serial: Serial number.
-        clock_us: Where its microseconds begin at each reset.
+        clock_us: Start value of the clock at each reset [us].
         seed: Seed of noise and garbage.
     """
 

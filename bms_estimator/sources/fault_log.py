@@ -24,7 +24,7 @@ class FaultLog:
         """Look at the counters since start.
 
         Args:
-            counters: By kind.
+            counters: Counts by kind.
             now_s: Monotonic clock [s].
         """
         counted = {name: n for name, n in counters.items() if name not in _NO_FAULTS and n}

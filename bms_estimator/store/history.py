@@ -54,7 +54,7 @@ class History:
     """A sink that keeps minutes and events.
 
     Args:
-        database: Where.
+        database: Database of the history.
         days: Number of days of stored one-minute rows.
     """
 

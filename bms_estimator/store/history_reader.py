@@ -36,7 +36,7 @@ class HistoryFile:
         """Minutes put together, those without a publication left out.
 
         Args:
-            since_s: From [s since 1970].
+            since_s: Start time [s since 1970].
             until_s: To before [s since 1970].
             step_s: Length of a row [s], whole minutes; one minute has two rows if the clock went through it twice.
 
@@ -58,7 +58,7 @@ class HistoryFile:
         """Yield the events, oldest first.
 
         Args:
-            since_s: From [s since 1970].
+            since_s: Start time [s since 1970].
             until_s: To before [s since 1970].
 
         Raises:

@@ -53,7 +53,7 @@ def migrate(connection: sqlite3.Connection, migrations: tuple[str, ...] = MIGRAT
 
     Raises:
         NewerVersionError: It is beyond this version.
-        OtherTablesError: Its tables were changed.
+        OtherTablesError: The tables were changed.
         sqlite3.Error: It cannot be read or written.
     """
     (version,) = connection.execute("PRAGMA user_version").fetchone()

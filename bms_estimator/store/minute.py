@@ -100,8 +100,8 @@ def seen(span_s: float, before_s: float) -> float:
     """Return the measured part of the time between two publications [s]: nothing of a gap.
 
     Args:
-        span_s: From one to the other on the board's clock [s].
-        before_s: The same of the two before [s].
+        span_s: Time between the two on the board's clock [s].
+        before_s: Time between the previous two [s].
     """
     return span_s if 0.0 < span_s <= max(MAX_S, GAP_RATIO * before_s) else 0.0
 

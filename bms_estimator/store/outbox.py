@@ -27,7 +27,7 @@ class Outbox:
     """Keeps messages in order until the broker has them.
 
     Args:
-        database: Where they wait for a broker that is away; None: in memory only.
+        database: Database for an absent broker; None: in memory only.
         most: Maximum number of stored messages; beyond it the oldest one not in flight is dropped.
 
     Attributes:

@@ -131,7 +131,7 @@ class Queue:
         """Take over messages that an earlier run left on disk; they precede all that were not handed out.
 
         Args:
-            runs: Their numbers on disk.
+            runs: Message numbers on disk.
 
         Returns:
             Offset from the numbers on disk to those of the queue.

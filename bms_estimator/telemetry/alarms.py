@@ -83,7 +83,7 @@ class AlarmEvaluator:
 
     Args:
         watched: Definitions of the alarms.
-        charging_a: From this current into the pack on it is charged [A].
+        charging_a: Minimum current into the pack that counts as charging [A].
         gap_s: A time between samples that is shorter is no gap [s].
         inputs: Measured quantities.
         silent_s: Without a sample for this time no alarm is watched [s].
@@ -130,7 +130,7 @@ class AlarmEvaluator:
             arrival_s: Wall clock at the arrival of the last of it [s since 1970].
             counts: Samples since start.
             suspects: What the identifier suspects now.
-            suspicions: The same in sentences.
+            suspicions: Suspicions as sentences.
         """
         if not self.rows:
             return
@@ -188,7 +188,7 @@ class AlarmEvaluator:
         """Acknowledge an alarm, or all. Return the acknowledged ones; those whose cause has ended end now.
 
         Args:
-            name: Which; None: all.
+            name: Name of the alarm; None: all.
         """
         found = [state for key, state in self._states.items() if state.raising and name in (None, key)]
         for state in found:

@@ -93,7 +93,7 @@ def make_health_payload(
         line: The source's counters.
         now_s: Wall clock [s since 1970].
         uptime_s: Time since the service started [s].
-        loop_lag_s: By how much the event loop woke too late at worst since the last report [s].
+        loop_lag_s: Longest delay of the event loop since the last report [s].
         restarts: Starts that found a checkpoint.
         checkpoint: Result of restoring the last checkpoint.
         sensor_message: Why values are not fresh; None when they are.

@@ -25,11 +25,11 @@ class LifetimeTotals:
     """Passes blocks to the estimator and adds up their results.
 
     Args:
-        estimator: Its counters are of this run.
+        estimator: Estimator of this run.
         before: Counted by the runs before.
 
     Attributes:
-        estimator: The same.
+        estimator: Estimator.
         unseen_s: Length of the last unmeasured gap, also before the start [s]; None if there was none or it is unknown.
     """
 
@@ -74,8 +74,8 @@ def gap_lengths(
 
     Args:
         times_s: Shape (n,): time stamps of accepted samples [s].
-        before_s: That of the one before [s]; infinite at the first of a new clock.
-        step_s: Between the two before [s].
+        before_s: Length of the previous step [s]; infinite at the first of a new clock.
+        step_s: Length of the step before [s].
         gap_s: Minimum length of a gap [s].
         restart_s: Before the first sample of a new clock [s].
     """

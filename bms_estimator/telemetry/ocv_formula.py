@@ -17,7 +17,7 @@ class OcvFormulaFit(NamedTuple):
     Attributes:
         a: a16..a21.
         std: Standard errors; NaN for one at its bound.
-        rms_v: How far the formula lies off the table, RMS over SOC [V].
+        rms_v: Deviation of the formula from the table, RMS over SOC [V].
     """
 
     a: tuple[float, ...]

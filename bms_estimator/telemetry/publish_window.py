@@ -62,7 +62,7 @@ class Window:
         Args:
             trace: Shape (n,), dtype TRACE; n may be 0.
             arrival_s: Wall clock [s since 1970].
-            cells: Beside the block's samples.
+            cells: Cell voltages of the block.
         """
         if cells.size:
             self._cells = cells[-1:]

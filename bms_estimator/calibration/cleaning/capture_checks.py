@@ -36,7 +36,7 @@ def capture_contradictions(load: CleanCapture, cell: CellModel, start: float) ->
 
     Args:
         load: The capture.
-        cell: Its alleged cell.
+        cell: The alleged cell.
         start: SOC at the first sample, 0..1.
     """
     found = _short(load) or _no_excitation(load, cell) or _sign(load, cell) or _answer(load, cell) or _gap(load, cell)

@@ -33,7 +33,7 @@ class CleanCapture:
         voltage_v: Shape (n,), measured [V].
         temperature_c: Shape (n,), of the cell [C]; NaN where it was not measured.
         discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
-        resting_samples: How many of the first samples are at rest.
+        resting_samples: Number of first samples at rest.
         samples: Number of samples in the capture.
         glitches: Number of dropped glitches.
     """

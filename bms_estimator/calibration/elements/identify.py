@@ -93,7 +93,7 @@ class CaptureFit:
         miscount: Relative charge that the samples miss; the SOC of the fit has it.
         voltage_rms_v: What the ladder leaves, each second weighing the same, SOC above 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
-        score_after: The same with the identified one.
+        score_after: Interval score with the identified cell.
         held_back: The capture had no part in the cell of ``score_after``.
     """
 
@@ -120,7 +120,7 @@ class Identification:
         left_out: Names of captures without excitation.
         ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0: it is the given one.
         score_before: Geometric mean over the captures of the interval score with the given cell [%]; NaN when none could judge.
-        score_after: The same with the identified one.
+        score_after: Interval score with the identified cell.
     """
 
     cell: CellModel

@@ -62,7 +62,7 @@ def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: fl
 
     Args:
         samples: What ``test`` was made of, dtype ``SAMPLE``, raw.
-        test: Its rests.
+        test: Relaxation test with its rests.
         capacity_ah: As ``test`` was counted with [Ah].
 
     Raises:

@@ -117,7 +117,7 @@ class LadderFit:
         correction: Coefficients of d, see ``correction_at``.
         per_kelvin_v: u at ``KELVIN_NODES`` [V/K].
         weak_ohm: Shape (RESISTANCES, SOC_NODES.size) [ohm].
-        strong_ohm: The same.
+        strong_ohm: Resistances with the strong temperature dependence [ohm].
         covariance: Covariance of weak and strong resistances in this order, each by rows; None of the bounds counted.
     """
 
@@ -189,7 +189,7 @@ def moments(
     """Accumulate the moments of the regression over ``load``.
 
     Args:
-        load: From rest.
+        load: Load that starts at rest.
         soc: Shape (n,), counted, less the miscount.
         given_v: Shape (n,), the given OCV at SOC and temperature [V].
         slope_v: Shape (n,), its slope dE_o/dSOC [V].

@@ -33,8 +33,8 @@ def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
     """Return the drop of the voltage below E_o(SOC) at 25 C, with dE/dT and hysteresis [V].
 
     Args:
-        cell: Its ladder counts, else its a1..a15; these do not depend on the temperature.
-        load: From rest.
+        cell: Supplies its ladder, or otherwise a1..a15, which do not depend on the temperature.
+        load: Load that starts at rest.
         soc: Shape (n,), counted.
     """
     temperature_c = temperature_of(load)

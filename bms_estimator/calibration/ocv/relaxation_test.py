@@ -171,7 +171,7 @@ def find_rests(
     Args:
         good: Dtype ``SAMPLE``, without glitches.
         soc: SOC at each sample.
-        resting: Which samples belong to a rest.
+        resting: True for each sample at rest.
         series_count: Cells in series, for limits that are given per cell.
     """
     rests: list[Rest] = []

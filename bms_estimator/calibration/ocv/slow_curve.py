@@ -62,7 +62,7 @@ class SlowBranch:
 
     Attributes:
         name: Name of its capture.
-        charge: Which of the two.
+        charge: True for a charge, False for a discharge.
         ah: Shape (n,), charge moved since its start, increasing [Ah].
         voltage_v: Shape (n,) [V].
         current_a: Mean magnitude [A].

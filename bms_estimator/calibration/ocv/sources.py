@@ -91,9 +91,9 @@ class OcvSources:
 
     Attributes:
         capacity_ah: Given, else measured [Ah].
-        measured_ah: By a full slow discharge [Ah]; NaN without one.
+        measured_ah: Capacity by a full slow discharge [Ah]; NaN without one.
         sources: Slow curves, given curves, rests.
-        tests: Those captures that are relaxation tests, as ``sources`` has them.
+        tests: Relaxation tests among ``sources``.
         hysteresis_v: At ``NODES`` and 25 C [V], from the nearest source that shows it, as far as rests keep it; None
             when
             none does.
@@ -313,7 +313,7 @@ def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSourc
 
     Args:
         found: Result of ``find_sources``.
-        usual_v: That of cells of the kind, as rests keep it, at ``NODES`` and 25 C [V].
+        usual_v: Hysteresis of similar cells after rests, at ``NODES`` and 25 C [V].
     """
     on_grid_v = np.interp(GRID, NODES, usual_v)
     moved = tuple(

@@ -98,7 +98,7 @@ class TableFit:
 
         Args:
             hysteresis_v: At the nodes [V]; None: not known.
-            hysteresis_std_v: Its std there, which adds to the curve's error [V].
+            hysteresis_std_v: Standard deviation of the hysteresis, which adds to the curve's error [V].
         """
         return TableOcv(
             form="table",

@@ -22,7 +22,7 @@ class AveragingWindow:
     """Interval over which (3.19) averages, and its reasons.
 
     Attributes:
-        t_int_s: From here the error stays small [s].
+        t_int_s: Time from which the error stays small [s].
         t_unst_s: Here the battery becomes unstable [s].
         start_reason: What set t_int.
         end_reason: What set t_unst.

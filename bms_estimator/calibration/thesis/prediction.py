@@ -32,8 +32,8 @@ class Prediction:
         time_s: On the capture's clock [s].
         current_a: Positive on discharge [A].
         voltage_v: Measured [V].
-        predicted_v: By the model [V].
-        soc: By coulomb counting, 0..1.
+        predicted_v: Predicted voltage [V].
+        soc: SOC by coulomb counting, 0..1.
         overpotential_v: x2 + x3 of the model [V].
     """
 

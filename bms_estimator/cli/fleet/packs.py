@@ -87,7 +87,7 @@ def pack_files(pack: str, known: PackRegistry) -> dict[str, str]:
     """Texts by file name: the pack's file, and its cell's unless the package brings it.
 
     Raises:
-        UserError: Its row or its cell is wrong.
+        UserError: The row or its cell is invalid.
     """
     kind = known.kind(pack)
     if not isinstance(kind, PackSpec) or known.reason(pack):

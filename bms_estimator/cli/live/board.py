@@ -115,7 +115,7 @@ def _accept_next(settings: Settings, folder: Path) -> None:
     """Make the pack's service, whose state is in ``folder``, accept the next board.
 
     Raises:
-        UserError: Its settings name the board, none is known in the folder, or the file cannot be written.
+        UserError: The settings name the board, none is stored in the folder, or the file cannot be written.
     """
     if settings.sensor.serial:
         raise UserError(f"sensor.serial = {settings.sensor.serial}: the settings name the board; change it there")

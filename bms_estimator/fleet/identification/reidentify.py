@@ -68,7 +68,7 @@ class ReidentificationResult:
         reason: Why it has no new cell; empty where it has one.
         method: ``learned`` or ``fitted``: how the best new cell was found; empty without any.
         cell_file: The text of the new cell's file; empty without one that is better.
-        hours: From its first to its last sample.
+        hours: Duration from the first to the last sample.
         capacity_ah, capacity_std_ah: Capacity of the best new cell, one object of its file; NaN without any.
         capacity_before_ah: Capacity of the old cell.
         r_s_ohm, r_s_before_ohm: Series resistance at SOC 0.5 and 25 C of the same.

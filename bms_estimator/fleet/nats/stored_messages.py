@@ -22,7 +22,7 @@ async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -
         stream: Name of the stream; it must allow direct gets.
         subject: May have wildcards.
         first: Sequence in the stream.
-        last: That of a message which the subject covers.
+        last: Sequence of the last message of the subject.
 
     Raises:
         StreamError: The server does not answer, or refuses.

@@ -38,7 +38,7 @@ class PackTable:
     """A table that was read.
 
     Attributes:
-        packs: By name.
+        packs: Rows by pack name.
         cell_files: Files that it names, by the names of their cells.
     """
 

@@ -119,7 +119,7 @@ async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, 
     Args:
         nc: Connected.
         bucket: Name of the bucket.
-        values: By key.
+        values: Values by key.
         remove: Remove entries that are not in ``values``.
 
     Raises:

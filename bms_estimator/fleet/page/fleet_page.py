@@ -45,9 +45,9 @@ async def fleet_page(
 
     Args:
         server: Address of the fleet's server.
-        settings: Where the page is served.
+        settings: Address and access of the page.
         hours: Folder of the Parquet files for queries; None: none are.
-        step_s: Between two pictures of the fleet [s].
+        step_s: Interval of the summaries [s].
 
     Yields:
         The page's address.

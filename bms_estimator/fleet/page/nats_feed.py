@@ -53,7 +53,7 @@ class FleetFeed:
     """Fills a view while the context lasts.
 
     Args:
-        server: Where to listen.
+        server: Address of the fleet's server.
         view: Filled.
         linked: Called with why there is no server, and with None when there is.
 

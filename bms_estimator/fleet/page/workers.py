@@ -24,7 +24,7 @@ class FleetWorkers:
     """Heartbeats of workers; times are on one monotonic clock [s].
 
     Args:
-        partitions: How many there are.
+        partitions: Number of partitions.
     """
 
     def __init__(self, partitions: int) -> None:

@@ -40,7 +40,7 @@ def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: date
 
     Args:
         folder: Folder of the keys; created if missing.
-        tenants: By name.
+        tenants: Settings by tenant name.
         now: When credentials that are made are made.
 
     Raises:
@@ -79,7 +79,7 @@ def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: dat
         tenant: Tenant of the pack.
         pack: The only one that it may write.
         now: Revocation looks at it.
-        expires: From when on it is refused; None: never.
+        expires: Expiry time; None: never.
 
     Raises:
         UserError: There are no keys of this tenant.

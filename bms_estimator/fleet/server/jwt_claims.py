@@ -139,7 +139,7 @@ def operator(key: Key, system: str) -> str:
     """Claims of the operator, which signs accounts.
 
     Args:
-        key: Its own.
+        key: Key of the operator.
         system: Public key of the account in which servers talk to each other.
     """
     return _signed(key, key.public, "fleet", {"system_account": system, "type": "operator"})
@@ -193,12 +193,12 @@ def user(signer: Key, account_key: str, role: Role, name: str, made: datetime, e
     """Make the token of a user.
 
     Args:
-        signer: That of the role.
+        signer: Signing key of the role.
         account_key: The account's public key.
         role: What the user is; the bearer of an edge's token is the edge.
         name: Name of the user; of an edge, its pack's.
         made: Revocation looks at it.
-        expires: From when on it is refused; None: never.
+        expires: Expiry time; None: never.
     """
     claims = {"issuer_account": account_key, "type": "user"}
     expiry = {"exp": int(expires.timestamp())} if expires else {}

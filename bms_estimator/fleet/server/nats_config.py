@@ -39,7 +39,7 @@ class Tls:
 
     Attributes:
         cert: The server's certificate, and what leads from it to the authority.
-        key: Its private key.
+        key: Private key.
         ca: Authority that the nodes trust; None: as clients do, by those of the system.
     """
 
@@ -68,9 +68,9 @@ class Node:
     """One server.
 
     Attributes:
-        name: Its own in the cluster.
+        name: Name in the cluster.
         store: Folder of the streams.
-        nats: Where workers connect, host:port; so are ``mqtt``, for edges, and ``monitor``.
+        nats: Address for workers, host:port; likewise ``mqtt`` for edges, and ``monitor``.
         cluster: The other nodes; None: it is alone.
         tls: For all ports but the monitor's; None: none.
         accounts: Accounts of the tenants; None: whoever reaches it, as one tenant.

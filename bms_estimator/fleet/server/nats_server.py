@@ -54,7 +54,7 @@ class NodeLocation:
 
     Attributes:
         folder: For streams and keys.
-        number: From 1.
+        number: Number from 1.
         nodes: Addresses of all nodes for each other, host:port; one alone has none.
     """
 
@@ -152,7 +152,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], say: Callab
 
     Args:
         place: Location of this node.
-        read: Its settings; called at start and at each SIGHUP.
+        read: Reads the settings; called at start and at each SIGHUP.
         say: Receives lines for people: addresses and created streams.
 
     Returns:

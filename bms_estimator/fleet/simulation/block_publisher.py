@@ -129,7 +129,7 @@ async def run_edges(
     Args:
         fleet: The packs.
         edges: Simulated edges.
-        settings: Settings of the page.
+        settings: Address and credentials of the server.
         connections: Number of connections for all edges.
         stop: Ends it.
         said: Receives progress messages.

@@ -56,7 +56,7 @@ class DemoObserver:
     """Observer of a demo.
 
     Attributes:
-        partitions: Those that have packs.
+        partitions: Partitions with packs.
         workers: Last heartbeat by name, with its moment of a monotonic clock [s].
         errors: Estimated less true SOC, of estimates since the last line.
         within: Whether the true SOC was within two standard deviations.
@@ -103,7 +103,7 @@ class Demo:
 
     Attributes:
         packs: Number of packs.
-        seconds: How long edges send.
+        seconds: Duration for which edges send.
         page_port: Port of the page.
         folder: For the server's files and all logs.
         say: Receives the progress, line by line.

@@ -150,8 +150,8 @@ class SimulatedFleet:
         """Return one block for each pack, as edges send it.
 
         Args:
-            packs: Which, shape (n,).
-            numbers: Their blocks' numbers, from 1.
+            packs: Numbers of the packs, shape (n,).
+            numbers: Numbers of the blocks, from 1.
             arrival_s: Wall clock at the arrival of each block's last sample [s since 1970].
         """
         samples = self.samples(packs, numbers)

@@ -88,9 +88,9 @@ class PartitionCheckpoint:
     Attributes:
         number: Number of the partition.
         sequence: Stream sequence of the last included message.
-        counters: By name.
+        counters: Counts by name.
         packs: Packed records by pack, of this version's layout.
-        former: The same for packs with a record of another version.
+        former: Records of packs by another version.
         deferred: Messages of packs that wait, in the order of their turns.
     """
 

@@ -142,7 +142,7 @@ class CheckpointStore:
         Args:
             claim: As the last write left it.
             sequence: Stream sequence of the last included message.
-            chunks: Its bytes; taken in a thread.
+            chunks: Bytes of the checkpoint; taken in a thread.
 
         Raises:
             FencedError: Another worker has taken the partition over; nothing was changed.

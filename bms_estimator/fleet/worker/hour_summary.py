@@ -56,7 +56,7 @@ def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> No
     Args:
         sums: Updated in place.
         trace: What the estimator made of the block's samples.
-        block: The same.
+        block: Block of samples.
         estimator: Estimator of the pack, or of any of its type: only its settings are read.
     """
     settings = estimator.settings[0]
@@ -73,7 +73,7 @@ def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour
         pack: Type of the pack, from its settings.
         hour: Hours since 1970.
         sums: Sums of the hour; read only.
-        estimator: With the pack's state at the hour's end; read only.
+        estimator: Estimator with the pack's state at the hour's end; read only.
     """
     h, record = sums[0], estimator.record[0]
     capacity_ah = None if isinstance(estimator.cell, FuelCellModel) else float(estimator.cell.cell.capacity_ah)

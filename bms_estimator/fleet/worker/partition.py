@@ -66,7 +66,7 @@ class Partition:
         wall: Wall clock of the publications [s since 1970].
 
     Attributes:
-        number: The same.
+        number: Number of the partition.
         sequence: Sequence of the last message that was taken or deferred; 0: none.
         deferred: Packs whose messages wait in the stream.
     """
@@ -133,7 +133,7 @@ class Partition:
         """Take a message of the stream, or defer it where its pack is not known or has others that wait.
 
         Args:
-            pack: From which.
+            pack: Name of the sending pack.
             data: A block, or what an edge sends for one: faults are counted by kind.
             sequence: In the stream; one that was taken is not taken again.
         """

@@ -53,7 +53,7 @@ class PartitionLease:
         nc: Connected.
         number: Number of the partition.
         table: What each pack is.
-        keeping: Where checkpoints are.
+        keeping: Store of the checkpoints.
         inbox: As ``PinnedConsumer`` has it.
         turn: Held while a block is stepped: of all partitions one at a time, so that the loop sees to requests and heartbeats
             between any two.

@@ -46,8 +46,8 @@ class PinnedConsumer:
 
     Args:
         nc: Connected.
-        partition: Its number.
-        inbox: Where the server is to answer: it adds one token; its messages go to ``receive``.
+        partition: Number of the partition.
+        inbox: Subject for the server's responses, to which it adds one token; its messages go to ``receive``.
 
     Attributes:
         waiting: Messages not taken yet.
@@ -141,7 +141,7 @@ def sequences(reply: str) -> tuple[int, int]:
     """Return a message's sequence number in its stream, and its gapless one in the consumer.
 
     Args:
-        reply: Where it would be acknowledged (ADR-15): 9 tokens, or 11 and more with the server's domain.
+        reply: Acknowledgment subject (ADR-15): 9 tokens, or 11 and more with the server's domain.
     """
     tokens = reply.split(".")
     first = 5 if len(tokens) == 9 else 7

@@ -46,8 +46,8 @@ class Options:
 
     Attributes:
         servers: As ``connect`` has them, like ``creds`` and ``ca``.
-        name: Its own among workers.
-        checkpoint_s: Between two checkpoints of a partition [s].
+        name: Name of the worker.
+        checkpoint_s: Interval between checkpoints of a partition [s].
     """
 
     servers: str
@@ -120,9 +120,9 @@ class Worker:
 
     Args:
         nc: Connected.
-        options: How it works.
-        partitions: How many there are in all.
-        keeping: Where checkpoints are.
+        options: Options of the worker.
+        partitions: Total number of partitions.
+        keeping: Store of the checkpoints.
         bucket: The table of packs.
         notifier: Is notified that the worker is ready and alive.
     """

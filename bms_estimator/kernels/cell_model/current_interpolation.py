@@ -32,8 +32,8 @@ def ramp_correction(change_a: float, taus: float, decay: float) -> float:
     """Return the change of a branch current by a linear ramp between samples, beyond that of its mean [A].
 
     Args:
-        change_a: From one sample to the next [A].
-        taus: Between them, in time constants of the branch.
+        change_a: Change of the current between the samples [A].
+        taus: Time between the samples in time constants of the RC pair.
         decay: e^-taus.
     """
     return change_a * (0.5 * (1.0 + decay) - (1.0 - decay) / taus)

@@ -68,7 +68,7 @@ def resistances(soc: float, weak_ohm: Floats, strong_ohm: Floats, weak: float, s
     Args:
         soc: State of charge.
         weak_ohm: Shape (GRID, RESISTANCES), the part of activation energy ``WEAK_J`` at 25 C [ohm].
-        strong_ohm: The same of ``STRONG_J``.
+        strong_ohm: Resistances that grow as ``STRONG_J`` [ohm].
         weak: ``arrhenius(WEAK_J, T)``.
         strong: ``arrhenius(STRONG_J, T)``.
         ohm: Shape (RESISTANCES,), written.

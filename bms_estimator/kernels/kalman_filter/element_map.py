@@ -118,7 +118,7 @@ def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float
         fit: Record of ELEMENT_FIT, as ``fit_element`` left it for this element.
         e: Row of the map, 0..4.
         lower: Bounds of a1..a15 at index 1..15.
-        upper: The same.
+        upper: Upper bounds.
     """
     i = 3 * e + 1
     amplitude, exponent, offset = fit.a[i], fit.a[i + 1], fit.a[i + 2]

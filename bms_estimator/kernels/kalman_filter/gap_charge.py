@@ -72,7 +72,7 @@ def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
 
     Args:
         change_a: Change of the current between the two [A].
-        dt_s: Between them [s].
+        dt_s: Time between the samples [s].
     """
     return BETWEEN * (change_a * dt_s) ** 2 if dt_s > SLOW_S else 0.0
 

@@ -96,7 +96,7 @@ def mittag_leffler(r: float, alpha: float, series: Floats, decay_value: Floats, 
     Args:
         r: lambda^(1/alpha) k, not negative.
         alpha: In (2, 3].
-        series: From ``series_coefficients(alpha)``.
+        series: Result of ``series_coefficients(alpha)``.
         decay_value: First table of ``decay_table(alpha)``.
         decay_slope: Second table of ``decay_table(alpha)``.
     """

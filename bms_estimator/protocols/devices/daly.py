@@ -116,7 +116,7 @@ class DalyProtocol(PolledProtocol):
         """Values of all frames in the order of their numbers, NaN for a missing one.
 
         Args:
-            frames: By their numbers.
+            frames: Frames by number.
             each: Number of values in one frame.
             count: Number of values; None: unknown, and zeros behind the last other value do not count.
         """

@@ -199,7 +199,7 @@ class FrameDecoder:
         Args:
             arrivals_s: Shape (reads,): arrival time of each read [s].
             ends: Shape (reads,): where in ``data`` each ends.
-            data: Their bytes, one behind the other.
+            data: Concatenated bytes of the reads.
 
         Returns:
             As ``feed``.

@@ -38,7 +38,7 @@ def values_to_publish(
     Args:
         shown: Values published last.
         snapshot: The snapshot.
-        described: Which entities there are.
+        described: Data of the existing entities.
         now_s: Monotonic clock [s].
         sign: -1: charging is positive for current and power.
     """

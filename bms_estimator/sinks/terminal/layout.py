@@ -14,7 +14,7 @@ class FlowLayout:
     """Texts beside each other, as many as a line takes; none is broken that a line can hold.
 
     Args:
-        texts: From left to right.
+        texts: Texts from left to right.
     """
 
     def __init__(self, *texts: Text) -> None:

@@ -51,7 +51,7 @@ class LiveView:
         log: Log lines to show below, the last ones; the screen hides what others write.
         hint: A line that stays at the foot of the screen.
         true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
-        lost: Since when there is no broker, where one is needed.
+        lost: Time since which there is no broker, if one is needed.
         first: The pack that is shown first, where it is there.
         wall: Wall clock, seconds since 1970.
     """

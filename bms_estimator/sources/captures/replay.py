@@ -48,7 +48,7 @@ class RawCapture:
 
     Args:
         path: What ``CaptureWriter`` wrote.
-        sensor: How to decode; None: that of the capture's header.
+        sensor: Settings of the decoder; None: that of the capture's header.
         current_sign: What its current calls positive; None: that of ``sensor``.
 
     Attributes:
@@ -207,8 +207,7 @@ def open_capture(
 
     Args:
         path: The file.
-        sensor: How to decode raw bytes, and what the current of a table calls positive unless its format lays that
-            down; None: that of the header of raw bytes, otherwise discharge.
+        sensor: Settings for decoding raw bytes and for the current sign of a table without its own; None: that of the header of raw bytes, otherwise discharge.
         current_sign: Direction of positive current, which overrides ``sensor``, header and format.
 
     Raises:

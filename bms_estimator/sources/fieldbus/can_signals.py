@@ -84,7 +84,7 @@ class CanMap:
     A reading is made when voltage and current have both been updated; temperature and cells are the newest.
 
     Args:
-        settings: Where the values lie.
+        settings: Signals of the values.
 
     Raises:
         UserError: The DBC file cannot be read, or lacks a signal.

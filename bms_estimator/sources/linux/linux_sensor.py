@@ -38,7 +38,7 @@ class LinuxSensor(LineProducer):
     """Polls the files of a chip.
 
     Args:
-        settings: Which chip, its files, divider and shunt.
+        settings: Chip, files, divider and shunt.
         root: Root of sysfs.
         hung_s: Timeout of the bus [s].
     """

@@ -106,7 +106,7 @@ class BoardCheck:
         """Accept samples of ``board`` as the pack's from now on; log and store what changed.
 
         Args:
-            board: Its reported properties.
+            board: Reported properties of the board.
             now_s: Monotonic clock [s].
         """
         if not board:

@@ -101,7 +101,7 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
     Args:
         path: Path of the device.
         baud: [1/s].
-        timeout_s: How long a read waits [s].
+        timeout_s: Timeout of a read [s].
 
     Raises:
         PortBusyError: Another process has it open.
