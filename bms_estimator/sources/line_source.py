@@ -136,7 +136,7 @@ class LineSource:
     current_zero: None = None
     """Function that sets the zero of the current; None: lines have no such command."""
     relay: None = None
-    """Function that switches a relay; None: there is none."""
+    """Function that switches a relay; None: no relay."""
 
     def pulse(self) -> SourceHealth:
         """Health of the task that produces lines."""

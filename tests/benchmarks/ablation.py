@@ -27,10 +27,10 @@ from tests.estimator.anywhere.score import Score, score
 Change = Callable[[np.void], None]
 
 KINDS = {
-    "oxide, 25, 10 C": ("PF 25 C, US06", "PF 25 C, mixed", "PF 10 C", "NCR", "Leaf"),
-    "oxide, 0, -10 C": ("PF 0 C", "PF -10 C", "PF 0 C from full", "PF -10 C from full"),
+    "NMC/NCA, 25, 10 C": ("PF 25 C, US06", "PF 25 C, mixed", "PF 10 C", "NCR", "Leaf"),
+    "NMC/NCA, 0, -10 C": ("PF 0 C", "PF -10 C", "PF 0 C from full", "PF -10 C from full"),
     "file of 25 C": tuple(f"PF {t} C, file of 25" for t in (10, 0, -10)),
-    "wrong sensor": ("NCR, current", "NCR, -50", "NCR, +50", "NCR, capacity"),
+    "sensor errors": ("NCR, current", "NCR, -50", "NCR, +50", "NCR, capacity"),
     "LFP from full": tuple(f"LFP {t} C from full" for t in (25, 5, -15)),
     "LFP": ("LFP 25 C (its", "LFP 5 C", "LFP -15 C (its"),
     "by ocv alone": (
@@ -62,29 +62,29 @@ def known_resistances_of_the_middle(p: np.void) -> None:
 
 
 PARTS: dict[str, Change] = {
-    "as it is": setting(),
-    "R of 5 mV, not 50": setting(model_v=0.005),
-    "no biases": setting(bias_relative=0.0, bias_grown=0.0, bias_soc=0.0),
-    "no error of R and early end along SOC": setting(bias_soc=0.0),
-    "no error of what R has grown by": setting(bias_grown=0.0),
-    "scales of R as in the file": setting(r_std=1e-6),
-    "R the same at any SOC": known_resistances_of_the_middle,
-    "outside the file's temperatures as inside": setting(low_c=-100.0, high_c=200.0),
-    "no entropy": setting(per_kelvin_v=0.0),
-    "no error of the OCV": setting(curve_error_v=0.0),
-    "curve not learned": setting(learned=0.0),
-    "knees as sure as the rest of the curve": setting(curve_soc=CURVE_SOC),
-    "no hysteresis": setting(hysteresis_v=0.0),
-    "no offset": setting(offset_c=0.0),
-    "a rest without current tells nothing": setting(zero_std_c=1.0),
-    "no error of the capacity": setting(capacity_std=0.0),
-    "offset and capacity do not change": setting(offset_s=1e12, aged_soc=1e9),
-    "polarisation from the first current": setting(load_c=0.0, load_level_c=1e-3),
-    "weights not tempered": setting(half_likelihood_exponent=0.5),
-    "weights by S as it is": setting(min_innovation_scale=1.0),
-    "weights by innovations alone": setting(inconsistency_penalty=0.0),
+    "nothing": setting(),
+    "large R (5 mV instead of 50)": setting(model_v=0.005),
+    "biases": setting(bias_relative=0.0, bias_grown=0.0, bias_soc=0.0),
+    "error of R over SOC": setting(bias_soc=0.0),
+    "error of grown resistances": setting(bias_grown=0.0),
+    "learned scales of R": setting(r_std=1e-6),
+    "R over SOC": known_resistances_of_the_middle,
+    "error outside the file's temperatures": setting(low_c=-100.0, high_c=200.0),
+    "entropy": setting(per_kelvin_v=0.0),
+    "error of the OCV": setting(curve_error_v=0.0),
+    "learned OCV": setting(learned=0.0),
+    "larger error at the knees of the OCV": setting(curve_soc=CURVE_SOC),
+    "hysteresis": setting(hysteresis_v=0.0),
+    "offset": setting(offset_c=0.0),
+    "offset from rests": setting(zero_std_c=1.0),
+    "error of the capacity": setting(capacity_std=0.0),
+    "drift of offset and capacity": setting(offset_s=1e12, aged_soc=1e9),
+    "unknown load before switch-on": setting(load_c=0.0, load_level_c=1e-3),
+    "tempered weights": setting(half_likelihood_exponent=0.5),
+    "reduced innovation variance in weights": setting(min_innovation_scale=1.0),
+    "penalty for large biases": setting(inconsistency_penalty=0.0),
 }
-ONE_FILTER, NO_TEMPERATURE = "one hypothesis", "temperature not used"
+ONE_FILTER, NO_TEMPERATURE = "filter bank (one hypothesis)", "temperature"
 
 
 def main() -> None:
