@@ -37,10 +37,10 @@ check: venv ## style, import order of the layers, and types, in seconds
 	$(BIN)/mypy
 
 test: prepared ## style, types, firmware, and the tests of every promise
-	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile -m "not thorough" $(ARGS)
+	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile --no-loadscope-reorder -m "not thorough" $(ARGS)
 
 test-all: prepared ## also the tests that repeat a promise in another way or for longer
-	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile $(ARGS)
+	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 prepared: apt venv
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant
