@@ -1,10 +1,9 @@
-"""Estimates sample by sample into CSV or Parquet, block after block: length does not cost memory.
+"""Estimates of each sample to CSV or Parquet, block by block, so that memory does not grow.
 
 The columns are the trace's fields; every value can be read back to the last bit.
 """
 
 import gzip
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, Protocol, Self, cast
@@ -39,7 +38,7 @@ class TableSink(Protocol):
 
 
 class CsvSink:
-    """CSV, gzipped when the name ends in .gz. With pyarrow four times as fast as without.
+    """CSV, gzipped when the name ends in .gz.
 
     Args:
         path: The file.
@@ -49,7 +48,6 @@ class CsvSink:
         self._path = path
         self._files = ExitStack()
         self._file: IO[bytes] | None = None
-        self._lines = _csv_writer()
 
     def __enter__(self) -> Self:
         """Nothing to open yet."""
@@ -65,7 +63,7 @@ class CsvSink:
             self._file = self._open()
             self._file.write((",".join(trace.dtype.names or ()) + "\n").encode())
         if trace.size:
-            self._file.write(self._lines(trace))
+            self._file.write(_lines(trace))
 
     def _open(self) -> IO[bytes]:
         file = self._files.enter_context(_create(self._path))
@@ -131,29 +129,10 @@ def _create(path: Path) -> IO[bytes]:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def _csv_writer() -> Callable[[NDArray[np.void]], bytes]:
-    """Return the faster available CSV writer."""
-    try:
-        import pyarrow  # noqa: F401, ICN001, PLC0415 - optional
-    except ModuleNotFoundError:
-        return _lines
-    return _lines_by_arrow
-
-
 def _lines(trace: NDArray[np.void]) -> bytes:
     """Rows as CSV, with enough digits to restore each float exactly."""
     columns = [map(repr, trace[name].tolist()) for name in trace.dtype.names or ()]
     return ("\n".join(map(",".join, zip(*columns, strict=True))) + "\n").encode()
-
-
-def _lines_by_arrow(trace: NDArray[np.void]) -> bytes:
-    """Write lines as ``_lines`` does."""
-    import pyarrow as pa  # noqa: PLC0415 - optional
-    from pyarrow import csv  # noqa: PLC0415
-
-    buffer = pa.BufferOutputStream()
-    csv.write_csv(_arrow_batch(trace), buffer, csv.WriteOptions(include_header=False))
-    return bytes(memoryview(buffer.getvalue()))
 
 
 def _arrow_batch(trace: NDArray[np.void]) -> Any:
