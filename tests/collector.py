@@ -1,4 +1,4 @@
-"""A sink that keeps what it gets."""
+"""A sink that stores its snapshots."""
 
 import asyncio
 from collections.abc import Callable

@@ -22,14 +22,14 @@ SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile before workers would each do it, and before a test reads what a program says of it."""
+    """Compile kernels before each worker would, and before a test reads a program's output about it."""
     if not hasattr(session.config, "workerinput"):
         load_kernels()
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Folder of the real captures, or a skip that says where it was looked for."""
+    """Return the folder of the real captures, or skip with the searched path."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"real captures are absent: {SHARED_DATA} does not exist")
     return SHARED_DATA
@@ -37,13 +37,13 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """Folder of the real captures that come with the tests."""
+    """Return the folder of the captures of the tests."""
     return DATA
 
 
 @pytest.fixture(autouse=True)
 def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where programs keep their state: not in the home of who runs the tests, nor in that of another test."""
+    """Set the state folder of programs: neither the user's home nor another test's folder."""
     folder = tmp_path / "state-home"
     monkeypatch.setenv("XDG_STATE_HOME", str(folder))
     return folder

@@ -1,4 +1,4 @@
-"""What each part of the filter is worth: the table of ``make anywhere`` without it, in kinds of groups.
+"""Value of each part of the filter: the table of ``make anywhere`` without it, by kinds of groups.
 
 One part at a time is switched off in the filter's settings, in its first state or in what it sees; the cell files stay.
 Each cell of the table: RMSE, share of time inside two std, interval score, all in %.
@@ -42,11 +42,11 @@ KINDS = {
     "charging": ("NCR, charging", "LG M50, charging", *(f"LFP {t} C, charging" for t in (25, 5, -15))),
     "generic": ("generic",),
 }
-"""Groups by how their names begin; a name that is a group's own stands for that group alone."""
+"""Groups by the beginning of their names; a full name selects one group."""
 
 
 def setting(**values: float) -> Change:
-    """Of the filter's settings, ``p``."""
+    """Change settings of the filter, ``p``."""
 
     def change(p: np.void) -> None:
         for name, value in values.items():
@@ -103,12 +103,12 @@ def main() -> None:
 
 
 def belongs(group: Group, begin: str) -> bool:
-    """Whether a group is meant by how its name begins."""
+    """Return whether a group's name begins with the text."""
     return group.name == begin or (group.name.startswith(begin) and begin not in {g.name for g in GROUPS})
 
 
 def scores(group: Group, part: str, folder: Path) -> list[Score]:
-    """Of every run of a group."""
+    """Return the scores of every run of a group."""
     found = [judge(part, *run) for run in runs(group, folder)]
     return [s for s in found if s is not None]
 

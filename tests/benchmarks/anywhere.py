@@ -1,4 +1,4 @@
-"""How far the SOC is from the truth when the service is switched on anywhere, on real captures, beside other methods.
+"""Error of the SOC when the service starts anywhere in real captures, beside other methods.
 
 Cell files come from `ocv` and `identify`. Each capture is entered cut in mid-load (or from its start, where the group says
 so), 0.2 too low and 0.2 too high, and judged from 15 min later on, above SOC 0.05, weighted by time:
@@ -43,7 +43,7 @@ from tests.estimator.anywhere.score import Score, score
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one run by each method."""
+    """Result of one run by each method."""
 
     ours: Score
     nis: float
@@ -103,12 +103,12 @@ def cells_of(found: list[Outcome]) -> Iterator[str]:
 
 
 def mean(values: list[float]) -> float:
-    """Of some numbers."""
+    """Return the mean of some numbers."""
     return float(np.mean(values))
 
 
 def outcomes(group: Group, folder: Path) -> Iterator[Outcome]:
-    """Of every capture and start of a group; those that are too short are left out."""
+    """Return the outcomes of every capture and start of a group, except those that are too short."""
     for run in runs(group, folder):
         outcome = compare(*run)
         if outcome is not None:

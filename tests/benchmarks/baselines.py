@@ -1,4 +1,4 @@
-"""What others would use, on the same capture: textbook EKFs with fixed parameters, and RLS on the ARX form."""
+"""Common estimators on the same capture: textbook EKFs with fixed parameters, and RLS on the ARX form."""
 
 import math
 
@@ -23,7 +23,7 @@ FIVE_SIGMA_V = 0.1
 """The same in the mean of a second, of the filter with five time constants [V]: of 5, 20, 50, 100 and 200 mV what suits it best."""
 FIVE_TAU_S = np.array([2.0, 15.0, 80.0, 400.0, 2000.0])
 COLD_C = 0.0
-"""Where one activation energy takes the place of two."""
+"""Single activation energy in place of two."""
 
 
 @njit

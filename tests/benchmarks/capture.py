@@ -24,7 +24,7 @@ PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOURS = (4, 16)
 """Short and long: memory must not grow from one to the other."""
 GROWTH_MIB = 16.0
-"""What an allocator may keep without the program growing with its input [MiB]."""
+"""Memory that an allocator may retain without growth by the input [MiB]."""
 PIECE = 1_000_000
 RECORD = np.dtype([("arrival_s", "<f8"), ("length", "<u4"), ("data", "u1", SAMPLE_FRAME_BYTES), ("crc", "<u2")])
 """A record of the capture that holds one frame, as a live line at 100 Hz brings them."""
@@ -32,7 +32,7 @@ RECORD = np.dtype([("arrival_s", "<f8"), ("length", "<u4"), ("data", "u1", SAMPL
 
 @dataclass(frozen=True)
 class Replay:
-    """One replay: what it said of itself, and the most memory it had."""
+    """One replay: its summary, and its peak memory."""
 
     samples: int
     wall_s: float
@@ -110,6 +110,6 @@ def replay(path: Path, folder: Path, samples: int) -> Replay:
 
 
 def peak_mib(pid: int) -> float:
-    """Most memory that a process has had resident so far [MiB]; what wait4 says includes the parent's at the fork."""
+    """Return the peak resident memory of a process [MiB]; wait4 includes the parent's at the fork."""
     found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
     return int(found[1]) / 1024 if found else 0.0

@@ -1,4 +1,4 @@
-"""Chapter 5 on every real cell whose captures the protocol can be run on: ``make chapter5``."""
+"""Chapter 5 on every real cell with suitable captures: ``make chapter5``."""
 
 import itertools
 import sys
@@ -44,13 +44,13 @@ class Experiment:
 
 
 def _panasonic(name: str, at: str, *captures: tuple[str, Kind]) -> Experiment:
-    """Its HPPC, discharges with a rest after each, is its relaxation test."""
+    """Return its HPPC, discharges with a rest after each, as its relaxation test."""
     found = tuple((f"{PF}{at}_{capture}", kind) for capture, kind in (("hppc", RELAXATION), *captures))
     return Experiment(f"18650PF {name}", "nca", 2.9, found, room=at == "25")
 
 
 def _a123(name: str, at: str) -> Experiment:
-    """Its drive cycles have a rest of 5 min each half hour: a relaxation test, and the only load but C/30."""
+    """Return its drive cycles with a rest of 5 min each half hour as a relaxation test, and C/30."""
     captures = ((f"{LFP}dyn_{at}", RELAXATION), (f"{LFP}c30_dis_{at}", CONSTANT))
     return Experiment(f"A123 {name}", "lfp", 2.05, captures, room=at == "p25")
 
@@ -95,9 +95,9 @@ CONSTANT_C = 0.01
 VOLTAGE_STEP_V = 1e-3
 ROOM = [experiment.name for experiment in EXPERIMENTS if experiment.room]
 R_S_SOC = (0.98, 0.9, 0.7, 0.5, 0.3, 0.1, 0.05)
-"""Where R_s is looked at."""
+"""SOC values at which R_s is printed."""
 MIDDLE_SOC = 0.5
-"""Where the fit of (2.10) is looked at."""
+"""SOC values at which the fit of (2.10) is judged."""
 
 
 def protocol(experiment: Experiment) -> Procedure:
@@ -115,7 +115,7 @@ def _samples(name: str, kind: Kind, experiment: Experiment) -> SampleBlock:
 
 
 def discharge(rows: SampleBlock, least_a: float) -> SampleBlock:
-    """What lies between two charges and draws the most, until its last sample under load [A]."""
+    """Return the discharge between two charges with the largest charge, until its last sample under load [A]."""
     edges = np.r_[0, np.flatnonzero(np.diff((rows["current_a"] < -least_a).astype(np.int8))) + 1, rows.size]
     stretches = [rows[first:last] for first, last in itertools.pairwise(edges)]
     most = max(stretches, key=lambda stretch: charge_ah(stretch)[-1])
@@ -143,7 +143,7 @@ def lines(name: str, p: Procedure) -> Iterator[tuple[str, ...]]:
 
 
 def main() -> None:
-    """Print errors by load, the steps' outcomes by cell, the verdicts, and what else would have come out."""
+    """Print errors by load, the outcomes of the steps by cell, the verdicts, and the variants."""
     if not DATA.is_dir():
         sys.exit(f"{DATA}: the captures are not there")
     console = Console(width=WIDTH)
@@ -187,7 +187,7 @@ def errors(protocols: dict[str, Procedure]) -> Table:
 
 
 def parameters(protocols: dict[str, Procedure]) -> Table:
-    """What the three steps gave."""
+    """Print the results of the three steps."""
     table = Table(title="steps 1 to 3")
     residual = f"residual in mV, nearest SOC {MIDDLE_SOC}"
     heads = ("cell", "step 1: points", residual, "step 2 on", "outcome", "a13..a15 in ohm, -, ohm")
@@ -221,7 +221,7 @@ def verdicts(on: str, protocols: list[Procedure]) -> Table:
 
 
 def outcomes(protocols: list[Procedure]) -> Iterator[tuple[str, str, str, str]]:
-    """Of each claim: key, how often it was met, the range of what was found, verdict."""
+    """Return for each claim: key, how often it was met, range of the values, verdict."""
     for key in CLAIMS:
         found = claim(key, protocols)
         yield key, f"{found.met} of {len(found.results)}", found.span, found.verdict.value
@@ -240,12 +240,12 @@ class OwnInStep3(FastInStep3):
     """A load that validates has a part in its own R_s."""
 
     def r_s_without(self, name: str) -> SeriesResistanceFit:  # noqa: ARG002 - none is left out
-        """With it."""
+        """Use it."""
         return self.r_s_fit
 
 
 class Unweighted(Procedure):
-    """The plain mean of (4.2) as printed, whatever the current (E19)."""
+    """The plain mean of (4.2) as printed, for any current (E19)."""
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
@@ -296,7 +296,7 @@ def steps_met(protocols: dict[str, Procedure]) -> Iterator[tuple[str, str, str]]
 
 
 def steps_by_variant(protocols: dict[str, Procedure]) -> Table:
-    """What the claim of Table 11 for steps rests on."""
+    """Compute the claim of Table 11 for steps by variants of step 3."""
     table = Table(title="mean error under steps at most as printed, by step 3")
     for column in ("step 3", "all captures", "room temperature"):
         table.add_column(column)
@@ -306,7 +306,7 @@ def steps_by_variant(protocols: dict[str, Procedure]) -> Table:
 
 
 def ablation(name: str, otherwise: dict[str, Procedure]) -> Table:
-    """What the parts of step 3 and the bounds are worth on one cell."""
+    """Print the value of the parts of step 3 and of the bounds on one cell."""
     table = Table(title=f"{name}: mean / largest error in % when one thing is done otherwise")
     loads = [capture.name for capture in otherwise[AS_IT_IS].validating]
     for column in ("", *loads):
@@ -334,7 +334,7 @@ def resistances(name: str, otherwise: dict[str, Procedure]) -> Table:
 
 
 def worst(name: str, p: Procedure) -> Table:
-    """Where each load of one cell has its largest error."""
+    """Print where each load of one cell has its largest error."""
     table = Table(title=f"{name}: where the largest error is")
     for column in ("load", "at SOC", "measured in V", "less predicted in V", "current in A"):
         table.add_column(column, justify="right")

@@ -120,7 +120,7 @@ class Honest:
     number: int = 0
 
     async def send(self, seconds: float) -> tuple[float, float, int]:
-        """Send blocks for so long; return what ``Waits.take`` does."""
+        """Send blocks for this duration; return the result of ``Waits.take``."""
         end_s = time.monotonic() + seconds
         while True:
             self.number += 1
@@ -189,7 +189,7 @@ async def _kept(reader: Client, number: int) -> Row:
 
 
 def rows(seconds: float) -> Iterator[Row]:
-    """Measure for so long each [s]."""
+    """Measure for this duration each [s]."""
     load_kernels()  # compiled once, not by the worker
     with tempfile.TemporaryDirectory() as folder:
         yield from asyncio.run(measure(Path(folder), seconds))

@@ -46,17 +46,17 @@ from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
 BOARD_RATE_HZ = 1000
-"""What the hello tells: the protocol knows no higher rate, the time stamps do."""
+"""Rate in the hello: the protocol has no higher rate, the timestamps show it."""
 SEND_S = 0.002
-"""So often the board's bytes leave, as on USB [s]."""
+"""Interval at which the board's bytes leave, as on USB [s]."""
 BURST_S = 0.006
 """No more of them leaves at once [s]."""
 CHUNK_S = 10.0
-"""The sender prepares so much at a time [s]."""
+"""Duration that the sender prepares at a time [s]."""
 WARM_S = 20.0
 """Before it processor time and memory are not measured [s]."""
 HALF_DAY_S = 8.0 * 3600.0
-"""So long the pulses discharge, then they charge [s]."""
+"""Duration of the discharge pulses before the charge pulses [s]."""
 MAX_CPU, MAX_GROWTH_MIB = 0.20, 2.0
 READ_BYTES = 4096
 PACK = """
@@ -125,7 +125,7 @@ def send(master: int, rate_hz: int, seconds: float, sent: "mp.Queue[tuple[int, i
 
 @dataclass(frozen=True)
 class Run:
-    """What the service made of it."""
+    """Counters of the service."""
 
     sent: int
     no_room: int
@@ -283,7 +283,7 @@ def lost_sensor_rows(lost_s: float) -> Iterator[Row]:
 
 
 def main() -> None:
-    """Measure what is asked for; 1 where a target was not met."""
+    """Measure the requested parts; return 1 if a target was not met."""
     parser = argparse.ArgumentParser(prog="make load", description=__doc__)
     parser.add_argument("--rate", type=int, default=5000, help="frames per second over the PTY")
     parser.add_argument("--minutes", type=float, default=10.0, help="for so long; 0: not at all")

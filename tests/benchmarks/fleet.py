@@ -1,4 +1,4 @@
-"""What a fleet costs: server, workers and simulated edges as processes on the loopback. ``make fleet ARGS="--packs 10000"``.
+"""Cost of a fleet: server, workers and simulated edges as processes on loopback. ``make fleet ARGS="--packs 10000"``.
 
 Lag is from the arrival of a block's last sample at the edge to the estimate made of it, here, as ``bms.<pack>.state``
 arrives at a listener: of some packs for the shares, of all for the worst, which workers tell in their heartbeats.
@@ -33,12 +33,12 @@ from tests.patience import LONG_S
 
 SEED, DAY_S, PARTITIONS = 1, 86_400.0, 64
 LISTENED = 256
-"""Packs whose estimates are heard, evenly spread."""
+"""Number of packs whose estimates are received, evenly spread."""
 
 
 @dataclass
 class Heard:
-    """What was heard in the measured time.
+    """Messages received in the measured time.
 
     Attributes:
         lags_s: Of estimates of the packs that are listened to [s].
@@ -58,7 +58,7 @@ class Heard:
         return sum(worker.blocks for worker in self.workers.values())
 
     def total(self, what: str) -> int:
-        """Of a counter of all workers."""
+        """Return the sum of a counter over all workers."""
         return sum(worker.counters.get(what, 0) for worker in self.workers.values())
 
 
@@ -156,7 +156,7 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
 
 
 async def _listen(fleet_rig: Rig, fleet: SimulatedFleet) -> Heard:
-    """Hear workers, and some packs."""
+    """Receive heartbeats, and the estimates of some packs."""
     heard = Heard()
     nc = await fleet_rig.connected()
     index = {name: i for i, name in enumerate(fleet.names)}
@@ -187,7 +187,7 @@ async def _until(true: Any) -> None:
 
 
 def _wire_bytes(fleet_rig: Rig) -> int:
-    """What edges have sent by now, as the server counts it."""
+    """Return the bytes that edges have sent, by the server's count."""
     found = fleet_rig.engine.ask(0, "connz?limit=1000")["connections"]
     return sum(each["in_bytes"] for each in found if each.get("mqtt_client", "").startswith("simulated"))
 

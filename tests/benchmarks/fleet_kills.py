@@ -1,4 +1,4 @@
-"""Workers and the server killed at random, and no sample lost or counted twice. ``make fleet-kills ARGS="--kills 100"``.
+"""Workers and the server killed at random, without losing or repeating a sample. ``make fleet-kills ARGS="--kills 100"``.
 
 Real processes on the loopback, simulated edges that go on sending. Each kill is SIGKILL, at a moment that a seed chooses;
 who was killed is started again. Of three nodes one is down at a time, the leader of the blocks' stream as often as not.
@@ -43,13 +43,14 @@ OF_WORKERS = 0.5
 OF_LEADERS = 0.5
 """Part of the nodes' kills, where there are three."""
 MAX_AWAY_S = 2.0
-"""Before who was killed is started again."""
+"""Delay before a killed process is restarted."""
 BLOCKS_AFTER = 2
-"""That each edge sends after the last kill: what was lost is asked for again when the next block comes."""
+"""Number of blocks that each edge sends after the last kill, since a missing block is requested when the next one
+arrives."""
 LOOKS = 20
-"""A tenth of a second apart, at what is counted and what there is, that have to agree."""
+"""Number of equal readings, a tenth of a second apart, of counters and stream."""
 MAX_WRONG = 20
-"""Lines about what is wrong."""
+"""Maximum number of error lines."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Plan:
 
 @dataclass
 class Outcome:
-    """What came of it.
+    """Result of a run.
 
     Attributes:
         killed: How often whom.
@@ -103,7 +104,7 @@ class Outcome:
 
 @dataclass
 class Sent:
-    """What the stream has of a pack.
+    """Blocks of a pack in the stream.
 
     Attributes:
         numbers: Of its blocks, and how often each came.
@@ -152,7 +153,7 @@ def _say(line: str) -> None:
 
 
 def run(plan: Plan, said: Callable[[str], object] = lambda _: None) -> Outcome:
-    """Run a plan; ``said`` hears of each kill."""
+    """Run a plan; ``said`` receives each kill."""
     with (
         tempfile.TemporaryDirectory() as folder,
         rig(Path(folder), plan.nodes, partitions=plan.partitions) as fleet_rig,
@@ -220,7 +221,7 @@ async def _hear(nc: Client) -> dict[str, tuple[float, Heartbeat]]:
 
 
 def _counted(heard: dict[str, tuple[float, Heartbeat]]) -> int:
-    """Messages of the stream that the partitions' counts tell of, as who lives and holds them says."""
+    """Return the number of messages that the partitions' counters include, by their live owners."""
     now_s = time.monotonic()
     return sum(
         beat.counters.get(what, 0)
@@ -231,7 +232,7 @@ def _counted(heard: dict[str, tuple[float, Heartbeat]]) -> int:
 
 
 def _held(heard: dict[str, tuple[float, Heartbeat]]) -> set[int]:
-    """Partitions that somebody who lives has."""
+    """Return the partitions with a live owner."""
     now_s = time.monotonic()
     return {number for heard_s, beat in heard.values() if now_s - heard_s < DEAD_S for number in beat.partitions}
 
@@ -249,7 +250,7 @@ async def _until_whole(nc: Client, fleet: SimulatedFleet) -> None:
 
 
 async def _sent(nc: Client) -> dict[str, Sent]:
-    """What the stream has, by pack."""
+    """Return the blocks in the stream by pack."""
     sent: dict[str, Sent] = defaultdict(Sent)
     last = await _last_sequence(nc)
     async for message in stored(nc, subjects.RAW_STREAM, "p.*.raw.*", 1, last):
@@ -258,7 +259,7 @@ async def _sent(nc: Client) -> dict[str, Sent]:
 
 
 async def _until_all_counted(nc: Client, heard: dict[str, tuple[float, Heartbeat]]) -> None:
-    """Until nothing comes any more, and all is counted: the server may still store what it has read from the edges."""
+    """Wait until no message arrives and all are counted, because the server may still store messages of the edges."""
     looks = 0
     async with asyncio.timeout(LONG_S):
         while looks < LOOKS:
@@ -267,7 +268,7 @@ async def _until_all_counted(nc: Client, heard: dict[str, tuple[float, Heartbeat
 
 
 async def _last_sequence(nc: Client) -> int:
-    """Of the stream; asked until a server answers."""
+    """Return the last sequence of the stream; retried until a server responds."""
     async with asyncio.timeout(LONG_S):
         while True:
             with contextlib.suppress(NatsError, TimeoutError):
@@ -282,7 +283,7 @@ async def _until(true: Callable[[], bool]) -> None:
 
 
 async def _judge(nc: Client, fleet: SimulatedFleet, plan: Plan, outcome: Outcome) -> None:
-    """Compare what the stream has, what is in the checkpoints, and what one estimator makes of all samples."""
+    """Compare the stream, the checkpoints, and one estimator over all samples."""
     numbers = {pack: sent.numbers for pack, sent in (await _sent(nc)).items()}
     bucket = PackBucket(nc)
     await bucket.refresh()
@@ -323,7 +324,7 @@ def _differences(pack: str, numbers: Counter[int], state: np.void, estimator: Es
 
 
 async def _last(nc: Client, number: int, bucket: PackBucket) -> Partition | None:
-    """A partition as its last checkpoint has it; None: nobody had it."""
+    """Return a partition from its last checkpoint; None: it had no owner."""
     js = nc.jetstream(timeout=LONG_S)
     checkpoints, states = await js.key_value(subjects.CHECKPOINTS_BUCKET), await js.object_store(subjects.STATES_BUCKET)
     entry = await checkpoints.get(f"p{number}")

@@ -1,4 +1,4 @@
-"""What the page of a fleet costs its process: 100,000 packs in minute blocks are 1,667 states/s; ``make fleet-page``.
+"""Cost of the page of a fleet: 100,000 packs in minute blocks are 1,667 states/s; ``make fleet-page``.
 
 The real nats-server; the page as its command serves it, with one browser's stream of events; states from this process.
 """
@@ -49,7 +49,7 @@ async def send(nc: Client, packs: int) -> None:
 
 
 async def read(url: str, got: dict[str, float]) -> None:
-    """As a browser does."""
+    """Read as a browser does."""
     async with (
         aiohttp.ClientSession(timeout=aiohttp.ClientTimeout()) as session,
         session.get(f"{url}/events") as events,

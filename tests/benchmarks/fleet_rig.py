@@ -17,7 +17,7 @@ from tests.patience import LONG_S
 
 
 class Rig:
-    """Processes of one fleet; what they say is in files of ``folder``.
+    """Processes of one fleet; their output is in files of ``folder``.
 
     Args:
         folder: For all files.
@@ -40,13 +40,13 @@ class Rig:
         return name
 
     def kill_worker(self, name: str) -> None:
-        """By SIGKILL."""
+        """Kill a worker by SIGKILL."""
         process = self.workers.pop(name)
         process.kill()
         process.wait(LONG_S)
 
     def stop_workers(self) -> None:
-        """As an operator does: each writes its checkpoints."""
+        """Stop workers as an operator does: each writes its checkpoints."""
         for process in self.workers.values():
             process.send_signal(signal.SIGTERM)
         for process in self.workers.values():
@@ -54,7 +54,7 @@ class Rig:
         self.workers.clear()
 
     def load(self, fleet: SimulatedFleet) -> None:
-        """Let the server know the packs."""
+        """Load the table of packs."""
         table = self.folder / "packs.csv"
         table.write_text(fleet.table())
         process = self.run("packs", "load", str(table), "--server", self.server, log="load")
@@ -64,7 +64,7 @@ class Rig:
     def simulate(
         self, packs: int, *, seed: int, begin: str, speed: float, blocks: int | None = None
     ) -> subprocess.Popen[bytes]:
-        """Be their edges, for so many blocks each, or until it is stopped."""
+        """Simulate their edges, for a number of blocks each, or until stopped."""
         arguments = ["--packs", packs, "--seed", seed, "--begin", begin, "--speed", speed]
         arguments += ["--blocks", blocks] if blocks else []
         return self.run("simulate", "--mqtt", self._mqtt, *map(str, arguments), log="edges")
@@ -81,7 +81,7 @@ class Rig:
             process.wait(LONG_S)
 
     async def connected(self) -> Client:
-        """To any node that lives; again and again where the one it has goes."""
+        """Connect to any live node, and reconnect when it disappears."""
         return await connected(self.engine.urls)
 
 
@@ -104,7 +104,7 @@ async def make(rig: Rig, *, partitions: int) -> None:
 
 
 def cpu_s(pid: int) -> float:
-    """What a process has used of the processors [s]."""
+    """Return the CPU time of a process [s]."""
     times = psutil.Process(pid).cpu_times()
     return times.user + times.system
 

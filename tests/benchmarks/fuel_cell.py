@@ -25,7 +25,7 @@ from tests.mann_stack import CURVE_A
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 MIN_A = 0.1
-"""Of the measured curves: see docs/theory/fuel-cell.md [A/cm2]."""
+"""Limit of the measured curves: see docs/theory/fuel-cell.md [A/cm2]."""
 WRONG = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])
 """Parameters of the file that a search begins at, over those of ``pem_30w``."""
 WATCHED = "r_ohm", "tafel_slope_v", "exchange_current_a", "c_dl_farad"

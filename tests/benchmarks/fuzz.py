@@ -1,4 +1,4 @@
-"""Mutated inputs to everything that reads what others wrote: nothing but the documented errors, no hang.
+"""Mutated inputs to all readers of foreign bytes: only documented errors, and no hang.
 
     make fuzz ARGS="--decoders 10_000_000 --parsers 1_000_000 --seed 1 --only frames text"
 
@@ -65,14 +65,14 @@ CORPUS = Path(__file__).parents[1] / "data" / "fuzz"
 LONGEST = 4096
 """No input is longer [bytes]."""
 HANG_S = 240.0
-"""So long may a batch of inputs take before it counts as a hang [s]."""
+"""Time for a batch of inputs after which it counts as a hang [s]."""
 BATCH = 200
 ROOM = 1 << 20
 """A repaired input is no longer [bytes]."""
 PROCESSES = 2
 
 Read = Callable[[bytes], object]
-"""Reads an input; raises what is documented, or nothing."""
+"""Reads an input; raises only documented errors."""
 Repair = Callable[[random.Random, bytes], bytes]
 """Makes a damaged input whole again where a checksum would keep it from going deeper."""
 
@@ -118,7 +118,7 @@ def _text(_: Path) -> Read:
 
 
 def _meter(make: Callable[[], DeviceProtocol]) -> Callable[[Path], Read]:
-    """Of a dialect that only needs bytes."""
+    """Return a decoder that only needs bytes."""
 
     def read(data: bytes) -> None:
         dialect = make()
@@ -131,7 +131,7 @@ def _meter(make: Callable[[], DeviceProtocol]) -> Callable[[Path], Read]:
 
 
 def _asked(protocol: str) -> Callable[[Path], Read]:
-    """Of a BMS that is asked."""
+    """Return the decoder of a polled BMS."""
 
     def make(_: Path) -> Read:
         def read(data: bytes) -> None:
@@ -161,7 +161,7 @@ def _messages(_: Path) -> Read:
 
 
 def _file(name: str, load: Callable[[Path], object]) -> Callable[[Path], Read]:
-    """Of a file; what is wrong with it is said with its name."""
+    """Return a file reader; its errors name the file."""
 
     def make(folder: Path) -> Read:
         path = folder / name
@@ -200,7 +200,7 @@ def _requests(_: Path) -> Read:
 
 
 def _published(_: Path) -> Read:
-    """What a subscriber hears, as a screen and as lines."""
+    """Read messages of a subscriber, as a screen and as lines."""
     topics = ("state", "health", "info", "parameters", "availability", "alarm/soc_low")
     console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, color_system=None)
 
@@ -291,7 +291,7 @@ def _counted(random: random.Random, data: bytes) -> bytes:
 
 
 def _jbd_summed(random: random.Random, data: bytes) -> bytes:
-    """One frame with a right checksum again, of whatever length it says."""
+    """Correct the checksum of one frame of any stated length."""
     at = data.find(b"\xdd", random.randrange(len(data) + 1))
     end = at + 4 + data[at + 3] if 0 <= at < len(data) - 4 else len(data)
     return data[:end] + jbd.checksum(data[at + 2 : end]) + b"\x77" + data[end + 3 :] if end < len(data) else data
@@ -316,7 +316,7 @@ def _jk_summed(random: random.Random, data: bytes) -> bytes:
 
 
 def _headed(random: random.Random, data: bytes) -> bytes:
-    """A capture whose header has a right length and CRC again."""
+    """Correct length and CRC of a capture's header."""
     begin, end = data.find(b"{"), data.find(b"}") + 1
     if not 0 <= begin < end or random.random() < 0.3:
         return data
@@ -326,7 +326,7 @@ def _headed(random: random.Random, data: bytes) -> bytes:
 
 
 def _zipped(random: random.Random, data: bytes) -> bytes:
-    """A checkpoint one of whose members is damaged, with right CRCs."""
+    """Damage a member of a checkpoint, with right CRCs."""
     if random.random() < 0.3:
         return data
     content, members = io.BytesIO(), _checkpoint_members()
@@ -452,7 +452,7 @@ def seeds(name: str, pattern: str = "*") -> list[bytes]:
 
 
 class FuzzError(Exception):
-    """An input made a reader raise what it should not."""
+    """An input made a reader raise an undocumented error."""
 
     def __init__(self, data: bytes, error: BaseException) -> None:
         super().__init__(f"{type(error).__name__}: {error}")
@@ -496,7 +496,7 @@ def keep(name: str, data: bytes) -> Path:
 
 
 def quiet() -> None:
-    """Log nothing: readers say what was wrong with each input."""
+    """Suppress the log lines of readers about each input."""
     warnings.simplefilter("ignore")
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
 
@@ -506,7 +506,7 @@ def _memory_disk() -> str | None:
 
 
 def _work(name: str, seed: str, count: int, room: mmap.mmap, fault: "mp.Queue[str]") -> None:
-    """A process: the input that is read now stands in ``room``, for who finds it dead."""
+    """Process inputs; the current one is in ``room`` in case the process dies."""
     quiet()
 
     def note(data: bytes) -> None:
@@ -521,7 +521,7 @@ def _work(name: str, seed: str, count: int, room: mmap.mmap, fault: "mp.Queue[st
 
 
 def fuzz(name: str, seed: int, count: int) -> bool:
-    """Try ``count`` inputs in all processes, and say what came of it. Returns whether none failed."""
+    """Try ``count`` inputs in all processes, and print the result. Returns whether none failed."""
     fork = mp.get_context("fork")
     begin_s, workers = time.monotonic(), []
     for i in range(PROCESSES):
@@ -547,7 +547,7 @@ def fuzz(name: str, seed: int, count: int) -> bool:
 
 
 def main() -> None:
-    """Fuzz what is asked for; 1 where something failed."""
+    """Fuzz the requested readers; return 1 after a failure."""
     parser = argparse.ArgumentParser(
         prog="make fuzz", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

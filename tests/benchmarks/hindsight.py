@@ -1,4 +1,5 @@
-"""How often the SOC is within 2 std by hindsight (`fleet ask honest`) and in truth, on real captures: docs/fleet/questions.md.
+"""Share of SOCs within 2 std by hindsight (`fleet ask honest`) and in truth, on real captures:
+docs/fleet/questions.md.
 
 Captures last hours, so six minutes stand for an hour. Each is entered as `make anywhere` does; each run is a pack.
 
@@ -31,12 +32,12 @@ from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
 
 SLOT_S = 360.0
 LATER = (1, 3, 6, 12, 24)
-"""As `honest` looks back from."""
+"""Distance from which `honest` looks back."""
 STORE = 10**9
 
 
 def limits(slot_s: float = SLOT_S) -> Limits:
-    """With slots in the place of hours."""
+    """Return the limits with slots in place of hours."""
     return replace(LIMITS, least_seen_s=0.97 * slot_s)
 
 
@@ -85,7 +86,7 @@ def judged(pack: list[Known]) -> list[float]:
 def slots(
     pack: str, cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float, slot_s: float = SLOT_S
 ) -> list[Known]:
-    """What is known each ``slot_s`` [s], and how far its SOC is from the truth."""
+    """Return the estimates at intervals of ``slot_s`` [s], and the errors of their SOC."""
     estimator, sums, known = Estimator(cell, initial_soc=start_soc), np.zeros(1, HOUR_SUMS), list[Known]()
     number = ((seen["time_s"] - seen["time_s"][0]) // slot_s).astype(int)
     for slot in range(number[-1]):

@@ -1,4 +1,4 @@
-"""What the learning law is worth, simulated: ``make learning``. The tables of docs/theory/observer.md.
+"""Value of the learning law, simulated: ``make learning``. The tables of docs/theory/observer.md.
 
 The thesis's cell under steps of random height and length, a sample each second, bounds a quarter to four times the
 file's; the file is off by a factor 2 in R_s, R_ts, tau_ts, R_tl, tau_tl: sixteen of the 32 combinations, in which every
@@ -55,7 +55,7 @@ K_STILL_V = 9.0
 K_BOUND = learning_law.FASTEST_HZ / RATE_HZ
 OF_OBSERVER = ("dead_zone_v", "k0")
 LEAK = 1e-4
-"""Of the law without a memory, of its gain: already ten times as much leads it visibly away from the truth."""
+"""Gain of the law without a memory: ten times as much already diverges."""
 HIGH_OHM = 10.0
 SOC_OFF = 0.05
 NO_N: dict[str, Any] = {"nussbaum": "k2-cos", "k0": 0.0, "dead_zone_v": K_STILL_V}
@@ -128,7 +128,7 @@ def products(estimator: Estimator) -> tuple[float, float, float]:
 
 
 def put_in(kernel: Any, **others: Any) -> Any:
-    """A kernel with other functions under the names of those that it calls, compiled anew."""
+    """Recompile a kernel with other functions under the names of those that it calls."""
     plain = kernel.py_func
     return njit(types.FunctionType(plain.__code__, plain.__globals__ | others, plain.__name__))
 
@@ -152,7 +152,7 @@ def step_alone(m: Record, q: Record, share: float) -> None:
 
 @njit
 def gradient(m: Record, q: Record) -> bool:
-    """The gradient on what is remembered, over its trace, in place of Newton's step."""
+    """Return the gradient on the memory, over its trace, in place of Newton's step."""
     total = 0.0
     for j in range(q.count):
         total += m.information[j, j] + q.leak_v2s[j]
@@ -184,7 +184,7 @@ def along_pull(m: Record, q: Record) -> bool:
 
 @njit
 def inject_as_printed(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """u = -N e into both branches (3.2), (3.3) with N = N(0) = 1/s; the sensitivities know."""
+    """Inject u = -N e into both RC pairs (3.2), (3.3) with N = N(0) = 1/s, with its sensitivities."""
     share = 2.0 * integral_of_exponential(-2.0, dt_s)
     for branch in range(2):
         m.x[branch] -= 0.5 * share * e
@@ -226,7 +226,7 @@ def ablation(blocks: Mapping[str, tuple[SampleBlock, float]]) -> Iterator[tuple[
 
 
 def gains() -> Iterator[tuple[str, ...]]:
-    """What k is worth on a cell of ten times the resistances, whose errors are ten times as large."""
+    """Print the value of k on a cell with ten times the resistances, whose errors are ten times as large."""
     block = random_steps(3.0, 1e-3, cell=file_off_by(HIGH_OHM, HIGH_OHM, 1.0, HIGH_OHM, 1.0))
     for period_s, still in itertools.product((60.0, 1000.0), (False, True)):
         settings = {"rate": 1.0 / period_s} | ({"dead_zone_v": K_STILL_V} if still else {})

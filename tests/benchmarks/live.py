@@ -31,7 +31,7 @@ SETTLE_S, MEASURE_S, PATIENCE_S = 2.0, 20.0, 30.0
 BARE_MESSAGES, BARE_BYTES = 100, 945
 """Messages of the bare publish, and their size: that of a state."""
 MAX_S = 120
-"""A signal is prepared for so long [s]."""
+"""Duration of a prepared signal [s]."""
 
 PACK = """
 [pack]
@@ -55,7 +55,7 @@ folder = "{folder}"
 
 @dataclass(frozen=True)
 class State:
-    """One message on the state topic, and when it came on the monotonic clock [s]."""
+    """One message on the state topic, and its arrival on the monotonic clock [s]."""
 
     arrival_s: float
     board_time_s: float
@@ -66,20 +66,20 @@ class State:
 
 @dataclass(frozen=True)
 class Run:
-    """What one run measured."""
+    """Result of one run."""
 
     first_s: float
-    """From the start of the service to its first estimate [s]."""
+    """Time from the start of the service to its first estimate [s]."""
     cpu: float
     """Part of one core that the service took while measured."""
     latency_s: NDArray[np.float64]
-    """From a sample taken to the estimate of that sample received [s]."""
+    """Time from a sample taken to the reception of its estimate [s]."""
     sent: int
     last: State
 
 
 class Signal:
-    """What is at a board's sensors, sample by sample.
+    """Signal at a board's sensors, sample by sample.
 
     Attributes:
         taken_s: Monotonic time at which each sample so far was taken, whose bytes leave at once [s].

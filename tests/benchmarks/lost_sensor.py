@@ -23,9 +23,9 @@ from tests.patience import LONG_S
 CHARGE_A = -30.0
 PERIOD_S = 0.1
 LATE_S = 3.0
-"""From the end of the delay to the hook's program at most [s]."""
+"""Maximum time from the end of the delay to the hook's program [s]."""
 LOSSES = {"t": "over_temperature", "cells": "cell_over_voltage"}
-"""By quantity of the publisher: an alarm that needs it."""
+"""Alarm that needs each quantity of the publisher."""
 PACK = """
 [pack]
 name = "attack"
@@ -57,7 +57,7 @@ run = ["{program}"]
 
 @dataclass(frozen=True)
 class Loss:
-    """What followed when a quantity became null.
+    """Consequences of a quantity that became null.
 
     Attributes:
         alarm: Alarm that needs the quantity.

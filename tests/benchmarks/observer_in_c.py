@@ -38,7 +38,7 @@ class ObserverInC:
         self._run.argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_int64]
 
     def run(self, state: Records, settings: Records, samples: Records, trace: Records) -> int:
-        """As ``kernels.step.run``."""
+        """Run as ``kernels.step.run``."""
         pointers = [array.ctypes.data for array in (state, settings, samples, trace)]
         return int(self._run(*pointers, samples.size))
 

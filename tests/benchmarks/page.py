@@ -1,4 +1,4 @@
-"""What the live page costs a browser: first paint, processor time and memory at 10 Hz; ``make page ARGS=minutes``.
+"""Cost of the live page in a browser: first paint, CPU and memory at 10 Hz; ``make page ARGS=minutes``.
 
 A real Chromium on the page of the real service, whose pack publishes ten states a second.
 """
@@ -47,7 +47,7 @@ def say(text: str) -> None:
 
 
 async def measure(service: Service, minutes: float) -> None:
-    """Watch one page for so long."""
+    """Watch one page for this duration."""
     async with chromium() as browser, tab(browser, service.url) as opened:
         await opened.until_status("live")
         await opened.until("() => performance.getEntriesByName('first-contentful-paint').length")

@@ -1,4 +1,4 @@
-"""What a block of a fleet's pack costs a worker, all in and part by part, and what a pack takes in memory and on disk."""
+"""Cost of a block of a fleet's pack in a worker, in total and by part, and its memory and disk space."""
 
 import sys
 import time
@@ -55,7 +55,8 @@ def _block(samples: SampleBlock, minute: int) -> bytes:
 
 
 def _whole(partition: Partition, blocks: list[bytes]) -> float:
-    """Of one block, among those of all packs in turn [us]: the median of all minutes, and a share of the full hour."""
+    """Return the time of one block, among those of all packs in turn [us]: the median of all minutes, and a share
+    of the full hour."""
     minutes_s, sequence = [], 0
     for data in blocks:
         begin_s = time.process_time()

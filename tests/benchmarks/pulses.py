@@ -25,7 +25,7 @@ AFTER_S = 900.0
 
 
 def pulse_table(folder: Path, wanted: list[str]) -> Table:
-    """Of every group that is no other's captures from elsewhere or with a wrong sensor."""
+    """Print the table for every group without foreign captures or sensor errors."""
     table = Table(title="R_s against pulses: ratio of the medians; within 10 %, inside 2 std [% of pulses]")
     for column in ("group", "pulses", "step s", "pulse mOhm", "ratio", "within 10 %", "inside", "std %"):
         table.add_column(column, justify="left" if column == "group" else "right")
@@ -64,7 +64,7 @@ def cells_of(group: Group, folder: Path) -> Iterator[str]:
 
 
 def pulses(samples: SampleBlock, capacity_ah: float) -> tuple[NDArray[np.intp], Floats]:
-    """Row before each pulse, and what it shows [ohm]."""
+    """Return the row before each pulse, and its resistance [ohm]."""
     time_s, current_a, voltage_v = (samples[n] for n in ("time_s", "current_a", "voltage_v"))
     change_a, step_s = np.diff(current_a), np.diff(time_s)
     inner = np.arange(1, change_a.size - 2)

@@ -16,9 +16,9 @@ SPAN = 4.0
 
 
 NEVER_V = 1e3
-"""No simulation is to end at a cut-off: what it tries may be far off."""
+"""Cut-off that no simulation reaches, because the optimizer tries extreme values."""
 CHANGE_C, EVERY_S = 0.02, 10.0
-"""Rows that are kept: at both ends of a change of the current by more, and after so long."""
+"""Rows that are kept: both ends of a larger change of the current, and one after this time."""
 MAX_ROWS = 7_000
 
 
@@ -33,7 +33,7 @@ def thinned(samples: SampleBlock, change_a: float) -> SampleBlock:
 def fit(
     cell: CellModel, samples: SampleBlock, initial_soc: float, start: dict[str, float], seed: int
 ) -> tuple[float, float, float, float, float] | None:
-    """R_s, R_1 [ohm], C_1 [F], R_2 [ohm], C_2 [F] of least squares on a capture that begins rested.
+    """Fit R_s, R_1 [ohm], C_1 [F], R_2 [ohm], C_2 [F] by least squares to a capture that begins at rest.
 
     SOC below 0.1 is left out: constant elements know nothing of it.
 

@@ -20,20 +20,21 @@ WRONG = (-0.2, 0.2)
 IN_MID_LOAD, FROM_START = 0.35, 0.0
 """Part of the charge that is moved before the cut."""
 LOWEST_V, HIGHEST_V = 1.5, 4.5
-"""What lies outside is no voltage of a cell."""
+"""Voltages outside are no cell voltages."""
 PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a cell file is made of: by `ocv`, and `identify` if there is something for it; a generic one of chemistry and capacity alone."""
+    """Recipe of a cell file: by `ocv`, and by `identify` if there are captures for it; a generic one has chemistry
+    and capacity only."""
 
     capacity_ah: float
     ocv: tuple[str, ...] = ()
     identify: tuple[str, ...] = ()
     generic: str = ""
     measured: bool = False
-    """`ocv` is not told the capacity."""
+    """`ocv` measures the capacity."""
 
 
 PF_HPPC = tuple(PF + f"{t}_hppc" for t in ("25", "10", "0", "n10"))
@@ -68,9 +69,9 @@ class Group:
     gain: float = 1.0
     offset_a: float = 0.0
     capacity: float = 1.0
-    """What the estimator is told over what is true."""
+    """Declared relative to true value."""
     charging: bool = False
-    """Of the charge after the lowest SOC."""
+    """Fraction of the charge after the lowest SOC."""
 
 
 NCR_CHANGING = (
@@ -155,14 +156,14 @@ GROUPS = (
 
 
 def chosen(groups: Iterable[Group], parts: list[str]) -> list[Group]:
-    """Those whose name contains one of ``parts``; all where there are none."""
+    """Return the items whose name contains one of ``parts``; all without parts."""
     if not DATA.is_dir():
         sys.exit(f"{DATA}: the captures are not there")
     return [g for g in groups if not parts or any(part in g.name for part in parts)]
 
 
 def runs(group: Group, folder: Path) -> Iterator[tuple[CellModel, SampleBlock, Floats, float]]:
-    """Cell file, what the estimator sees, the true SOC at each sample and the one that is told, of each capture and start."""
+    """Return cell file, samples, true SOC and initial SOC of each capture and start."""
     true_ah = group.recipe.capacity_ah
     cell = cell_file(group.recipe, folder)
     if group.capacity != 1.0:
@@ -178,7 +179,7 @@ def runs(group: Group, folder: Path) -> Iterator[tuple[CellModel, SampleBlock, F
 
 
 def first_sample(samples: SampleBlock, group: Group) -> int:
-    """That the estimator sees."""
+    """Return the first sample of the estimator."""
     drawn_ah = charge_ah(samples)
     lowest = int(np.argmax(drawn_ah)) if group.charging else 0
     moved_ah = np.abs(drawn_ah[lowest:] - drawn_ah[lowest])
@@ -187,7 +188,7 @@ def first_sample(samples: SampleBlock, group: Group) -> int:
 
 @cache
 def cell_file(recipe: Recipe, folder: Path) -> CellModel:
-    """By `ocv`, then `identify`; what they refuse to write is not used, and said."""
+    """Return the cell file by `ocv`, then `identify`; a rejected file is not used, and printed."""
     if recipe.generic:
         return load_cell(recipe.generic, recipe.capacity_ah)
     named = *recipe.ocv, *recipe.identify
@@ -210,13 +211,13 @@ def command(*arguments: object) -> str:
 
 
 def path_of(name: str) -> Path:
-    """Of a capture."""
+    """Return the path of a capture."""
     return DATA / f"{name}.csv.gz"
 
 
 @cache
 def load(name: str, capacity_ah: float, initial_soc: float) -> tuple[SampleBlock, Floats]:
-    """Samples without what is no voltage, and the true SOC at each."""
+    """Return samples without invalid voltages, and the true SOC at each."""
     rows = load_capture(path_of(name)).rows
     rows = rows[(rows["voltage_v"] > LOWEST_V) & (rows["voltage_v"] < HIGHEST_V)]
     counter = DATA / f"{name}.soc.gz"

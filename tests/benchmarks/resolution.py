@@ -1,4 +1,5 @@
-"""What a source's rate, steps and delay do to the SOC and its band, on cells that the estimator's model does not contain.
+"""Effect of a source's rate, steps and delay on the SOC and its interval, on cells that differ from the estimator's
+model.
 
 Each row is one kind of source; a run is one simulated cell (``tests.estimator.anywhere``: its cell file errs as much as it
 says), under levels of some seconds or as in a house, met in mid-load with an SOC told 0.2 too low or 0.2 too high. Judged
@@ -31,7 +32,7 @@ from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.truth import simulate
 
 TRUTH_HZ = 10
-"""The truth is simulated so often, for sources that are slower."""
+"""Number of true steps for each sample of slower sources."""
 SEEDS = range(1, 9)
 KELVIN_STEP = 1.0
 NOISE_V = 5e-4
@@ -57,7 +58,7 @@ class Source:
 
     @property
     def name(self) -> str:
-        """Of the row."""
+        """Return the name of the row."""
         period_s = 1.0 / self.rate_hz
         rate = f"{self.rate_hz:g} Hz" if self.rate_hz >= 1.0 else f"{period_s:g} s"
         parts = [f"{self.capacity_ah:g} Ah", rate, f"{1e3 * self.ampere_step:g} mA"]
@@ -69,7 +70,7 @@ class Source:
 
     @property
     def sampling(self) -> Sampling:
-        """What the estimator is told of it."""
+        """Return the declared sampling."""
         return Sampling(1.0 / self.rate_hz, self.ampere_step, self.dead_band_a)
 
 
@@ -117,7 +118,7 @@ def cells_of(found: list[Score]) -> Iterator[str]:
 
 
 def scores(source: Source, *, told: bool = True, seeds: Iterable[int] = SEEDS) -> Iterator[Score]:
-    """Of each run of a kind of source."""
+    """Return the scores of each run of a kind of source."""
     for case in cases_of(source, seeds):
         samples, soc = seen(case, source)
         for wrong in WRONG:
@@ -158,7 +159,7 @@ def current_of(case: Case, source: Source, rate_hz: int) -> Floats:
 
 
 def seen(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
-    """What the source tells, and the SOC at each sample."""
+    """Return the samples of the source, and the SOC at each."""
     rng = np.random.default_rng(1000 + case.seed)
     rate_hz = max(TRUTH_HZ, round(source.rate_hz))
     current_a = current_of(case, source, rate_hz)

@@ -1,4 +1,4 @@
-"""The table of what was to be reached and what was measured."""
+"""Table of targets and measured values."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Row:
 
 
 def show(rows: Iterable[Row], title: str = "bms_estimator benchmarks") -> bool:
-    """Print the rows as they come. Returns whether all targets were met."""
+    """Print the rows as they arrive. Returns whether all targets were met."""
     table = Table(title=title)
     for column in ("what", "target", "measured", "met"):
         table.add_column(column)

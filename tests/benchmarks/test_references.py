@@ -1,4 +1,4 @@
-"""What the comparison of methods is judged by, on a cell whose elements are known."""
+"""References of the comparison on a cell with known elements."""
 
 import numpy as np
 import pytest

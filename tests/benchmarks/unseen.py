@@ -27,7 +27,7 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What happens every ``every_s``, a third more or less: samples are missing for ``missing_s``, a third more or less.
+    """A disturbance every ``every_s``, with a spread of a third: samples are missing for ``missing_s``.
 
     When it is a kill the estimator goes on from what it was up to ``age_s`` before.
     """

@@ -1,4 +1,4 @@
-"""What a board would put on the line for given samples, fast enough for millions."""
+"""A board's bytes for given samples, fast enough for millions."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -27,7 +27,7 @@ def constant(current_a=0.75, duration_s=13_000):
 
 
 def capture(current_a, *, cell=TRUTH, soc=0.98, noise_v=0.5e-3, seed=0):
-    """What a sensor sees of ``cell`` under ``current_a`` at 1 Hz, to SOC 0.03."""
+    """Return the samples of ``cell`` under ``current_a`` at 1 Hz, to SOC 0.03."""
     time_s = np.arange(current_a.size, dtype=float)
     elements = np.zeros(22)
     elements[1:16] = cell.a[1:16]
@@ -60,11 +60,11 @@ LADDER = Ladder(
     error_v=0.005,
     temperature_c=(-20.0, 45.0),
 )
-"""What ``ladder_capture`` is made of."""
+"""Parts of ``ladder_capture``."""
 
 
 def ladder_capture(current_a, temperature_c, *, soc=0.98, noise_v=0.5e-3, seed=0, told_c=None):
-    """As ``capture``, of ``TRUTH`` with ``LADDER`` for its elements, at one temperature."""
+    """Return a capture of ``TRUTH`` with ``LADDER`` as its elements, at one temperature."""
     time_s = np.arange(current_a.size, dtype=float)
     drawn_as = np.r_[0.0, np.cumsum(current_a[:-1])]
     counted = soc - drawn_as / (3600.0 * TRUTH.cell.capacity_ah)

@@ -1,4 +1,5 @@
-"""Capacity from anchors, on cells that no model contains, with cell files that err as much as they say."""
+"""Capacity from anchors, on cells that differ from the model, with cell files that are as wrong as their stated
+error."""
 
 import numpy as np
 import pytest
@@ -12,13 +13,13 @@ from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, Case, Truth, cell_f
 from tests.estimator.anywhere.truth import simulate
 
 WRONG_CAPACITY = 1.2
-"""Of the cell file over the true one: it must not count."""
+"""Capacity of the cell file relative to the true one, which must not matter."""
 SENSOR_A = 0.004
 """Offset of a good current sensor, std."""
 
 
 def samples(current_a: np.ndarray, truth: Truth = OXIDE, soc: float = 0.95, offset_a: float = 0.0) -> SampleBlock:
-    """What a sensor sees each 10 s."""
+    """Return samples at intervals of 10 s."""
     rows = np.zeros(current_a.size, dtype=SAMPLE)
     rows["time_s"], rows["temperature_c"] = 10.0 * np.arange(current_a.size), 25.0
     curves = truth.ocv_v, truth.per_kelvin_v, truth.hysteresis_v, truth.ohm
@@ -78,7 +79,7 @@ def test_two_captures_tell_more_than_one() -> None:
 
 
 def test_a_gap_parts_a_capture() -> None:
-    """What was drawn in it is not known: 0.4 Ah here, and the capacity is right all the same."""
+    """The charge in the gap is unknown: 0.4 Ah here, and the capacity is still right."""
     rows = samples(loads(0.8))
     middle = int(np.flatnonzero(np.abs(rows["current_a"]) > 0.0)[rows.size // 5])
     cut = np.concatenate([rows[:middle], rows[middle + 40 :]])

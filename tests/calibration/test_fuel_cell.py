@@ -1,4 +1,4 @@
-"""Identification of a fuel cell: what the data tell comes out within its error, what they do not tell is refused."""
+"""Identification of a fuel cell: determined parameters are within their errors, others are rejected."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def of_the_model(truth: FuelCellModel, *, seed: int, highest_a: float = 8.0) -> 
 
 
 def test_parameters_come_out_within_their_errors() -> None:
-    """Seven parameters of five stacks: the errors are those that are said, on the whole and each."""
+    """Seven parameters of five stacks: the stated errors hold on average and for each."""
     truth = PEM.identified(PEM.a * TRUTH, {})
     scores = []
     for seed in range(5):
@@ -65,7 +65,7 @@ def test_steps_far_from_the_limit_do_not_tell_of_concentration() -> None:
 
 
 def test_one_current_tells_of_nothing_but_the_voltage() -> None:
-    """One number is found, the loss as a whole: nobody can say of which kind it is."""
+    """One number is found, the total loss, which cannot be divided."""
     record = of_the_model(PEM, seed=3)[1]
     constant = np.full(record.current_a.size, 3.0)
     voltage_v = np.random.default_rng(0).normal(9.4, 0.003, constant.size)
@@ -117,7 +117,8 @@ def test_a_real_polarisation_curve_gives_the_resistance_that_impedance_has() -> 
 
 
 def test_a_flooding_cell_on_air_is_not_this_model_s() -> None:
-    """Its resistance cannot be told from a curve that leaves 23 mV: it is said, and the file's is kept."""
+    """Its resistance cannot be determined from a curve with a residual of 23 mV: the reason is given, and the
+    file's value kept."""
     columns = read_polarisation(DATA / "nafion112_air.csv")
     assert columns is not None
     current_a, voltage_v, temperature_c = columns[columns[:, 0] > 0.1].T.copy()

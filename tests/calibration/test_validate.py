@@ -11,7 +11,7 @@ from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps
 
 END_OF_CHARGE_S = 10_085.5
-"""Of the first one in ``leaf/cc_1c``, and of the rest behind it [s]."""
+"""Duration of the first rest in ``leaf/cc_1c``, and of the rest after it [s]."""
 
 
 def with_series_resistance(extra_ohm):
@@ -37,7 +37,7 @@ def test_a_resistance_beside_the_cell_is_seen():
 
 
 def test_temperature_and_hysteresis_are_taken_out_once():
-    """A discharge at -15 C, of a cell whose file knows what both do to its OCV."""
+    """A discharge at -15 C, with a file that contains both effects on its OCV."""
     samples = ladder_capture(steps(), -15.0)
     samples["voltage_v"] -= 40.0 * 2e-4 + 0.01 * arrhenius(HYSTERESIS_J, -15.0)
     grid_v = ocv_grid(TRUTH)[0]

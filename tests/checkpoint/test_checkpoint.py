@@ -1,4 +1,4 @@
-"""What outlives a restart: taken up when it is of the same pack, whatever else was edited or has come with a version."""
+"""Checkpoints: restored for the same pack, after any change of settings or version."""
 
 import asyncio
 import itertools
@@ -51,11 +51,11 @@ def a_used_pack() -> Estimator:
 
 @dataclass
 class Ended:
-    """What came of a run."""
+    """Result of a run."""
 
     estimator: Estimator
     health: Health
-    """The first that was published: it says what became of the checkpoint."""
+    """The first publication, with the result of reading the checkpoint."""
 
 
 async def ran(
@@ -192,7 +192,7 @@ def test_a_version_with_other_fields_reads_what_it_knows() -> None:
 
 
 def test_a_version_whose_filter_has_more_states_keeps_those_it_knows() -> None:
-    """Those of the curve came last: capacity and offset are known as well as before, of the curve nothing is."""
+    """The curve states were added last: capacity and offset are as certain as before, the curve is unknown."""
     learned = a_used_pack()
     cut = {"filter.mean": 1, "filter.covariance": 2, "checks.good_mean": 1, "checks.good_covariance": 2}
     saved = dict(fields(learned.record.copy()))
@@ -358,7 +358,7 @@ async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_
 
 
 async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first sample is saved, and the state whenever the SOC has gone by so much."""
+    """The first sample is saved, and the state after this change of the SOC."""
     monkeypatch.setattr(checkpoint_writer, "LOOK_S", 0.01)
     saved: asyncio.Queue[float] = asyncio.Queue()
     loop = asyncio.get_running_loop()

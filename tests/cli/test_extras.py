@@ -1,4 +1,4 @@
-"""Sources whose libraries are extras: what is missing is named, with the extra that brings it."""
+"""Sources with optional libraries: a missing one is named, with its extra."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a command writes with ``--out`` never replaces a file unasked, and what it reads it reads once."""
+"""``--out`` never replaces a file without --force, and inputs are read once."""
 
 import shutil
 from pathlib import Path

@@ -43,7 +43,7 @@ async def next_message(client: aiomqtt.Client) -> tuple[str, bytes, bool]:
 
 
 async def all_retained(port: int, subscription: str) -> list[str]:
-    """Topics that come to a new client, until one it publishes itself afterwards."""
+    """Return the retained topics of a new client, until one that it publishes itself."""
     seen = []
     last = subscription.replace("#", "last").replace("+", "last")
     async with aiomqtt.Client("127.0.0.1", port) as client:

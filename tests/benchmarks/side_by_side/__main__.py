@@ -1,4 +1,4 @@
-"""Methods side by side on real captures: what each learns from one profile, tried on others that it never saw.
+"""Methods side by side on real captures: each learns from one profile and is judged on others.
 
 ``make compare``, or some of the trials: ``make compare ARGS="NCR PF"``; with ``--json`` the figures one by one. What is
 measured and how is in docs/theory/comparison.md.

@@ -27,9 +27,9 @@ from tests.estimator.anywhere.score import score
 Starts = Iterable[tuple[float, CellModel]]
 
 WRONG_SOC, LEARNED_AT = 0.2, 0.1
-"""Too low by so much: the SOC that a capture is entered with, that a method is told while it learns."""
+"""Error of the initial SOC of a capture, and of the SOC given while learning."""
 GROWN_BY = 0.5
-"""R_s jumps by so much of itself."""
+"""Relative step of R_s."""
 MIN_PULSES = 9
 ROUNDS = 9
 TIMED_ROWS = 20_000
@@ -53,7 +53,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Reference:
-    """What the captures of a trial show by themselves."""
+    """References from the captures of a trial."""
 
     trial: str
     rests: Relaxations
@@ -76,14 +76,14 @@ class Bench:
         self.tried_on = tried_on
 
     def figures(self, method: Method, starts: Starts) -> Iterator[Figure]:
-        """Of one method, from each start."""
+        """Return the figures of one method, from each start."""
         for factor, cell in starts:
             for seed, learn in enumerate((method.learn, *method.other_seeds), start=1):
                 for figure in self._of_one(method, learn, factor, cell):
                     yield replace(figure, seed=seed)
 
     def _of_one(self, method: Method, learn: Learn, factor: float, cell: CellModel) -> Iterator[Figure]:
-        """Of one method from one start with one seed."""
+        """Return the figures of one method from one start with one seed."""
         name = self.trial.name
         begin = time.thread_time()
         learned = learn(cell, self.learn.samples, float(self.learn.soc[0]))
@@ -105,7 +105,7 @@ class Bench:
             yield Figure(VOLTAGE_WRONG, name, method.name, factor, np.nan if rms_mv is None else rms_mv)
 
     def _elements(self, learned: Learned) -> Iterator[tuple[str, float]]:
-        """By which factor the elements are off the references, as the median over these."""
+        """Return the median error factors of the elements relative to the references."""
         rests, pulses = self.reference.rests, self.reference.pulses
         r_s = learned.elements(pulses.soc)[0]
         _, tau_ts, tau_tl = learned.elements(rests.soc)
@@ -150,7 +150,7 @@ def of_trial(trial: Trial, folder: Path) -> tuple[Reference, list[Figure]]:
 
 
 def off_by(values: Floats, reference: Floats) -> float:
-    """The factor by which half of the values are off by less; 1 is exact, infinite is none of them."""
+    """Return the median error factor; 1 is exact, infinite without values."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ln = np.abs(np.log(values / reference))
     return float(np.exp(np.median(np.where(np.isfinite(ln), ln, np.inf))))

@@ -1,4 +1,4 @@
-"""The methods, each behind the same few questions: learn from a capture, then say what was learned.
+"""The methods, each behind the same interface: learn from a capture, then return the results.
 
 ``learn`` takes blocks of samples in turn, each told its SOC at the first sample. What comes back says a voltage open loop,
 the elements at an SOC, the SOC of a capture entered at a wrong one, and R_s over time; None is what a method does not do.
@@ -32,16 +32,16 @@ LOWEST_SOC = 0.1
 MAX_MV = 1e4
 """A model that is off by more has run away."""
 WHOLE = 0.9
-"""A prediction that ends before this part of the capture, since a learned capacitance is negative there, is none."""
+"""Minimum fraction of the capture that a prediction must cover before a learned capacitance becomes negative."""
 TRACED_S = 30.0
-"""How often R_s is read from the observer's parameters."""
+"""Interval at which R_s is read from the observer's parameters."""
 RLS_EVERY_S, RLS_FORGETTING = 1.0, 0.9995
 SEEDS = range(1, 6)
 """PyBOP's optimizer draws random numbers: one fit for each seed."""
 
 
 class Learned(Protocol):
-    """What a method has learned."""
+    """Result of a method."""
 
     def voltage_rms_mv(self, samples: SampleBlock, initial_soc: float) -> float | None:
         """Open loop along a capture from rest, SOC above ``LOWEST_SOC`` [mV]."""
@@ -53,7 +53,7 @@ class Learned(Protocol):
         """At each sample of a capture entered with ``start_soc``."""
 
     def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
-        """Times [s] and R_s [ohm] while it goes on learning from a capture."""
+        """Return times [s] and R_s [ohm] while learning continues on a capture."""
 
 
 Learn = Callable[[CellModel, SampleBlock, float], Learned | None]
@@ -83,7 +83,7 @@ class Elements:
         self.cell, self.a = cell, a
 
     def voltage_rms_mv(self, samples: SampleBlock, initial_soc: float) -> float | None:
-        """As ``Learned``."""
+        """Return the value as ``Learned`` does."""
         counted = soc_by_counting(samples, self.cell.cell.capacity_ah, initial_soc)
         judged = np.flatnonzero(counted < LOWEST_SOC)
         whole = judged[0] if judged.size else counted.size
@@ -95,7 +95,7 @@ class Elements:
         return rms_mv if error_v.size >= WHOLE * whole and rms_mv < MAX_MV else None
 
     def elements(self, soc: Floats) -> Floats:
-        """As ``Learned``."""
+        """Return the values as ``Learned`` does."""
         return np.array([elements_at(x, self.a) for x in soc]).reshape(-1, 3).T
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
@@ -113,7 +113,7 @@ class FixedEkf(Elements):
     """The textbook filter with these elements at mid SOC."""
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
-        """As ``Learned``."""
+        """Return the SOC as ``Learned`` does."""
         return fixed_ekf(*_columns(samples), start_soc, textbook(self.cell), np.array(ocv_grid(self.cell)))[0]
 
 
@@ -121,7 +121,7 @@ class Counted(Elements):
     """Elements of a method whose SOC is coulomb counting."""
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
-        """As ``Learned``."""
+        """Return the SOC as ``Learned`` does."""
         return np.clip(soc_by_counting(samples, self.cell.cell.capacity_ah, start_soc), 0.0, 1.0)
 
 
@@ -140,11 +140,11 @@ class JointEkf(Elements):
         return joint_ekf(*_columns(samples), start_soc, self.start, np.array(ocv_grid(self.cell)))
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
-        """As ``Learned``."""
+        """Return the SOC as ``Learned`` does."""
         return self._run(samples, start_soc)[0]
 
     def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
-        """As ``Learned``."""
+        """Return R_s as ``Learned`` does."""
         return samples["time_s"].copy(), self._run(samples, initial_soc)[1][:, 0]
 
 
@@ -163,12 +163,12 @@ class Observed(Elements):
         return self._estimator
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
-        """As ``Learned``."""
+        """Return the SOC as ``Learned`` does."""
         trace = self._entered(start_soc).run(samples)
         return np.interp(samples["time_s"], trace["time_s"], trace["soc"])
 
     def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
-        """As ``Learned``; the identifier's own where it is at work and read."""
+        """Return R_s as ``Learned`` does; the identifier's own if it is used."""
         estimator = self._entered(initial_soc)
         if self._filtered:
             trace = estimator.run(samples)
@@ -191,7 +191,7 @@ class Arx:
         self.cell, self.coefficients = cell, history[len(history) // 2 :].mean(axis=0)
 
     def voltage_rms_mv(self, samples: SampleBlock, initial_soc: float) -> float | None:
-        """As ``Learned``."""
+        """Return the value as ``Learned`` does."""
         current_a, over_v, soc = overpotential(self.cell, samples, initial_soc)
         predicted_v = simulate_arx(self.coefficients, current_a)
         below = np.flatnonzero(soc < LOWEST_SOC)
@@ -199,7 +199,7 @@ class Arx:
         return rms_mv if rms_mv < MAX_MV else None
 
     def elements(self, soc: Floats) -> Floats:
-        """As ``Learned``: the same at each SOC."""
+        """Return the values as ``Learned`` does: equal at each SOC."""
         c1, c2, c3 = self.coefficients[:3]
         poles = np.sort(np.roots([1.0, -c1, -c2]))
         real = np.isreal(poles).all() and (np.real(poles) > 0.0).all() and (np.real(poles) < 1.0).all()
@@ -207,7 +207,7 @@ class Arx:
         return np.tile(np.array([c3, *taus])[:, None], soc.size)
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
-        """As ``Learned``; it starts at rest, where none is."""
+        """Return the SOC as ``Learned`` does; it starts at rest without a value."""
         current_a, over_v, soc = overpotential(self.cell, samples, start_soc)
         open_v = open_circuit(self.cell, soc) - over_v + simulate_arx(self.coefficients, current_a)
         grid = ocv_grid(self.cell)
@@ -216,7 +216,7 @@ class Arx:
         return np.interp(samples["time_s"], evenly(samples), smooth)
 
     def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
-        """As ``Learned``, from the first sample anew."""
+        """Return R_s as ``Learned`` does, from the first sample on."""
         current_a, over_v, _ = overpotential(self.cell, samples, initial_soc)
         return evenly(samples), rls_arx(current_a, over_v, RLS_FORGETTING)[:, 2]
 
@@ -248,7 +248,7 @@ def by_observer(estimator: Estimator, cell: CellModel) -> Floats:
 
 
 def by_identifier(estimator: Estimator, cell: CellModel) -> Floats:
-    """a1..a15 of the identifier's fit to its map, of the start where there is none."""
+    """Return a1..a15 of the identifier's fit to its map, or of the start."""
     a = cell.a[:16].copy()
     for i in range(1, 16):
         learned = fitted_parameter(estimator.record[0], i)
@@ -269,7 +269,7 @@ def run_ekf(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:
 
 
 def learn_arx(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
-    """Recursive least squares; its start is 0, whatever the cell file says."""
+    """Run recursive least squares; its start is 0, for any cell file."""
     current_a, over_v, _ = overpotential(cell, samples, initial_soc)
     return Arx(cell, rls_arx(current_a, over_v, RLS_FORGETTING))
 
@@ -319,7 +319,7 @@ def constant_a(r_s: float, r1: float, c1: float, r2: float, c2: float) -> Floats
 
 PRINTED, LEARNING, ON = ObserverSettings(), ObserverSettings(law="learning"), IdentifierSettings()
 FILE = Method("the file, EKF", learn_nothing, run_ekf)
-"""What the start was before it was made wrong, for comparison."""
+"""The correct start values, for comparison."""
 OFFLINE = tuple(map(offline_fit, SEEDS))
 METHODS = (
     observer("UAS printed", PRINTED, None, by_observer),

@@ -1,4 +1,4 @@
-"""What the captures show by themselves, without any model of ours: R_s in pulses, two time constants in rests.
+"""References from the captures without a model: R_s in pulses, two time constants in rests.
 
 A rest is judged where a load that moved enough charge ended and nothing flowed for ten minutes. Its first twenty minutes
 are fitted by v = v_inf - b_1 e^(-t/tau_1) - b_2 e^(-t/tau_2), each second weighing the same. A real cell relaxes with more
@@ -21,20 +21,20 @@ MIN_MOVED = 0.02
 """Part of the capacity that the load before has moved: a pulse of seconds leaves the slow branch alone."""
 LOWEST_SOC = 0.1
 FIRST = (0.01, 0.3)
-"""Where the fit begins: time constants in windows."""
+"""Start of the fit: time constants in windows."""
 RANGE = (1.0, 3.0)
-"""Time constants are from so many seconds to so many windows."""
+"""Limits of the time constants, in seconds and in windows."""
 APART = 2.5
 """Two time constants that are nearer are one."""
 MIN_SIZE = 3.0
-"""Each exponential is larger than so many RMS of what the fit leaves."""
+"""Minimum size of each exponential, in RMS of the residual."""
 MIN_RESOLUTION_V = 3e-4
 """No fit leaves less [V]."""
 
 
 @dataclass(frozen=True)
 class Relaxations:
-    """Of the rests of a capture that show two time constants, shape (n,) each."""
+    """Rests of a capture that show two time constants, shape (n,) each."""
 
     soc: Floats
     tau_ts_s: Floats
@@ -122,7 +122,7 @@ def with_jump(block: Block, more_ohm: float) -> tuple[Block, float]:
 def settled_after(
     time_s: Floats, ratio: Floats, jump_s: float, within: float = 0.1, hold_s: float = 600.0
 ) -> float | None:
-    """How long after the jump ``ratio`` has come within ``within`` of 1, to stay for ``hold_s`` [s].
+    """Return the time after the step until ``ratio`` stays within ``within`` of 1 for ``hold_s`` [s].
 
     Args:
         time_s: Shape (n,) [s].

@@ -42,7 +42,7 @@ NOTHING = -np.inf
 
 
 def reference_table(references: list[Reference]) -> Table:
-    """What the methods are judged by: median, and what half of the values lie between."""
+    """Return the references: median, and the interquartile range."""
     table = Table(title="references: median (quartiles)", box=box.MARKDOWN)
     for column in ("trial", "pulses", "R_s [mOhm]", "rests", "shorter RC product [s]", "longer [s]"):
         table.add_column(escape(column), justify="left" if column == "trial" else "right")
@@ -76,7 +76,8 @@ def figure_tables(figures: Iterable[Figure]) -> Iterator[Table]:
 
 
 def figure_table(name: str, figures: list[Figure], title: str, digits: int) -> Table:
-    """Rows as they came, a column for each method: the mean of both starts, of jumps both; then the mean over rows.
+    """Return the rows with a column for each method: the mean of both starts, of steps both; then the mean over
+    rows.
 
     That is geometric, of the rows with a number, how many in brackets where they are not all; and the mean rank.
     """
@@ -122,7 +123,7 @@ def seed_table(figures: Iterable[Figure]) -> Table:
 
 
 def mean(values: Floats, factor: bool) -> float:
-    """Of both starts; of factors the geometric one."""
+    """Return the mean of both starts; the geometric one for factors."""
     if not values.size:
         return NOTHING
     return float(np.exp(np.mean(np.log(values)))) if factor else float(values.mean())
@@ -138,7 +139,7 @@ def over_rows(column: Floats, digits: int) -> str:
 
 
 def text(value: float, digits: int, name: str) -> str:
-    """A number; nothing, none and never where it is none."""
+    """Format a number, or the reason why there is none."""
     if value == NOTHING:
         return "-"
     if np.isinf(value) and name == JUMP:

@@ -1,4 +1,4 @@
-"""The trials: a cell, what every method learns from, and what it is tried on afterwards.
+"""The trials: a cell, captures to learn from, and held-back captures.
 
 Every method starts from the same cell: its file as it is at the temperature of the capture, with every resistance
 twice, or half, what the file says. The capacitances stay, so every time constant is as wrong.
@@ -21,9 +21,9 @@ from tests.benchmarks.recipes import LEAF, LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_
 WRONG_BY = (2.0, 0.5)
 """Resistances of the start over those of the cell file."""
 LEFT_V = 0.02
-"""What its elements are said to leave of a voltage [V]."""
+"""Assumed voltage error of the elements [V]."""
 KNOWN_K = 10.0
-"""The start is taken to know so far around its temperature, as a file without a ladder is."""
+"""Temperature range of the start, as of a file without a ladder."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Trial:
-    """What is learned from, and what the learned is tried on; all else is tried on the first of these."""
+    """Captures to learn from and held-back captures; all figures but the voltage use the first of these."""
 
     name: str
     recipe: Recipe
@@ -98,12 +98,12 @@ def block(part: Part, capacity_ah: float) -> Block:
 
 
 def chosen(parts: list[str]) -> list[Trial]:
-    """Trials whose name contains one of ``parts``; all where there are none."""
+    """Return the trials whose name contains one of ``parts``; all without parts."""
     return [trial for trial in TRIALS if not parts or any(part in trial.name for part in parts)]
 
 
 def starts(right: CellModel, temperature_c: float) -> Iterator[tuple[float, CellModel]]:
-    """By how much the resistances are wrong, and the cell that is so."""
+    """Return the factors on the resistances, and the resulting cells."""
     for factor in WRONG_BY:
         yield factor, wrong(right, factor, temperature_c)
 

@@ -1,4 +1,4 @@
-"""What captures do not tell is that of the generic cell most like them."""
+"""Properties that captures do not show are those of the most similar generic cell."""
 
 import numpy as np
 import pytest

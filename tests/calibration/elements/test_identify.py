@@ -20,7 +20,7 @@ from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, l
 
 WARM_C, COLD_C = 25.0, -5.0
 OHM = {"r_s": 28e-3, "r_ts": 24e-3, "r_tl": 24e-3}
-"""Of ``LADDER`` at SOC 0.5 and 25 C."""
+"""Resistances of ``LADDER`` at SOC 0.5 and 25 C."""
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_at_one_temperature_the_parts_are_shared_as_in_the_file_given(identified
 
 
 def growth(ladder):
-    """Of the sum of all resistances, from SOC 0.65 to 0."""
+    """Return the growth of the sum of all resistances, from SOC 0.65 to 0."""
     ohm = (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).sum(axis=0)
     return ohm[0] / np.interp(0.65, ladder.soc, ohm)
 
@@ -182,7 +182,7 @@ def test_a_wrong_ocv_is_corrected(warm):
 
 
 def test_what_may_be_hysteresis_is_no_error_of_the_curve(warm):
-    """The middle of two branches 25 mV to both sides: a drive that lies elsewhere by 8 mV tells nothing of the other branch."""
+    """The mean of two branches 25 mV apart to both sides: a drive 8 mV off says nothing of the other branch."""
     soc = np.linspace(0.0, 1.0, 101)
     true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
     moved_v = {}

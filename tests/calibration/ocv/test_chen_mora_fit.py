@@ -1,4 +1,4 @@
-"""(2.10) through points whose curve is known."""
+"""(2.10) through points of a known curve."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_shipped_cell_is_the_same_curve():
 
 
 def test_standard_errors_are_those_of_the_scatter():
-    """Forty noisy sets: the fits scatter as each says it does."""
+    """Forty noisy sets: the fits scatter by their stated errors."""
     rng, soc = np.random.default_rng(0), np.linspace(0.01, 1.0, 80)
     exact = chen_mora(np.array(TABLE_1), soc)
     fits = [fit_chen_mora(points(soc, exact + 1e-3 * rng.standard_normal(soc.size))) for _ in range(40)]
@@ -49,7 +49,7 @@ def test_standard_errors_are_those_of_the_scatter():
 
 
 def test_points_that_end_on_their_way_down_leave_a_curve_above_0_v():
-    """Nothing below SOC 0.07 says how large the exponential grows: its amplitude is held by the highest point."""
+    """Without points below SOC 0.07 the amplitude of the exponential is limited by the highest point."""
     soc = np.linspace(0.07, 1.0, 19)
     ocv_v = 3.2 + 0.1 * soc
     ocv_v[0] -= 0.15

@@ -1,4 +1,4 @@
-"""Voltage relaxation tests of a simulated cell whose open-circuit voltage is known."""
+"""Voltage relaxation tests of a simulated cell with known open-circuit voltage."""
 
 from dataclasses import replace
 
@@ -97,7 +97,7 @@ def test_a_longer_rest_is_more_certain():
 
 @pytest.mark.parametrize("noise_v", [1e-3, 2e-3, 5e-3])
 def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
-    """Noise that hides the time constant: up to five times what is left to relax at a rest's end."""
+    """Noise that hides the time constant: up to five times the remaining relaxation at a rest's end."""
     score, error_v = [], []
     for seed in range(3):
         found = relaxation_test(relaxation(noise_v=noise_v, seed=seed), CAPACITY_AH, name="mine")
@@ -208,7 +208,7 @@ def test_a_dead_instrument(voltage_v, message):
 
 
 def test_several_captures_in_one_file_are_none():
-    """Pulses at several SOCs, one below the other, each from 0 s: what lies between them nobody knows."""
+    """Pulses at several SOCs in one file, each from 0 s, with unknown charge between them."""
     pulse = relaxation(rounds=2)
     for more in (1, 2):
         together = np.concatenate([pulse] * (1 + more))

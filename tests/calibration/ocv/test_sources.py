@@ -1,4 +1,4 @@
-"""What captures are found to be, and what they say together."""
+"""Recognized kinds of captures, and their joint result."""
 
 import numpy as np
 import pytest
@@ -82,7 +82,7 @@ def test_a_lone_branch_is_brought_to_the_middle_of_what_is_usual(direction, lift
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize("rested", [True, False])
 def test_what_branches_take_of_a_lone_curve_is_taken_out(direction, rested):
-    """With the ohmic drop where no jump to or from a rest has told it."""
+    """With the ohmic drop if no step to or from a rest shows it."""
     samples, ladder = slow((direction,)), load_cell("nca", CAPACITY_AH).ladder
     found = of(samples if rested else samples[samples["current_a"] != 0.0], capacity_ah=CAPACITY_AH)
     plain, (source,) = found.points, without_branches(found, ladder).sources

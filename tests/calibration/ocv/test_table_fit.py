@@ -1,4 +1,4 @@
-"""The smooth table through points whose curve, errors and entropy are known."""
+"""The smooth table through points of a known curve, with known errors and entropy."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def source(soc, *, noise_v=0.0, off_v=0.0, std_v=1e-3, common_v=2e-3, temperatur
 
 
 def slope_v(fit, soc):
-    """As the estimator's kernels take it."""
+    """Return the slope as the estimator's kernels do."""
     return PchipInterpolator(fit.soc, fit.ocv_v).derivative()(soc)
 
 

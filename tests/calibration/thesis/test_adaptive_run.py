@@ -16,7 +16,7 @@ CELL = load_cell("chen_mora")
 SMALL = [1, 3, 6, 13, 15]
 LARGE = [i for i in range(1, 16) if i not in SMALL]
 DISTURBED_V, DISTURBED = 0.3, 500
-"""The voltage is off by so much for so many samples: e, and with it the drive of (3.16), is far from zero."""
+"""Voltage error and number of samples: e, and with it the drive of (3.16), is far from zero."""
 
 
 def settings(law, **others):

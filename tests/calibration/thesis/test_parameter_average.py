@@ -22,7 +22,7 @@ def run(samples, **given):
 
 
 def find(error_v=None, voltage_v=None, margin=None, a=None, **given):
-    """``settled`` on a thousand seconds in which nothing happens but what is given."""
+    """Run ``settled`` on a thousand seconds with the given events only."""
     return settled(
         TIME_S,
         np.zeros(TIME_S.size) if error_v is None else error_v,
@@ -52,7 +52,8 @@ def test_a_simulated_discharge_is_averaged_from_where_it_settles_to_where_it_tur
 
 
 def test_override_of_both_ends():
-    """From the first sample on the mean holds the way from a_i(t0): limit + (a_i(t0) - limit) / (rate t), by (4.5)."""
+    """From the first sample on the mean includes the path from a_i(t0): limit + (a_i(t0) - limit) / (rate t), by
+    (4.5)."""
     found = run(discharge(CELL, 0.055, 0.01)[:50_000], t_int_s=0.0, t_unst_s=400.0)
     assert found.window == AveragingWindow(0.0, 400.0, "given", "given")
     for i in (1, 3, 4, 6, 8, 12):

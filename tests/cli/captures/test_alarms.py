@@ -1,4 +1,4 @@
-"""``alarms``: what it says of a capture; ``config check`` of what is set."""
+"""``alarms``: its result for a capture; ``config check`` of limits."""
 
 import json
 from pathlib import Path

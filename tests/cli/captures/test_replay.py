@@ -1,4 +1,4 @@
-"""``replay``: its summary, its table, and what it says of files that cannot be replayed."""
+"""``replay``: its summary, its table, and its errors for unusable files."""
 
 import csv
 import gzip
@@ -225,7 +225,7 @@ def test_a_capture_without_a_usable_sample_is_an_error(tmp_path, capsys):
 
 
 def test_what_is_in_another_unit_is_guessed(capture, tmp_path, capsys):
-    """All of it, or what is above a few milliamperes."""
+    """All columns, or those above a few milliamperes."""
     rows = read_csv(capture).to_pylist()
     head = ",".join(rows[0])
     tables = {
@@ -341,7 +341,7 @@ def test_what_is_wrong_on_stdin_is_named_without_a_path(monkeypatch, capsys):
 
 
 def currents(capsys, out, *arguments):
-    """What the estimator took, with the command line's arguments."""
+    """Return the current in the estimator, with the command line's arguments."""
     code, _, err = run(capsys, "replay", *arguments, "--out", out, "--force")
     assert (code, err) == (0, "")
     return np.unique(columns_of_csv(out)["current_a"]).tolist()

@@ -177,7 +177,7 @@ def test_errata_are_numbered(whole):
 
 @pytest.mark.thorough
 def test_one_start_gives_what_tables_2_and_3_print(whole):
-    """To the printed digits, which are four to seven; small parameters of Table 3 as they began."""
+    """To the printed digits, four to seven; small parameters of Table 3 as they began."""
     for key in ("table-2", "table-3"):
         rows = cells(whole, key)
         assert len(rows) == 15

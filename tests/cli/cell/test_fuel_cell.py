@@ -1,4 +1,4 @@
-"""A fuel cell on the command line: identified, replayed, checked; what makes no sense for it says so in one line."""
+"""A fuel cell on the command line: identified, replayed, checked; unsuitable commands report it in one line."""
 
 import csv
 import json

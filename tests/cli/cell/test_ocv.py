@@ -249,7 +249,7 @@ def test_a_lone_slow_curve_of_a_layered_oxide_is_brought_to_rest(tmp_path, capsy
 
 
 def test_a_curve_that_would_fall_to_nothing_is_none(tmp_path, capsys, shared_data):
-    """Told that 2.9 Ah are 4, the points end far from empty."""
+    """With 2.9 Ah declared as 4, the points end far from empty."""
     capture = shared_data / "panasonic18650pf" / "25_hppc.csv.gz"
     code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "4", "--out", tmp_path / "large.toml")
     assert code == 2

@@ -1,4 +1,4 @@
-"""``board``: what a board says of itself, what is set in it, and what is said where that cannot be."""
+"""``board``: properties, settings, and errors."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""The live view on a real pseudo-terminal: what it shows at which size, and that nobody waits for it."""
+"""The live view on a real pseudo-terminal: its content by size, and that nothing waits for it."""
 
 import re
 import signal

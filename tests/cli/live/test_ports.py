@@ -1,4 +1,4 @@
-"""``ports``: the ports that are there, who holds them, and what answers on them."""
+"""``ports``: existing ports, their holders, and the devices on them."""
 
 import contextlib
 import os
@@ -15,7 +15,7 @@ from tests.patience import LONG_S
 
 @pytest.fixture(autouse=True)
 def wide(monkeypatch):
-    """So that no cell of the table is broken."""
+    """Avoid broken cells of the table."""
     monkeypatch.setenv("COLUMNS", "240")
 
 

@@ -1,4 +1,4 @@
-"""``record`` as a program: what the line brought is in the file, whatever ends the recorder."""
+"""``record`` as a program: received bytes are in the file, however the recorder ends."""
 
 import contextlib
 import json
@@ -20,7 +20,7 @@ from tests.serial_line import Line
 
 LENGTH_AT = 8
 DATA_AT = 12
-"""In a record, after time and length [bytes]."""
+"""Position in a record, after time and length [bytes]."""
 TEXT = b"3.900,1.000,25.0\r\n"
 
 
@@ -57,13 +57,13 @@ def reads(path):
 
 
 def samples(path):
-    """What a decoder that hears the whole reads makes of them."""
+    """Return the samples of a decoder that receives the complete reads."""
     decoder = FrameDecoder()
     return sum(decoder.feed(arrival_s, data).size for arrival_s, data in reads(path))
 
 
 def long_enough(path):
-    """Whether a capture that grows holds a second's samples."""
+    """Return whether a growing capture holds a second's samples."""
     return size(path) > 1_000 and samples(path) >= 100
 
 

@@ -1,4 +1,4 @@
-"""What ``run`` and the command line say when they cannot start: one line for each fault, code 2, no traceback."""
+"""Errors of ``run`` and the command line at start: one line for each, code 2, no traceback."""
 
 import os
 import subprocess

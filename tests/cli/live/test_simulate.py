@@ -42,7 +42,7 @@ def opened(path):
 
 
 def read(descriptor, enough, data=b""):
-    """``data`` and all bytes after it, read by read, until ``enough`` of them says so."""
+    """Return ``data`` and all bytes after it, read by read, until ``enough`` of them returns True."""
     end_s = time.monotonic() + LONG_S
     while not enough(data):
         assert time.monotonic() < end_s, f"{len(data)} bytes are all that came"

@@ -1,4 +1,4 @@
-"""Commands for a pack whose source is no serial line."""
+"""Commands for a pack with a source other than a serial line."""
 
 import tomllib
 from pathlib import Path

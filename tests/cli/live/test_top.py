@@ -1,4 +1,4 @@
-"""``top`` on a real pseudo-terminal beside a real broker: what it shows is what is published."""
+"""``top`` on a real pseudo-terminal with a real broker: it shows the publications."""
 
 import asyncio
 import subprocess

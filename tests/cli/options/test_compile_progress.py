@@ -1,4 +1,4 @@
-"""A first start says what it is at: whatever computes tells which kernel is being compiled."""
+"""A first start shows which kernel is being compiled."""
 
 import os
 import signal

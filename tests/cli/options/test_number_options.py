@@ -1,4 +1,4 @@
-"""What an option takes as a number."""
+"""Numbers accepted by options."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""``config``: what it writes it accepts, what is wrong it names, what it shows can be read."""
+"""``config``: its output is accepted, errors are named, and the shown settings can be read."""
 
 import re
 import tomllib
@@ -37,7 +37,7 @@ NEEDED = {
     "mqtt": "profile = 'opendtu'\n",
     "modbus": "host = 'gx'\nvoltage = { address = 259 }\ncurrent = { address = 261 }\n",
 }
-"""What a section of ``[source]`` has to say, by kind."""
+"""Required settings of ``[source]``, by kind."""
 
 
 def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, capsys):
