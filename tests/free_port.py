@@ -22,7 +22,7 @@ _numbers = itertools.count(101 * os.getpid())  # several runs on one machine: ea
 
 
 def free_port() -> int:
-    """A port of the loopback that nobody listens on; never the same twice in a row."""
+    """Return a free port on loopback; never the same twice in a row."""
     for number in itertools.islice(_numbers, len(_ports)):
         port = _ports[number % len(_ports)]
         with socket.socket() as probe:

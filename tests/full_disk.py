@@ -26,7 +26,7 @@ def full_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def disk_without_files(full_disk: Path) -> Path:
-    """As ``full_disk``, and not even a folder can be made."""
+    """Mount a full disk as ``full_disk``, on which no folder can be created either."""
     inodes = os.statvfs(full_disk).f_files - os.statvfs(full_disk).f_ffree
     subprocess.run(["mount", "-o", f"remount,nr_inodes={inodes}", full_disk], check=True)
     return full_disk

@@ -17,7 +17,7 @@ INFLUXD = shutil.which("influxd", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/
 
 
 class InfluxDB:
-    """The server with one database; can be stopped and started again on its port, with what it holds."""
+    """The server with one database; can be stopped and restarted on its port with its data."""
 
     def __init__(self, folder: Path) -> None:
         self.url = f"http://127.0.0.1:{free_port()}"

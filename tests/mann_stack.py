@@ -1,4 +1,4 @@
-"""A PEM stack that does more than the model knows: what the fuel cell's tests and benchmark take for the truth.
+"""A PEM stack with effects that the model lacks: the truth of the fuel cell's tests and benchmark.
 
 Losses after Mann et al. (2000) with the coefficients of Correa et al. (2004), from which ``pem_30w`` is made, and beyond
 the model: a membrane whose resistance follows current, temperature and a water content that lags by a minute, oxygen that

@@ -1,4 +1,4 @@
-"""A real Mosquitto on a free port of the loopback, and a listener that remembers what it heard."""
+"""A real Mosquitto on a free port on loopback, and a listener that stores its messages."""
 
 import asyncio
 import getpass
@@ -22,7 +22,7 @@ MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/
 
 
 class Broker:
-    """Mosquitto; can be stopped and started again on its port, forgetting what it retained."""
+    """Mosquitto; can be stopped and restarted on its port without its retained messages."""
 
     def __init__(self, folder: Path, extra: str = "allow_anonymous true") -> None:
         self.port = free_port()
@@ -136,7 +136,7 @@ class Listener:
         raise AssertionError(f"{topic} did not bring what was wanted; last on each topic: {seen}")
 
     async def wait_json(self, topic: str, wanted: Callable[[Any], bool] = lambda _: True, skip: int = 0) -> Any:
-        """As ``wait``, decoded; a NaN in the payload is a failure."""
+        """Decode the result of ``wait``; a NaN in the payload is a failure."""
 
         def nan(token: str) -> None:
             raise AssertionError(f"{topic} holds {token}")

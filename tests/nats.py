@@ -1,4 +1,4 @@
-"""A real NATS server on free ports of the loopback, alone or three in a cluster, whose MQTT side is a broker."""
+"""A real NATS server on free ports on loopback, alone or three in a cluster, with its MQTT side as broker."""
 
 import contextlib
 import json
@@ -17,7 +17,7 @@ from tests.patience import LONG_S
 
 NATS = shutil.which("nats-server", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
 STREAM = "$MQTT_msgs"
-"""Where NATS keeps messages of QoS 1 until all have them."""
+"""Stream in which NATS keeps messages of QoS 1 until all have them."""
 
 
 class Node:
@@ -59,7 +59,7 @@ mqtt {{ listen: 127.0.0.1:{self.port} }}
 
     @property
     def is_ready(self) -> bool:
-        """Whether streams can be used."""
+        """Return whether streams can be used."""
         with contextlib.suppress(OSError):
             return self.ask("healthz")["status"] == "ok" and "leader" in self.ask("jsz").get("meta_cluster", {"leader"})
         return False

@@ -21,7 +21,7 @@ def frame(at_s: float) -> bytes:
 
 @pytest.fixture
 def truth() -> TrueSoc:
-    """Of a pack that a simulator has read five minutes ahead."""
+    """True SOC of a pack that a simulator has read five minutes ahead."""
     truth = TrueSoc(SimulatedPack(load_cell("chen_mora"), constant(LOAD_A), soc=START_SOC))
     for step in range(1, round(300.0 / STEP_S)):
         truth(step * STEP_S)

@@ -29,7 +29,7 @@ from bms_estimator.process.boot_clock import synchronised
 print("clock", ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)), synchronised(), flush=True)
 '
 """
-"""What the service's own confinement lets it see of the clock."""
+"""Prints what the service's sandbox shows of the clock."""
 
 PACK = """
 [pack]
@@ -53,7 +53,7 @@ RestartSec=100ms
 # The board is on a pseudo-terminal.
 DeviceAllow=char-pts rw
 """
-"""To both units: a watchdog that does not take long, and what is particular here."""
+"""For both units: a short watchdog, and the settings of this container."""
 
 BROKER = """
 listener 1883 127.0.0.1
@@ -149,7 +149,7 @@ def write_program(path: Path, text: str) -> None:
 
 
 def boot(root: Path, systemd_nspawn: str, timeout_s: float) -> str:
-    """Boot until the judge switches off. Returns its report.
+    """Boot until the judge powers off. Returns its report.
 
     Raises:
         TimeoutError: It did not end in time; the message holds what the console said.

@@ -1,4 +1,4 @@
-"""Where the files to deploy are, and how to find the programs that judge them."""
+"""Files to deploy, and the programs that check them."""
 
 import os
 import shutil

@@ -16,7 +16,7 @@ LEFT_OUT = "step.run-"
 
 
 def fill(cache: Path, package: Path = PACKAGE) -> None:
-    """Fill a cache for a package that will lie where ``package`` says."""
+    """Fill a cache for a package at ``package``."""
     load_kernels()
     compiled = Path(numba.config.CACHE_DIR)
     named = _CacheLocator.get_suitable_cache_subpath  # by the folder of a source

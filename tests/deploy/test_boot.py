@@ -15,7 +15,7 @@ pytestmark = pytest.mark.thorough
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory) -> dict[str, str]:
-    """What the judge inside the container saw, by the names of its parts."""
+    """Return the judge's report from inside the container, by the names of its parts."""
     systemd_nspawn = "/usr/bin/systemd-nspawn"
     if not os.access(systemd_nspawn, os.X_OK):
         pytest.skip("systemd-nspawn is not installed (apt install systemd-container)")
@@ -83,7 +83,7 @@ def test_the_watchdog_starts_a_service_that_hangs_and_a_kernel_that_was_cut_is_c
 
 
 def test_it_knows_whether_the_clock_is_set(report):
-    """Of systemd-timesyncd before and after, since the kernel may not be asked; with clock.conf it may."""
+    """The state of systemd-timesyncd before and after, since the kernel may not be queried; with clock.conf it may."""
     asked = re.findall(r"^clock (-?\d) (\w+)$", report["journal"], re.MULTILINE)
     assert asked[:2] == [("-1", "False"), ("-1", "True")], report
     assert re.fullmatch("[0-5]", asked[2][0]), report

@@ -1,4 +1,4 @@
-"""The dashboard asks for what is written: its queries, run on a real InfluxDB that holds a state and an alarm."""
+"""Queries of the dashboard on a real InfluxDB with a state and an alarm."""
 
 import itertools
 import json
@@ -21,7 +21,7 @@ TAGS = {"device", "name", "severity"}
 
 
 def fields(query: str) -> set[str]:
-    """What is asked for between SELECT and FROM."""
+    """Return the fields between SELECT and FROM."""
     asked = re.search(r"SELECT (.*) FROM", query)
     assert asked
     return set(re.findall(r'(?<!AS )"(\w+)"', asked[1]))

@@ -26,7 +26,7 @@ LAST = {
     "bms/pack/request/+": ("homeassistant", "bms/pack/request/last"),
     "homeassistant/status": ("homeassistant", "homeassistant/status"),
 }
-"""For each subscription who may publish to it what: once that has come, all before it has come or was denied."""
+"""Last message of each subscription: once it has arrived, all before it have arrived or were denied."""
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def client(port: int, user: str) -> aiomqtt.Client:
 
 
 async def arrived(port: int, sender: str, topics: list[str], *, reader: str, subscription: str) -> list[str]:
-    """Which of the messages that ``sender`` publishes come to ``reader``."""
+    """Return the messages of ``sender`` that reach ``reader``."""
     allowed, last = LAST[subscription]
     async with client(port, reader) as listening, client(port, sender) as sending, client(port, allowed) as ending:
         await listening.subscribe(subscription, qos=1)

@@ -32,7 +32,7 @@ def test_all_wires_lead_to_nodes_and_all_fields_are_published() -> None:
 
 
 class NodeRed:
-    """The program with the flow, whose debug nodes write to standard output."""
+    """Node-RED with the flow, whose debug nodes write to standard output."""
 
     def __init__(self, folder: Path, broker: Broker) -> None:
         self._folder, self.output = folder, ""

@@ -1,4 +1,4 @@
-"""A service with a password and a key of its own: neither is found in anything that it tells or leaves behind."""
+"""A service with a password and a key: neither appears in its output or its files."""
 
 import asyncio
 import ssl
@@ -86,7 +86,7 @@ async def test_a_password_and_a_key_are_told_nobody(tmp_path: Path, line: Line, 
 
 
 def files_of(folder: Path) -> list[Path]:
-    """What the service has written."""
+    """Return the files that the service has written."""
     return [*folder.glob("capture*"), *(folder / "state").iterdir()]
 
 

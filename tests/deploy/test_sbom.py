@@ -1,4 +1,4 @@
-"""The wheel, built for real, names what it needs: versions and digests of requirements.lock."""
+"""The wheel, really built, lists its dependencies: versions and digests of requirements.lock."""
 
 import importlib.metadata
 import json
@@ -25,7 +25,7 @@ def bom(tmp_path_factory):
 
 
 def needed(name: str, found: set[str]) -> set[str]:
-    """What is installed here for a package, without its extras."""
+    """Return the installed dependencies of a package, without its extras."""
     for line in importlib.metadata.requires(name) or ():
         other = re.split(r"[^\w.-]", line)[0].lower().replace("_", "-")
         if ";" not in line and other not in found:

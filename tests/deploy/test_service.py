@@ -1,4 +1,4 @@
-"""The service as systemd starts it: what it tells the notify socket, and its cache of kernels."""
+"""The service as systemd starts it: its notify messages, and its cache of kernels."""
 
 import contextlib
 import os
@@ -46,13 +46,13 @@ class Systemd:
         return self._socket.recv(4096).decode()
 
     def until(self, notice: str) -> None:
-        """Wait until a notice comes; others may come before."""
+        """Wait for a notice, skipping others."""
         deadline = time.monotonic() + LONG_S
         while notice not in self.next_notice().split("\n"):
             assert time.monotonic() < deadline, f"{notice} did not come"
 
     def stop(self) -> tuple[int, str]:
-        """End as systemd ends a service. Returns its exit code and what it logged."""
+        """End the service as systemd does. Returns its exit code and what it logged."""
         self.process.send_signal(signal.SIGTERM)
         _, logged = self.process.communicate(timeout=LONG_S)
         return self.process.returncode, logged

@@ -1,4 +1,4 @@
-"""Telegraf's configuration, by Telegraf's documented rules: what it makes of our payloads is what our own sink writes.
+"""Telegraf's configuration, by Telegraf's documented rules: it makes of the payloads what the InfluxDB sink writes.
 
 No registry here has Telegraf. The rules are those of its pages on ``mqtt_consumer``, on topic parsing and on the JSON
 format: numbers become floats, nested names are joined by ``_``, null is left out, texts and truth values too unless named.
@@ -73,7 +73,7 @@ def written(line: str) -> tuple[str, dict[str, str], dict[str, Any]]:
 
 @pytest.fixture
 def full() -> Snapshot:
-    """With cells and an alarm."""
+    """Return a state with cells, and an alarm."""
     assert ONE.estimate
     return ONE._replace(estimate=ONE.estimate.model_copy(update={"cells_v": [3.25, None, 3.5]}), alarms=(SOC_LOW,))
 

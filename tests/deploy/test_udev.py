@@ -11,7 +11,7 @@ READ = 'mount -t tmpfs none /run/udev && mkdir /run/udev/rules.d && cp "$1" /run
 
 
 def read_rules(program, rules: Path) -> list[str]:
-    """What udev says of the rules."""
+    """Return udev's messages about the rules."""
     udevadm, unshare = program("udevadm", "udev"), program("unshare", "util-linux")
     if os.geteuid() != 0:
         pytest.skip("only root can give udev a folder of rules for a test")

@@ -26,7 +26,7 @@ def unit(request, deploy, tmp_path) -> Path:
 
 
 def verify(systemd_analyze: str, unit: Path) -> str:
-    """What systemd finds wrong. Its exit code is 0 for unknown keys, so only its words count."""
+    """Return systemd's messages about the units. Its exit code is 0 for unknown keys, so only its words count."""
     return subprocess.run([systemd_analyze, "verify", unit], capture_output=True, text=True, check=False).stderr
 
 

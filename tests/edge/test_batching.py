@@ -1,4 +1,4 @@
-"""Samples gathered into blocks: none lost, none twice, however they come."""
+"""Samples divided into blocks: none lost or repeated."""
 
 import numpy as np
 from hypothesis import given

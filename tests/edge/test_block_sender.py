@@ -1,4 +1,4 @@
-"""An edge and the real server: whatever breaks, the samples that come in the order of their blocks are those taken."""
+"""An edge and the real server: after any fault the samples in the order of their blocks are those taken."""
 
 import asyncio
 import contextlib
@@ -36,7 +36,7 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
 
 @pytest.fixture
 async def receiver(engine: Engine, request: pytest.FixtureRequest) -> AsyncIterator[Receiver]:
-    """Of a pack of its own for each test."""
+    """Return the receiver of a pack for each test."""
     async with Receiver(engine.url, request.node.name.replace("[", "_").rstrip("]")[:64]) as receiver:
         yield receiver
 
@@ -80,7 +80,7 @@ class Feed:
 
 
 def same(some: SampleBlock, others: SampleBlock) -> bool:
-    """To the last bit; what lies between the columns is no part of a sample."""
+    """Return whether both are equal to the last bit; padding between the columns does not count."""
     return all(some[name].tobytes() == others[name].tobytes() for name in SAMPLE.names or ())
 
 
@@ -176,7 +176,7 @@ async def test_an_edge_that_begins_anew_sends_what_is_not_safe_and_goes_on(
 
 
 async def test_what_the_stream_has_lost_is_sent_again(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
-    """As when a leader is killed that has acknowledged what nobody else has."""
+    """As when a leader is killed after acknowledging messages that no other node has."""
     receiver.lose = {5, 6, 14, 30}
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
@@ -226,7 +226,7 @@ async def test_garbage_from_who_is_no_worker_changes_nothing(
 
 
 async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
-    """What hears there says which blocks are safe, and from where to send again."""
+    """A receiver there confirms blocks and requests resends."""
     edge = BlockSender(EdgeSettings(url=broker.url), "pack", tmp_path, handover_s=LONG_S)
     async with Listener(broker, "raw/#") as heard, edge:
         samples = np.zeros(600, dtype=SAMPLE)

@@ -1,4 +1,4 @@
-"""Blocks on an edge's disk: their numbers, their bounds, and what is left after a kill, a damage, a full disk."""
+"""Blocks on an edge's disk: numbers, limits, and what remains after a kill, damage or a full disk."""
 
 import asyncio
 import contextlib
@@ -28,7 +28,7 @@ FAR = 1 << 30
 
 
 def gathered(at_s: float, count: int = 5) -> ReadyBlock:
-    """Samples of which each can be told from all others."""
+    """Return samples that differ from each other."""
     samples = np.zeros(count, dtype=SAMPLE)
     samples["time_s"] = at_s + np.arange(count)
     samples["voltage_v"] = samples["time_s"] - WALL_S
@@ -276,7 +276,7 @@ asyncio.run(main())
 
 
 def killed_in_mid_write(path: Path) -> int:
-    """The number after the last that a process has said to be on disk, which was killed while it wrote on."""
+    """Return the number after the last that a process reported as stored before it was killed while writing."""
     command, folder = [sys.executable, "-c", KILLED, str(path)], {"PYTHONPATH": "."}
     with subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ | folder

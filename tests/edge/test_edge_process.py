@@ -33,7 +33,7 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
 
 
 class Board:
-    """Prints a line at a time; no voltage comes twice."""
+    """Prints a line at a time; no voltage is repeated."""
 
     def __init__(self, line: Line) -> None:
         self._line, self._number = line, itertools.count(1)

@@ -1,4 +1,4 @@
-"""The clock of samples on their way to a fleet: it goes on, whatever the others do."""
+"""The clock of samples for a fleet: it continues whatever other clocks do."""
 
 import math
 
@@ -14,7 +14,7 @@ WALL_S = 1.7e9
 
 
 def run(clock: SampleClock, told_s: np.ndarray, late_s: float | np.ndarray = 0.0, host_s: np.ndarray | None = None):
-    """Samples that come one by one, at ``host_s`` (as told when left out); wall and steady clock agree."""
+    """Place samples one by one at ``host_s`` (default: their own times); wall and steady clock agree."""
     host_s = (told_s if host_s is None else host_s) + late_s
     host_s = np.broadcast_to(host_s, told_s.shape)
     return np.concatenate([clock.place(np.array([t]), WALL_S + h, h) for t, h in zip(told_s, host_s, strict=True)])

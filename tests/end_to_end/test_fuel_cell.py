@@ -24,7 +24,7 @@ LSB_V = 25.0 / 1024.0
 
 
 def stack() -> list[Reading]:
-    """A minute at 100 Hz; the board asks for no more."""
+    """Return a minute at 100 Hz, the board's rate."""
     time_s, current_a = mann_stack.random_steps(60.0, 100.0, seed=2, highest_a=4.0)
     record = mann_stack.measured(time_s, current_a, noise_v=0.0)
     columns = (record.current_a, record.voltage_v, record.temperature_c)

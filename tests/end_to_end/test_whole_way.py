@@ -31,7 +31,7 @@ START_SOC = 0.9
 LOAD_A = 0.3
 RUN_S = 14.0
 EDGE_S = 0.3
-"""How well the clocks of board and cell agree, and a publish window."""
+"""Tolerance of the clocks of board and cell, plus a publish window."""
 
 
 class Truth:
@@ -66,7 +66,7 @@ def truth() -> Truth:
 
 
 class Plug:
-    """The name under which the program knows the board; a board can be unplugged and another plugged in."""
+    """Path of the board for the program; a board can be unplugged and another plugged in."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -227,7 +227,7 @@ async def test_a_recorded_capture_gives_the_live_run_s_state_to_the_last_bit(
 
 
 def events(board: VirtualBoard) -> list[Callable[[], None]]:
-    """What happens to the line, one after the other."""
+    """Return the events on the line, in order."""
     faults = [lambda f=f: board.inject(f, 3) for f in BoardFault]  # type: ignore[misc]
     return [*faults, lambda: board.reset(ResetCause.BROWN_OUT)]
 

@@ -16,14 +16,14 @@ TRUTH = load_cell("chen_mora").model_copy(update={"adaptation": {}})
 RATED_A = 0.275
 HEIGHTS_C = (-1.0, -0.5, 0.0, 0.0, 0.5, 1.0)
 HOLD_S = (20, 400)
-"""Steps are held between so long [s]."""
+"""Range of the duration of a step [s]."""
 LOW, HIGH = 0.3, 0.85
 FIRST_SOC = 0.6
 RESOLUTION_V = 5e-4
 
 
 def file_off_by(*factors: float) -> CellModel:
-    """The cell's file with R_s, R_ts, tau_ts, R_tl, tau_tl so many times as large."""
+    """Return the cell's file with R_s, R_ts, tau_ts, R_tl, tau_tl multiplied by factors."""
     r_s, r_ts, tau_ts, r_tl, tau_tl = factors
     scale = {"r_s": r_s, "r_ts": r_ts, "r_tl": r_tl, "c_ts": tau_ts / r_ts, "c_tl": tau_tl / r_tl}
     parts = {}
@@ -35,7 +35,7 @@ def file_off_by(*factors: float) -> CellModel:
 
 
 def held_currents(hours: float, rng: np.random.Generator) -> np.ndarray:
-    """One current for each half second [A]; steps come midway between whole seconds."""
+    """Return one current for each half second [A]; steps are midway between whole seconds."""
     n, soc = int(hours * 7200), FIRST_SOC
     current_a, i = np.zeros(n), 1
     while i < n:
@@ -56,7 +56,7 @@ def random_steps(hours: float, noise_v: float = 0.0, seed: int = 1, cell: CellMo
 
 
 def measured(current_a: np.ndarray, noise_v: float, rng: np.random.Generator, cell: CellModel = TRUTH) -> SampleBlock:
-    """What a sensor sees of ``cell`` each second, under a current for each half second [A]."""
+    """Return a sensor's samples of ``cell`` each second, under a current for each half second [A]."""
     time_s = 0.5 * np.arange(len(current_a))
     voltage_v, _ = simulate_cell((FIRST_SOC, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
     block = np.zeros(len(current_a[::2]), dtype=SAMPLE)
@@ -66,12 +66,12 @@ def measured(current_a: np.ndarray, noise_v: float, rng: np.random.Generator, ce
 
 
 def learner(file: CellModel, soc: float = FIRST_SOC, **observer: float) -> Estimator:
-    """The learning law alone, told ``soc``."""
+    """Return the learning law alone, starting at ``soc``."""
     settings = ObserverSettings.model_validate({"law": "learning", **observer})
     return Estimator(file, settings, identifier=None, initial_soc=soc, voltage_resolution_v=RESOLUTION_V)
 
 
 def errors(estimator: Estimator, factors: Sequence[float]) -> np.ndarray:
-    """How far what was learned from a file that is off by ``factors`` is from the truth, relative; shape (5,)."""
+    """Return the relative errors of what was learned from a file with wrong ``factors``; shape (5,)."""
     theta = estimator.record[0]["learning"]["theta"][: len(NAMES)]
     return np.abs(np.exp(theta) * np.asarray(factors) - 1.0)

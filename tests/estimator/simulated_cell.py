@@ -32,7 +32,8 @@ def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleB
 def measured(
     current_a: np.ndarray, soc: float, rng: np.random.Generator, *, step_s: float = 1.0
 ) -> tuple[SampleBlock, np.ndarray]:
-    """What a sensor sees of the true cell, from rest at ``soc``, under a current each ``step_s`` [A], and its true SOC."""
+    """Return a sensor's samples of the true cell, from rest at ``soc``, under a current each ``step_s`` [A], and
+    its true SOC."""
     block = np.zeros(current_a.size, dtype=SAMPLE)
     block["temperature_c"] = 25.0
     block["time_s"] = step_s * np.arange(block.size)

@@ -1,4 +1,4 @@
-"""What is wrong with the counting is learned, and its std is true: the capacity, and the zero of the current sensor.
+"""Counting errors are learned with a true std: the capacity, and the offset of the current sensor.
 
 On cells that no model here contains. Their files have half the error of a common curve, 2 mV and 0.35 % of SOC, as from a slow
 discharge of the cell itself: between two SOCs a capacity is known no better than the curve is at both.
@@ -17,13 +17,14 @@ from tests.estimator.anywhere.use import DAY_S, cycles, days
 SEEDS = range(1, 9)
 OWN_CURVE = {"curve_error": 0.5, "unseen_h": 0.0}
 MAX_ERROR, SOH_ERROR = 0.025, 0.015
-"""Of a capacity: the worst of 16 cells, and RMS."""
+"""Limits of the capacity error: the worst of 16 cells, and RMS."""
 MAX_A, MAX_STD_A = 0.003, 0.006
 """Error and std of an offset after a day, in cells of 3 Ah."""
 
 
 def nees_limit(cells: int) -> float:
-    """Mean of (error / std)^2 over so many cells, which the true std does not exceed in 999 of 1000 draws."""
+    """Return the limit of the mean of (error / std)^2 over this number of cells, which the true std exceeds in 1 of
+    1000 draws."""
     return float(chi2.ppf(0.999, cells)) / cells
 
 
@@ -33,7 +34,7 @@ def ratio(learned: IdentifiedValue, true: float) -> float:
 
 
 def after_cycles(case: Case, told_wrong: float) -> Estimator:
-    """Three cycles between 0.9 and 0.2 with rests of 10 min, told an SOC that is so far off."""
+    """Return the estimator after three cycles between 0.9 and 0.2 with rests of 10 min, with a wrong initial SOC."""
     rng = np.random.default_rng(case.seed)
     seen = capture(case, cycles(rng, case.truth.capacity_ah, count=3, by_soc=0.7, rest_s=600))
     estimator = Estimator(seen.cell, initial_soc=float(np.clip(seen.soc[0] + told_wrong, 0.0, 1.0)))

@@ -1,4 +1,4 @@
-"""One object, two ways in, the same bits out; and what it does with bad samples."""
+"""One object, two interfaces, identical results; and its handling of bad samples."""
 
 import numpy as np
 import pytest

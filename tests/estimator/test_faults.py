@@ -1,4 +1,4 @@
-"""Bad input: the estimate stays finite, says what it suspects, and comes back when the input is good again."""
+"""Bad input: the estimate stays finite, reports diagnostics, and recovers with good input."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +16,7 @@ FAULT_S = 3600.0, 7200.0
 """The hour in which the input is bad, from the first sample."""
 CAPACITY_AH = 3.0
 FIRST_SOC = {"cell1_random_steps": 0.98, "cell5_hppc": 0.98}
-"""Where the first rest is not that of a full cell."""
+"""SOC at which the first rest is not that of a full cell."""
 CHANGING = ["cell5_random_steps", "cell1_dst", "cell1_hppc"]
 PIECE = 20
 """Samples after which the suspicions are looked at."""
@@ -50,7 +50,7 @@ def spikes(block: SampleBlock, during: np.ndarray) -> None:
 
 
 def stuck(block: SampleBlock, during: np.ndarray) -> None:
-    """The voltage: its wire is off, or an old value comes again and again."""
+    """Return a capture with a stuck voltage: a broken wire, or an old value repeated."""
     block["voltage_v"][during] = block["voltage_v"][np.argmax(during)]
 
 
@@ -90,7 +90,7 @@ class Run:
         return (self.time_s > time_s) & (self.soc > 0.05)
 
     def covered(self, after_s: float = 900.0) -> float:
-        """Share of the samples whose error is within two std."""
+        """Return the share of samples whose error is within two std."""
         judged = self.after(after_s)
         return float(np.mean(np.abs(self.error[judged]) < 2.0 * self.std[judged]))
 
@@ -189,7 +189,7 @@ def test_nothing_is_suspected_of_a_leaf(data: Path) -> None:
 
 
 def test_a_gap_of_an_hour(captures: Path) -> None:
-    """What the current did meanwhile is not known, and the std says so."""
+    """The current in the gap is unknown, and the std includes that."""
     block = load_capture(capture(captures, "cell5_random_steps")).rows
     when_s = block["time_s"] - block["time_s"][0]
     before, after = when_s < FAULT_S[0], when_s >= FAULT_S[1]

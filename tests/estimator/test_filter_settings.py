@@ -1,4 +1,4 @@
-"""What the filter makes of a cell file and ``[identifier]``."""
+"""The filter's settings from a cell file and ``[identifier]``."""
 
 import math
 
@@ -41,7 +41,8 @@ def test_the_resistances_of_two_branches_are_kept_over_soc() -> None:
 
 
 def test_resistances_of_two_branches_grow_in_the_cold_as_those_of_cells_do() -> None:
-    """By two fits 2.4 times as large at 0 C as at 25 C in the middle, and more towards empty: 4.6 (NCA) and 2.7 times (LFP) at SOC 0.1."""
+    """In two fits the resistances are 2.4 times as large at 0 C as at 25 C in the middle, and more towards empty:
+    4.6 (NCA) and 2.7 times (LFP) at SOC 0.1."""
     p = Estimator(CELL.model_copy(update={"ladder": None})).settings_record[0]["filter"]
     grown = {}
     for soc in (0.5, 0.1):

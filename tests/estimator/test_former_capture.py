@@ -1,4 +1,4 @@
-"""What was recorded by the first version is read as it was then."""
+"""A capture of the first version is read as it was then."""
 
 import json
 from pathlib import Path

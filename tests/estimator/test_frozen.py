@@ -31,7 +31,7 @@ AFTER = load_a(HOUR, (0.0, 0.2, 0.4))
 
 
 def run(estimator: Estimator, samples: SampleBlock) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """SOC, its std and the bits of what is suspected, at each sample."""
+    """Return SOC, its std and the diagnostic bits, at each sample."""
     out = []
     for n in range(samples.size):
         trace = estimator.run(samples[n : n + 1])

@@ -28,7 +28,7 @@ def block(record: mann_stack.Record) -> SampleBlock:
 
 
 def own_block(truth: np.ndarray, duration_s: float, *, seed: int = 0) -> SampleBlock:
-    """The model itself whose parameters are ``truth`` times the file's."""
+    """Return samples of the model itself with ``truth`` times the file's parameters."""
     return block(mann_stack.model_itself(PEM.a * truth, duration_s, seed=seed))
 
 

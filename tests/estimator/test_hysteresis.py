@@ -87,7 +87,7 @@ def test_regeneration_does_not_turn_it(steps_s: tuple[float, ...]) -> None:
 
 
 def test_it_grows_in_the_cold() -> None:
-    """What the filter predicts after a charge less what it predicts after a discharge."""
+    """Return the filter's prediction after a charge minus that after a discharge."""
     seen_v = {}
     for h in (-1.0, 1.0):
         for celsius in (-15.0, 25.0):

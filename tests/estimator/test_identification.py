@@ -1,4 +1,4 @@
-"""Identifier and observer together: what is learned is handed over, guarded, saved and taken up again."""
+"""Identifier and observer together: learned values are handed over, limited, saved and restored."""
 
 import numpy as np
 import pytest
@@ -172,7 +172,7 @@ def test_after_a_pause_the_soc_is_less_certain_and_found_again(load) -> None:
 
 
 def test_pauses_of_a_pack_do_not_add_up_how_its_cells_differ(load) -> None:
-    """That error is there once, however often the filter begins anew from the SOC that it had."""
+    """The error exists once, however often the filter restarts from its SOC."""
     stds = []
     for series in (1, 6):
         block = load[0][:5000].copy()

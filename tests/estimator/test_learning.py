@@ -1,4 +1,4 @@
-"""The learning law's promises: it learns under a load that tells, stays bounded under any, and survives."""
+"""Promises of the learning law: it learns under an informative load, stays bounded under any, and survives."""
 
 import itertools
 
@@ -60,7 +60,7 @@ def test_a_constant_current_does_not_tell_the_elements_apart() -> None:
 
 
 def test_noise_of_200_mv_leaves_the_voltage_near_the_cells() -> None:
-    """To a fifth of the noise."""
+    """To within a fifth of the noise."""
     noise_v = 0.2
     noisy, clean = random_steps(3.0, noise_v), random_steps(3.0)
     trace = learner(TRUTH).run(noisy)
@@ -102,7 +102,7 @@ def test_k_is_bounded_under_noise_that_goes_on() -> None:
 
 
 def test_a_k_beyond_its_bound_does_not_lead_what_is_learned_astray() -> None:
-    """As a checkpoint may hold it after hours of noise."""
+    """As in a checkpoint after hours of noise."""
     estimator, block = learner(file_off_by(*OFF)), random_steps(10.0, 5e-3)
     estimator.run(block[:1])
     estimator.state["k"] = 113.0
@@ -200,7 +200,7 @@ def test_the_smallest_guard_keeps_capacitances_above_zero(law: str) -> None:
 
 
 def test_a_gap_teaches_nothing_and_the_law_goes_on() -> None:
-    """Two hours at rest that nobody measured."""
+    """Two hours at rest without samples."""
     rng = np.random.default_rng(5)
     parts = held_currents(2.0, rng), np.zeros(2 * 7200), held_currents(3.0, rng)
     block = measured(np.concatenate(parts), NOISE_V, rng)
@@ -275,7 +275,7 @@ def test_what_was_learned_is_published_with_its_source(ten_hours: SampleBlock) -
 
 
 def test_gamma_k_has_its_own_name_and_delta_is_said_to_be_configured(ten_hours: SampleBlock) -> None:
-    """Beside it a printed law, which has N(k) and adapts what delta1 and delta2 come from."""
+    """A printed law beside it has N(k) and adapts the parameters of delta1 and delta2."""
     states = {}
     for law in ("learning", "improved"):
         estimator = Estimator(file_off_by(*OFF), ObserverSettings(law=law), identifier=None, initial_soc=FIRST_SOC)

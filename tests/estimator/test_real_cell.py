@@ -1,4 +1,4 @@
-"""The estimator on a real capture that comes with the tests, from a wrong start."""
+"""The estimator on a real capture of the tests, from a wrong start."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""How warm a cell makes itself, against one that was measured."""
+"""Self-heating of a cell, compared with a measured one."""
 
 import math
 from pathlib import Path
@@ -17,7 +17,7 @@ HALF_C = Path(__file__).parents[1] / "data" / "lgm50" / "rate_0p5c_25c.csv.gz"
 
 
 def rise_k(samples, cell=None):
-    """How much warmer than a room the estimator takes an LG M50 for, of which it knows chemistry and capacity [K]."""
+    """Return the estimator's temperature rise of an LG M50 with only chemistry and capacity known [K]."""
     estimator = Estimator(cell or load_cell("nmc", 5.0), initial_soc=1.0)
     rise_k = np.zeros(samples.size)
     for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):

@@ -1,4 +1,4 @@
-"""R_s by (4.2) while samples come: steps 1 to 3 of the thesis live."""
+"""R_s by (4.2) while samples arrive: steps 1 to 3 of the thesis live."""
 
 import numpy as np
 import pytest

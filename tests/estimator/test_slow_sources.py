@@ -1,4 +1,5 @@
-"""Sources that tell little: a sample each minute, a current in steps, nothing below some amperes, voltage and current apart."""
+"""Sources with little information: a sample each minute, current steps, a dead band of amperes, voltage and current
+apart."""
 
 import numpy as np
 import pytest

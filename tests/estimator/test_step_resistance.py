@@ -1,4 +1,4 @@
-"""R_s is what a step of the current shows between two samples, at any rate, whatever the cell file says."""
+"""R_s follows from a current step between two samples, at any rate, for any cell file."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def pulses() -> tuple[SampleBlock, Floats]:
 
 
 def seen_by_all(samples: SampleBlock) -> Floats:
-    """What each step of the capture shows from one sample to the next [ohm]."""
+    """Return the resistance of each step of the capture from one sample to the next [ohm]."""
     change_a, change_v = np.diff(samples["current_a"]), np.diff(samples["voltage_v"])
     steps = np.abs(change_a) >= MIN_A
     return -change_v[steps] / change_a[steps]

@@ -1,4 +1,4 @@
-"""Kills, restarts and gaps: what moved while nobody measured is inside the band, and what was known stays known."""
+"""Kills, restarts and gaps: unmeasured changes are inside the interval, and known values are kept."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ SEEN_S = 900
 
 
 def killed(block: SampleBlock, every_s: int, age_s: int, down_s: int, initial_soc: float) -> np.ndarray:
-    """The trace of an estimator that goes on, each time, ``down_s`` later from what it was ``age_s`` before."""
+    """Return the trace of an estimator that continues, each time, ``down_s`` later from its state ``age_s`` before."""
     estimator, traces, begin = Estimator(TRUTH, initial_soc=initial_soc), [], 0
     while begin < block.size:
         traces.append(estimator.run(block[begin : begin + every_s - age_s]).copy())
@@ -27,7 +27,7 @@ def killed(block: SampleBlock, every_s: int, age_s: int, down_s: int, initial_so
 
 
 def outside(trace: np.ndarray, true_soc: np.ndarray) -> float:
-    """Share of the samples, after a quarter of an hour, whose true SOC is outside two standard deviations."""
+    """Return the share of samples, after a quarter of an hour, whose true SOC is outside two standard deviations."""
     error = trace["soc"] - true_soc[trace["time_s"].astype(int)]
     return float(np.mean((np.abs(error) > 2.0 * trace["soc_std"])[trace["time_s"] >= SEEN_S]))
 
@@ -62,7 +62,7 @@ def test_restarts_at_rest_change_nothing(every_s: int) -> None:
 @pytest.mark.parametrize("unseen_s", [40, 400, 1500])
 @pytest.mark.parametrize("restart", [False, True], ids=["gap", "restart"])
 def test_a_load_in_a_gap_is_inside_the_band(unseen_s: int, restart: bool) -> None:
-    """At rest before and after, and a load as it was earlier while nobody measured."""
+    """At rest before and after, and the earlier load in the gap."""
     load_a = np.repeat([0.0, 3.0, 0.0, 3.0, 0.0], [1200, 1200, 1200, unseen_s, 600])
     block, true_soc = measured(load_a, 0.9, np.random.default_rng(4))
     estimator = Estimator(TRUTH, initial_soc=0.9)
@@ -93,7 +93,7 @@ def test_what_was_measured_before_a_gap_tells_nothing_of_what_flowed_in_it() -> 
 
 @pytest.mark.parametrize("period_s", [60, 120, 600, 1800])
 def test_slow_sampling_is_no_gap(period_s: int) -> None:
-    """Both ends of a step are measured: what is between them is not the load of long ago."""
+    """Both ends of a step are measured, so the load between them is not the long-term one."""
     block, true_soc = measured(np.repeat([0.0, 0.3], [3600, 7 * 3600]), 0.95, np.random.default_rng(6))
     estimator = Estimator(TRUTH, initial_soc=0.95)
     trace = estimator.run(block[::period_s])

@@ -1,4 +1,4 @@
-"""What a rest that shows no current tells of the current sensor, and what it does not."""
+"""Information of a rest without current on the current sensor, and its limits."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def offset_of(steps, estimator=None):
 
 
 def test_samples_on_both_sides_of_zero_are_no_rest() -> None:
-    """A minute apart, as where the sun comes and goes: in the mean nothing, and no zero was shown."""
+    """A minute apart, as with changing clouds: the mean is zero, but no zero was reported."""
     crossing = [(60, current_a, 60) for current_a in (2.0, -2.0) * 10]
     assert offset_of(crossing)[1] > 0.7 * FIRST_STD_A
 
@@ -119,7 +119,8 @@ def test_a_small_load_that_begins_after_a_long_rest_is_judged_by_itself() -> Non
 
 
 def test_a_standing_load_that_looks_like_an_offset_stays_in_the_band() -> None:
-    """C/600 of an LFP cell on its plateau for a day, shown rightly: it may be the sensor's, and the band says so."""
+    """C/600 of an LFP cell on its plateau for a day, reported correctly: it may be an offset, and the interval
+    includes that."""
     hours, capacity_ah = 24.0, 100.0
     samples = np.zeros(round(3600.0 * hours) // 10, dtype=SAMPLE)
     samples["time_s"] = 10.0 * np.arange(samples.size)

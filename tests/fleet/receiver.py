@@ -1,4 +1,4 @@
-"""Who takes an edge's blocks from the stream as a worker does, and keeps the samples."""
+"""Takes an edge's blocks from the stream as a worker does, and stores the samples."""
 
 import asyncio
 import contextlib
@@ -20,7 +20,7 @@ POLL_S = 0.01
 
 
 class Receiver:
-    """Reads the stream in order; takes blocks in the order of their numbers and asks for those that are missing.
+    """Reads the stream in order; takes blocks in the order of their numbers and requests missing ones.
 
     Args:
         url: Of the server.
@@ -53,7 +53,7 @@ class Receiver:
 
     @property
     def samples(self) -> SampleBlock:
-        """With their times since 1970."""
+        """Return the samples with their times since 1970."""
         parts = []
         for block in self.blocks:
             part = block.samples.copy()
@@ -62,7 +62,7 @@ class Receiver:
         return np.concatenate(parts)
 
     async def until(self, count: int) -> None:
-        """So many samples were taken."""
+        """Wait for a number of samples."""
         async with asyncio.timeout(LONG_S):
             while sum(block.samples.size for block in self.blocks) < count:
                 if self._task.done():

@@ -1,4 +1,4 @@
-"""Workers of a fleet as processes, what edges send them, and what is left of it in the end."""
+"""Workers of a fleet as processes, their blocks, and their final states."""
 
 import asyncio
 import hashlib
@@ -34,11 +34,11 @@ KIND = stored(PackSpec(cell="ncr18650", period_s=PERIOD_S))
 STORE = 1_790_000_000 * 10**9
 """When the edges' stores were made [ns since 1970]."""
 SAMPLES = 60
-"""Of a block, which is ten minutes."""
+"""Duration of a block, ten minutes."""
 
 
 def samples(pack: str, number: int) -> np.ndarray:
-    """Of a pack's block, from its number alone: a load with steps, differently fast in each pack."""
+    """Return the samples of a pack's block, computed from its number: a load with steps at the pack's own rate."""
     time_s = PERIOD_S * (SAMPLES * (number - 1.0) + np.arange(SAMPLES))
     made = np.zeros(SAMPLES, SAMPLE)
     made["time_s"] = time_s
@@ -62,7 +62,7 @@ async def know(nc: Client, packs: list[str]) -> PackRegistry:
 
 
 async def send(nc: Client, pack: str, data: bytes) -> None:
-    """Until the stream has it; it drops what comes again because its answer was late."""
+    """Publish until the stream has it; the stream drops a repetition after a late response."""
     headers = {"Nats-Msg-Id": f"{pack} {hashlib.sha256(data).hexdigest()}"}
     deadline = time.monotonic() + LONG_S
     while time.monotonic() < deadline:
@@ -84,12 +84,12 @@ class Process:
 
     @property
     def lines(self) -> list[dict[str, Any]]:
-        """Of its log, what else comes to stderr left out."""
+        """Return the lines of its log, without other stderr output."""
         lines = self._log.read_text().splitlines(keepends=True)
         return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]
 
     async def logged(self, text: str) -> dict[str, Any]:
-        """The first line that says so."""
+        """Return the first line with this event."""
 
         def found() -> dict[str, Any] | None:
             assert self._process.poll() is None, f"it has ended: {self._log.read_text()}"
@@ -101,7 +101,7 @@ class Process:
         self._process.send_signal(number)
 
     async def end(self) -> int:
-        """Its exit code after SIGTERM."""
+        """Return its exit code after SIGTERM."""
         self.signal(signal.SIGTERM)
         return await asyncio.to_thread(self._process.wait, LONG_S)
 
@@ -111,7 +111,7 @@ class Process:
 
 
 class Heartbeats:
-    """What workers say of themselves, the last of each."""
+    """The last heartbeat of each worker."""
 
     def __init__(self, nc: Client) -> None:
         self._nc, self._last = nc, dict[str, Heartbeat]()
@@ -154,7 +154,7 @@ async def until(found: Callable[[], Any], or_else: Callable[[], object]) -> Any:
 
 
 async def end_states(nc: Client, known: PackRegistry, partitions: int) -> dict[int, Partition]:
-    """What is in the last checkpoints."""
+    """Return the content of the last checkpoints."""
     js = nc.jetstream(timeout=LONG_S)
     checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
     keeping = CheckpointStore(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))

@@ -33,7 +33,7 @@ def packs(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(scope="module")
 def home(packs: Packs, broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[HomeAssistant]:
-    """With all entities of both packs."""
+    """Return Home Assistant with all entities of both packs."""
     home = HomeAssistant(tmp_path_factory.mktemp("home"), DASHBOARD)
     try:
         home.start()

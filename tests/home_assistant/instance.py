@@ -1,4 +1,4 @@
-"""A real Home Assistant on the loopback: its own folder, its own Python, asked over its REST and WebSocket API."""
+"""A real Home Assistant on loopback with its own folder and Python, and its REST and WebSocket API."""
 
 import contextlib
 import json
@@ -20,7 +20,7 @@ VERSION = os.environ.get("HOME_ASSISTANT", "2025.2.5")
 ENVIRONMENT = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bms_estimator-home-assistant" / VERSION
 )
-"""Where `make home-assistant` makes it."""
+"""Folder of `make home-assistant`."""
 MISSING = f"Home Assistant {VERSION} is not there: `make home-assistant` makes it, which takes two minutes"
 
 CONFIGURATION = """
@@ -97,7 +97,7 @@ class HomeAssistant:
         self._token = self._call("/auth/token", form)["access_token"]
 
     def ask(self, path: str, body: Mapping[str, Any] | None = None, *, authorized: bool = True) -> Any:
-        """What its REST API answers; with a ``body`` by POST."""
+        """Return the response of its REST API; with a ``body`` by POST."""
         content = None if body is None else json.dumps(body).encode()
         return self._call(path, content, {"Authorization": f"Bearer {self._token}"} if authorized else {})
 
@@ -116,7 +116,7 @@ class HomeAssistant:
         assert done["type"] == "create_entry", done
 
     def states(self) -> dict[str, Any]:
-        """By entity."""
+        """Return the states by entity."""
         return {state["entity_id"]: state for state in self.ask("/api/states")}
 
     def call(self, service: str, **data: Any) -> None:
@@ -149,7 +149,7 @@ class HomeAssistant:
         return file.read_text() if file.exists() else (self.folder / "console.log").read_text()
 
     def rows(self, entities: str) -> list[tuple[str, str | None]]:
-        """Entity and state of its recorder's rows, of entities whose names are ``LIKE`` that, in their order."""
+        """Return entity and state of its recorder's rows, for entities ``LIKE`` the pattern, in order."""
         query = (
             "SELECT states_meta.entity_id, state FROM states JOIN states_meta USING (metadata_id)"
             " WHERE states_meta.entity_id LIKE ? ORDER BY state_id"

@@ -29,7 +29,7 @@ from tests.sinks.home_assistant.test_discovery import described as shown
 SOC, SET_SOC, LOW = "sensor.bms_pack_soc_percent", "number.bms_pack_set_soc", "binary_sensor.bms_pack_alarm_soc_low"
 NOT_GRANTED = '"event": "request not granted", "pack": "bench"'
 NOT_OURS = ("Skipping pip installation", "zlib_ng and isal are not available")
-"""What this Home Assistant warns of itself."""
+"""Warnings of this Home Assistant about itself."""
 CARDS = {"conditional", "entities", "entity-filter", "gauge", "history-graph", "statistics-graph", "tile"}
 
 
@@ -140,7 +140,7 @@ def test_the_dashboard_has_only_cards_and_entities_that_there_are(home: HomeAssi
 
 
 def play(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], home: HomeAssistant) -> None:
-    """Say what a pack says in ``stream``, as fast as the broker takes it, once Home Assistant has its entities."""
+    """Publish a pack's messages as fast as the broker accepts them, once Home Assistant has its entities."""
     messages, sent, said = MessageBuilder("bms", device), PublishedState(), list[Message]()
     for now_s, each in stream:
         info = each.info.model_copy(update={"device": device})
@@ -159,7 +159,7 @@ def play(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], 
     voltage = f"sensor.bms_{device}_voltage_v"
 
     def shown(states: dict[str, Any]) -> bool:
-        """It reads a topic some time after it was told of it."""
+        """Home Assistant reads a topic some time after its discovery."""
         asyncio.run(say(values[:1]))
         ours = [state["state"] for entity, state in states.items() if entity.startswith(f"sensor.bms_{device}_")]
         return "unavailable" not in ours and voltage in states

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept: a folder named by all that goes into them, or nowhere where there is no room."""
+"""Location of compiled kernels: a folder named by all their sources, or none without space."""
 
 import ast
 import os
@@ -16,7 +16,7 @@ from tests.patience import LONG_S
 
 PACKAGE = Path(bms_estimator.__file__).parent
 ELF, HEADER_BYTES = b"\x7fELF", 64
-"""How the object file of a kernel begins; its machine code comes behind the header."""
+"""First bytes of a kernel's object file; its machine code follows the header."""
 
 
 def imported(source: Path) -> set[Path]:
@@ -46,7 +46,7 @@ def test_every_kernel_takes_njit_from_the_cache() -> None:
 
 
 def crc16_with_cache_in(folder: Path) -> str:
-    """Have another process compile a kernel, and check what it says. Returns what was written on stderr."""
+    """Compile a kernel in another process, and check its result. Returns what was written on stderr."""
     homes = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), str(folder))
     script = "import numpy; from bms_estimator.protocols.firmware.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
     command = [sys.executable, "-c", script]
@@ -78,7 +78,7 @@ def emptied(_: bytes) -> bytes:
 
 
 def zeros_in_its_code(content: bytes) -> bytes:
-    """What a power cut leaves where the file system knew the length already: all else can be read, and would be run."""
+    """Damage by a power failure on a file system that knew the length: the rest can be read, and would run."""
     code = content.index(ELF) + HEADER_BYTES
     return content[:code] + bytes(64) + content[code + 64 :]
 

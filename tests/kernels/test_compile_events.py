@@ -1,4 +1,4 @@
-"""A person hears which kernel is being compiled."""
+"""Progress messages for the kernel that is being compiled."""
 
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.kernels.cell_model import chen_mora

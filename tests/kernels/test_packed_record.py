@@ -1,4 +1,4 @@
-"""What is kept of a record: every bit comes back, and bytes that are none of it are refused."""
+"""Packed records: every bit returns, and invalid bytes are rejected."""
 
 import numpy as np
 import pytest
@@ -69,7 +69,7 @@ def test_a_bit_of_the_bitmap_that_flips_is_refused(words, bit: int) -> None:
 
 @given(hnp.arrays(np.uint64, st.integers(0, SIZE + 9)))
 def test_no_bytes_harm(noise) -> None:
-    """What is taken is the one way to say it."""
+    """Accepted bytes are the only encoding of their record."""
     back = np.zeros(SIZE, np.uint64)
     if unpack(noise, MIRROR, back):
         assert (packed(back) == noise).all()

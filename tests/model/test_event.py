@@ -1,4 +1,4 @@
-"""What happened, from one snapshot to the next."""
+"""Events from one snapshot to the next."""
 
 import itertools
 from typing import Any

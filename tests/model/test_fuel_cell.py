@@ -1,4 +1,4 @@
-"""A fuel cell's file: the shipped one, scaling, what is refused, and that a written one is read again."""
+"""A fuel cell's file: the shipped one, scaling, rejected ones, and writing and reading."""
 
 from pathlib import Path
 

@@ -149,7 +149,7 @@ def test_capacity_that_cannot_be_is_refused(capacity_ah):
 
 
 def test_capacity_replaces_that_of_a_cell_file_and_nothing_else():
-    """An aged cell: what it holds is less, its resistances are those that were measured."""
+    """An aged cell: its capacity is smaller, its resistances are those that were measured."""
     aged, new = load_cell("leaf", 24.0), load_cell("leaf")
     assert aged.cell.capacity_ah == 24.0
     assert aged.model_copy(update={"cell": new.cell}) == new

@@ -1,4 +1,4 @@
-"""Certificates for tests, made by openssl: an authority, and who it vouches for."""
+"""Certificates for tests, by openssl: an authority, and those it signs."""
 
 import subprocess
 from pathlib import Path
@@ -22,7 +22,7 @@ class Authority:
         )
 
     def vouch_for(self, name: str) -> tuple[Path, Path]:
-        """Certificate and key of somebody on this machine."""
+        """Create certificate and key for a name on this machine."""
         certificate, key, request = (self._folder / f"{name}.{kind}" for kind in ("crt", "key", "csr"))
         names = self._folder / "names"
         names.write_text(HERE)

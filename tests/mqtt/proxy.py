@@ -1,12 +1,12 @@
-"""What stands between a client and its broker: a network that fails in silence, or a broker of the older MQTT, or one
-that takes nothing."""
+"""Proxy between a client and its broker: a network that fails silently, an older broker, or one that accepts
+nothing."""
 
 import asyncio
 import contextlib
 from typing import Self
 
 REFUSED = b"\x20\x02\x00\x01"
-"""CONNACK of a broker that does not know the client's version of MQTT."""
+"""CONNACK for an unsupported protocol version."""
 
 
 async def read_packet(reader: asyncio.StreamReader) -> bytes:
@@ -28,7 +28,7 @@ def published(packet: bytes) -> tuple[str, bytes] | None:
 
 
 class Proxy:
-    """Hands on to the broker on ``port``.
+    """Forwards to the broker on ``port``.
 
     Args:
         port: The broker's.
@@ -68,7 +68,7 @@ class Proxy:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def leave(self) -> None:
-        """The network is away: both ends of all connections hear of it, and who comes is turned away."""
+        """Disconnect the network: both ends of all connections are closed, and new ones rejected."""
         self.away = True
         for client, broker in self._clients:
             client.transport.abort()
@@ -76,7 +76,7 @@ class Proxy:
         self._clients = []
 
     def cut(self) -> None:
-        """The clients lose their connections, of which the broker hears nothing."""
+        """Close the clients' connections without informing the broker."""
         self._half_open = True
         for client, _ in self._clients:
             client.transport.abort()
@@ -127,7 +127,7 @@ class Proxy:
     async def _hand_up(
         self, reader: asyncio.StreamReader, to_broker: asyncio.StreamWriter, to_client: asyncio.StreamWriter
     ) -> None:
-        """What the client says, until either end is gone."""
+        """Forward the client's bytes until either end is closed."""
         lost = False
         with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
             while not to_broker.transport.is_closing():

@@ -1,4 +1,4 @@
-"""A broker that asks for our certificate, and what is said of certificates that cannot be used."""
+"""A broker that requires a client certificate, and errors of unusable certificates."""
 
 import shutil
 import ssl
@@ -25,7 +25,7 @@ from tests.sinks.snapshots import ONE
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With ca, server, pack and somebody of another authority."""
+    """Return a folder with ca, server, pack and a certificate of another authority."""
     folder = tmp_path_factory.mktemp("certificates")
     authority = Authority(folder)
     authority.vouch_for("server")

@@ -14,11 +14,11 @@ from tests.nats import Node, leader, running, skip_without_nats
 from tests.sinks.service import STATE, Sink, assert_all_in_order, state, until
 
 COUNT = 400
-"""As many states as the measurement had of which none arrived."""
+"""Number of states of the measurement in which none arrived."""
 
 
 class Collector:
-    """Hears the pack over any of the nodes that lives, and misses nothing: its session lies in the cluster."""
+    """Receives the pack's messages over any live node without a loss: its session is in the cluster."""
 
     def __init__(self, nodes: list[Node]) -> None:
         self._nodes = nodes

@@ -1,4 +1,4 @@
-"""Brokers that go, stand still or fall silent: no state is lost, none comes out of order, and another broker serves."""
+"""Brokers that disappear, freeze or fall silent: no state is lost or out of order, and another broker serves."""
 
 import asyncio
 from collections.abc import AsyncIterator, Iterator
@@ -119,7 +119,7 @@ async def test_a_line_that_falls_silent_while_nothing_is_to_be_said_is_found_out
 
 
 async def test_a_broker_is_told_to_expect_a_sign_of_life_each_10_s() -> None:
-    """One that hears none says our will after one and a half times that."""
+    """A broker that receives none publishes the will after one and a half times that."""
     first = asyncio.get_running_loop().create_future()
 
     async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

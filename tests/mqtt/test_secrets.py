@@ -1,4 +1,4 @@
-"""A password that stands in the wrong place is not shown again."""
+"""A password in the wrong place is not shown."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""A subscriber beside a real broker: what it keeps, and what it says when the broker is gone."""
+"""A subscriber with a real broker: its stored messages, and its report when the broker is gone."""
 
 import asyncio
 import json
@@ -20,7 +20,7 @@ from tests.sinks.snapshots import ONE
 
 
 class Watch:
-    """A subscriber whose callbacks wake who waits."""
+    """A subscriber whose callbacks wake waiting tests."""
 
     def __init__(self, url: str, **options: Any) -> None:
         self.heard: list[DeviceMessage] = []

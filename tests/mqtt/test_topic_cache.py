@@ -1,4 +1,4 @@
-"""What is kept of what anybody may publish."""
+"""Bounded storage of messages from any publisher."""
 
 import json
 import string

@@ -27,7 +27,7 @@ DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 
 @contextlib.asynccontextmanager
 async def chromium() -> AsyncIterator[Browser]:
-    """Chromium in a folder of its own, that knows nobody."""
+    """Start Chromium in an empty folder."""
     if CHROMIUM is None:
         pytest.skip("chromium is not installed (apt-get install chromium)")
     async with async_playwright() as playwright:
@@ -38,26 +38,26 @@ async def chromium() -> AsyncIterator[Browser]:
 
 @dataclass
 class Tab:
-    """A page of ours, and what it complained of and asked for meanwhile."""
+    """A page, with its console errors and requests."""
 
     page: Page
     errors: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)
 
     async def text(self, quantity: str) -> str:
-        """What is shown of a quantity; empty where it is hidden."""
+        """Return the shown text of a quantity; empty if it is hidden."""
         shown = self.page.locator(f'[data-q="{quantity}"]')
         return await shown.inner_text() if await shown.is_visible() else ""
 
     async def until(self, condition: str, argument: Any = None) -> None:
-        """Wait until JavaScript says so."""
+        """Wait until a JavaScript expression is true."""
         await self.page.wait_for_function(condition, arg=argument)
 
     async def until_status(self, text: str) -> None:
         await self.until("text => document.getElementById('status').innerText.includes(text)", text)
 
     async def until_text(self, quantity: str, text: str) -> None:
-        """Until that is what ``text`` says of it."""
+        """Wait until ``text`` returns this."""
         await self.until(
             """([name, text]) => {
                 const shown = document.querySelector(`[data-q="${name}"]`);
@@ -69,7 +69,7 @@ class Tab:
 
 @contextlib.asynccontextmanager
 async def tab(browser: Browser, url: str, *, size: dict[str, int] = DESKTOP, **options: Any) -> AsyncIterator[Tab]:
-    """A page opened, as somebody does who was never there."""
+    """Open a page as a new visitor."""
     context = await browser.new_context(viewport=size, **options)  # type: ignore[arg-type]
     context.set_default_timeout(1e3 * LONG_S)
     page = await context.new_page()

@@ -1,4 +1,4 @@
-"""What the page is shown of: the real service of a pack whose board prints its cells, and programs of ours that serve pages."""
+"""The pack of the page's tests: the real service with a board that prints its cells, and programs that serve pages."""
 
 import asyncio
 import contextlib
@@ -15,12 +15,12 @@ from tests.patience import LONG_S
 from tests.serial_line import Line
 
 Values = dict[str, Any]
-"""What a board prints."""
+"""Lines of a board."""
 CELL, SERIES, PARALLEL = "ncr18650", 14, 10
 PACK = f'cell = "{CELL}"\nseries = {SERIES}\nparallel = {PARALLEL}\ninitial_soc = 0.6'
-"""Of the simulated pack, as its file has it."""
+"""Capacity of the simulated pack, as in its file."""
 UNEVEN_V = [1e-3 * d for d in (2, -1, 3, 0, -4, 1, 5, -2, 1, 2, -17, 1, 4, 5)]
-"""How far the cells of a simulated pack are from their mean [V]."""
+"""Deviations of the cells of a simulated pack from their mean [V]."""
 
 
 def simulated(load_a: float = 24.0, soc: float = 0.66) -> Callable[[float], Values]:
@@ -42,7 +42,7 @@ def simulated(load_a: float = 24.0, soc: float = 0.66) -> Callable[[float], Valu
 
 
 async def starting(folder: Path, *arguments: object, port: int) -> asyncio.subprocess.Process:
-    """A program of ours that serves a page, once it does."""
+    """Start a program that serves a page, and wait for it."""
     log = folder / f"{port}.log"
     with log.open("ab") as file:
         process = await asyncio.create_subprocess_exec(

@@ -28,9 +28,9 @@ from tests.store.test_history import keep
 DOCS = Path(__file__).parents[2] / "docs" / "images"
 LEARN_S = 60.0
 TOP = 500
-"""So much of the page shows what an alarm, or stale values, look like [px]."""
+"""Height of the page that shows an alarm or stale values [px]."""
 SOC, CAPACITY_AH = 0.66, 30.0
-"""Of the pack, at the end of its day, roughly."""
+"""SOC of the pack at the end of its day, approximately."""
 ALARMS = """
 [alarms]
 cell_imbalance = {limit_v = 0.02, delay_s = 1, severity = "critical"}
@@ -63,7 +63,7 @@ def yesterday() -> list[Snapshot]:
 
 
 def _current_a(time_s: float) -> float:
-    """Of a house: 8 h of sun."""
+    """Current of a house: 8 h of sun."""
     hour = time_s % 86_400 / 3600.0
     return 0.9 + 0.3 * math.sin(time_s / 700.0) - 4.0 * max(0.0, 1.0 - ((hour - 12.5) / 4.0) ** 2)
 

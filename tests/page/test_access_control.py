@@ -1,4 +1,4 @@
-"""Who may see the page: settings, names, token."""
+"""Access to the page: settings, names, token."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The page in a real Chromium: what is on it is what was published, and it says when that is not what is now.
+"""The page in a real Chromium: it shows the publications, and reports when they are not current.
 
 A real Mosquitto; the real service of a pack with four cells, whose page is one; the real ``dashboard`` of the broker, whose
 page is the other. A second pack on that broker is this test's own, so that it may publish anything.
@@ -90,7 +90,7 @@ class House(NamedTuple):
     broker: Broker
     service: Service
     dashboard: str
-    """Of the broker."""
+    """User of the broker."""
     live: Listener
 
 
@@ -154,7 +154,7 @@ async def dashboard_of(browser: Browser, house: House, pack: str, **options: Any
 
 
 def of_clock(time: str) -> str:
-    """As a browser on this machine shows it."""
+    """Format a time as a browser on this machine does."""
     return datetime.fromisoformat(time).astimezone().strftime("%H:%M:%S")
 
 
@@ -220,7 +220,7 @@ async def test_the_pack_of_a_service_is_shown_by_both_alike_and_by_nobody_else(b
 
 
 def as_shown(parameter: dict[str, Any]) -> str:
-    """A value to the two digits of its standard deviation, or to four where there is none."""
+    """Format a value to the two digits of its standard deviation, or to four without one."""
     if parameter["std"] is None:
         return f"{parameter['value']:.4g}"
     decimals = 1 - math.floor(math.log10(parameter["std"]))

@@ -1,4 +1,4 @@
-"""A thousand idle connections to each program of ours that serves HTTP, while its broker or server is restarted."""
+"""A thousand idle connections to each program with HTTP, while its broker or server is restarted."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the page's hub keeps: the newest of each topic, for readers of any speed."""
+"""The page's hub: the newest message of each topic, for readers of any speed."""
 
 import json
 import sys

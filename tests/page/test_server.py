@@ -1,4 +1,4 @@
-"""The page's server over real sockets: its files, the stream, the token, what was; and what it does when an address is taken."""
+"""The page's server over real sockets: files, stream, token, history; and an address in use."""
 
 import asyncio
 import contextlib
@@ -24,7 +24,7 @@ from tests.sinks.snapshots import ONE
 from tests.store.test_history import at, keep
 
 MAX_BYTES = 100_000
-"""Of all that a browser is given."""
+"""Total content for a browser."""
 TOKEN = "0123456789abcdef"
 
 
@@ -42,7 +42,7 @@ def past() -> HistoryQuery:
 async def browsing(
     hub: PackTopics, past: HistoryQuery, settings: PageSettings | None = None
 ) -> AsyncIterator[aiohttp.ClientSession]:
-    """Somebody who keeps cookies, at a server's address."""
+    """Return a client with cookies at a server's address."""
     jar = aiohttp.CookieJar(unsafe=True)  # of an address, too
     async with (
         PageServer(settings or PageSettings(listen="127.0.0.1:0"), hub, past, patient=False) as server,

@@ -1,4 +1,4 @@
-"""One service for each pack, whatever becomes of its folder, and whoever else is on the machine."""
+"""One service for each pack, for any state of its folder and any other users."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""The log: what is asked for, and nothing that waits for who reads it."""
+"""The log: the requested lines, without waiting for a reader."""
 
 import threading
 from collections.abc import Iterator

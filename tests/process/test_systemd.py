@@ -1,4 +1,4 @@
-"""What systemd hears of a process that serves several packs."""
+"""Notify messages of a process with several packs."""
 
 import os
 import socket

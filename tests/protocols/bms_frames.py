@@ -1,10 +1,10 @@
-"""Frames that real BMS have sent, as others have published them, with what is in them by the same source."""
+"""Frames of real BMS, as published by others, with the values by the same source."""
 
 from typing import NamedTuple
 
 
 class Published(NamedTuple):
-    """An answer, or those of one round, and what they say. Current positive on discharge here."""
+    """A response, or those of one poll cycle, and their values. Current positive on discharge here."""
 
     protocol: str
     frames: bytes
@@ -77,7 +77,7 @@ JK_NEWER_FRAME = bytes.fromhex(
 )
 """syssi/esphome-jk-bms, tests/components/jk_bms_ble/frames_jk02_32s_v11.h, of a JK_PB2A16S15P; the same frame as on RS485."""
 JK_RECORD_OF_PACK_2 = bytes.fromhex("0210162000010478")
-"""What follows it there: eggcho/jk-bms-passive-bridge, README."""
+"""The frame after it: eggcho/jk-bms-passive-bridge, README."""
 
 JK_NEWER = Published(
     "jk", JK_NEWER_FRAME + JK_RECORD_OF_PACK_2, 51.689, 0.0, 17.7,

@@ -1,4 +1,4 @@
-"""Captures of each kind that a user may have, short, the same on every machine.
+"""Short captures of each kind that a user may have, identical on every machine.
 
 The estimator is switched on in mid-load, at an SOC that is 0.2 too low and 0.2 too high. The cell file comes from the
 impedance of the truth at the temperatures that it is made for, as far as a ladder can follow it, and errs as much as it
@@ -42,13 +42,13 @@ PHOSPHATE = Truth(
     ohm=resistances((12.0, 3.0, 5.0, 4.0, 4.0, 5.0, 6.0, 4.0)),
 )
 NODES = np.array([0, 20, 40, 60, 80, 120, 160, 200, 240, 280, 320, 360, 400])
-"""Of ``GRID``: where the cell file has its resistances."""
+"""SOC nodes of the resistances in the cell file."""
 OCV_NODES = np.concatenate([np.arange(0, 40, 4), np.arange(40, 401, 10)])
-"""Where it has its OCV."""
+"""SOC nodes of the OCV in the cell file."""
 RAD_S = 1.0 / np.geomspace(0.1, 4000.0, 40)
-"""Where the ladder is fitted to the impedance [1/s]."""
+"""Frequencies at which the ladder is fitted to the impedance [1/s]."""
 WEAK_SHARE = np.array([0.7, 0.3, 0.3, 0.4, 0.5, 0.5, 0.5])
-"""Of the resistances at 25 C, where the cell file knows no other temperature: another cell's."""
+"""Error of the resistances at 25 C when the cell file has no other temperature."""
 R_STD, SHAPE_STD = 0.1, 0.05
 """Resistances of the cell file over the true ones, std of the logarithm: of all together, and of each at each SOC."""
 OCV_STD_V, OCV_STD_SOC, OCV_LENGTH_SOC = {"nmc": 0.004, "lfp": 0.002}, 0.007, 0.15
@@ -59,7 +59,7 @@ VOLT_STEP, AMPERE_STEP, KELVIN_STEP = 1e-3, 1e-3, 0.1
 
 @dataclass(frozen=True)
 class Case:
-    """One capture, and what the estimator is told of its cell."""
+    """One capture, and the estimator's description of its cell."""
 
     name: str
     truth: Truth = OXIDE
@@ -69,13 +69,13 @@ class Case:
     """Mean of the load [C]."""
     temperature_c: float = 25.0
     rising_k: float = 0.0
-    """How much warmer it gets."""
+    """Temperature rise."""
     rate_hz: float = 1.0
     hours: float = 1.3
     unseen_h: float = 0.5
-    """How long the load ran before the estimator is switched on; 0: from rest."""
+    """Duration of the load before the estimator starts; 0: from rest."""
     soc: float = 0.9
-    """Where the load began, from rest; 1: just charged."""
+    """SOC at the start of the load, from rest; 1: just charged."""
     file_c: tuple[float, ...] | Literal["generic"] = (25.0, 10.0, 0.0, -10.0)
     """Temperatures that the cell file is made for; or a generic one."""
     gain: float = 1.0
@@ -88,7 +88,7 @@ class Case:
     """Below 1: six cells in series, one with this part of the capacity of the others."""
     sensed: bool = True
     warms_k: float = 0.0
-    """How much warmer than its surroundings a loss of 1 W makes it."""
+    """Temperature rise for a loss of 1 W."""
     after_s: float = 900.0
     seed: int = 1
 
@@ -141,12 +141,12 @@ CASES: tuple[Case, ...] = (
     Case("6S one cell -20%", weak_cell=0.8, seed=35),
 )
 WRONG = (-0.2, 0.2)
-"""How far off the SOC is that the estimator is told."""
+"""Error of the initial SOC."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """What the estimator sees, and what is true."""
+    """Samples of the estimator, and the true values."""
 
     samples: SampleBlock
     soc: Floats
@@ -203,7 +203,7 @@ def capture(case: Case, current_a: Floats | None = None) -> Capture:
 
 
 def cell_file(case: Case) -> CellModel:
-    """What the estimator is told of the cell."""
+    """Return the estimator's cell file."""
     kind = "nmc" if case.truth.ocv_v is OXIDE.ocv_v else "lfp"
     generic = load_cell(kind, case.capacity * case.truth.capacity_ah)
     if case.file_c == "generic":

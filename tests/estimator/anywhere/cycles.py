@@ -37,11 +37,11 @@ MAX_CHARGE_S = 8 * 3600
 
 @dataclass(frozen=True)
 class Cycle:
-    """One capture of a cell whose resistances are ``resistance`` times those of its generic cell."""
+    """One capture of a cell with ``resistance`` times the resistances of its generic cell."""
 
     chemistry: Literal["nmc", "nca", "lfp", "lmo", "lco", "lto"]
     begin: Literal["discharge", "charge"]
-    """A discharge at 1C to empty comes first; or the charge does, from empty."""
+    """True: a discharge at 1C to empty comes first; False: the charge, from empty."""
     resistance: float
     soc: float
     """At the first sample, from rest."""
@@ -92,7 +92,8 @@ def true_curve(cycle: Cycle) -> Floats:
 
 
 def load(cycle: Cycle, rng: np.random.Generator, charge_s: int) -> Floats:
-    """Current that is asked for, at 1 Hz [A]: a discharge to empty or a rest, a charge, and a drive, with rests between."""
+    """Return the requested current at 1 Hz [A]: a discharge to empty or a rest, a charge, and a drive, with rests
+    between."""
     one_c = CAPACITY_AH
     begin = np.r_[np.full(3600, one_c), np.zeros(REST_S)] if cycle.begin == "discharge" else np.zeros(REST_S)
     return np.r_[begin, np.full(charge_s, -cycle.charge_c * one_c), np.zeros(REST_S), drive(rng, one_c, 0.5, TAIL_S)]
@@ -140,7 +141,7 @@ class CycleRow:
     capacity: float
     """Learned over true capacity, less 1 [%]."""
     initializations: int
-    """How often the filter initialized itself again."""
+    """Number of re-initializations of the filter."""
 
     @property
     def line(self) -> list[str]:

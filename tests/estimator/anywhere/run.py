@@ -12,7 +12,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 
 BLOCK_S = 600.0
-"""Over which innovations are summed: errors of the model that stay so long are those that the SOC suffers from."""
+"""Duration over which innovations are summed: model errors of this duration disturb the SOC."""
 WHOLE = 0.5
 """A block with less than this part of the updates of the fullest is left out."""
 

@@ -1,4 +1,4 @@
-"""How good an SOC with its error is."""
+"""Quality of an SOC with its error."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ MIN_ROWS = 10
 
 @dataclass(frozen=True)
 class Score:
-    """Of one run, weighted by time. All but ``nees`` in percent of SOC, or of the time."""
+    """Scores of one run, weighted by time. All but ``nees`` in percent of SOC, or of the time."""
 
     rmse: float
     bias: float
@@ -30,7 +30,7 @@ class Score:
 
 
 def score(time_s: Floats, soc: Floats, soc_std: Floats, truth: Floats, after_s: float = 900.0) -> Score | None:
-    """From ``after_s`` on, above ``LOWEST_SOC``. Arrays of shape (n,).
+    """Score a run from ``after_s`` on, above ``LOWEST_SOC``. Arrays of shape (n,).
 
     Returns:
         None where that leaves too little.

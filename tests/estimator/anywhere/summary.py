@@ -1,4 +1,4 @@
-"""How the estimator does on each case: a small table that is checked in, so that a change of it shows as a diff."""
+"""Results of the estimator for each case: a small table under version control, so that a change shows as a diff."""
 
 import csv
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ DIGITS = 2
 
 @dataclass(frozen=True)
 class Row:
-    """Of one case, started ``wrong`` by so much."""
+    """Result of one case with the initial error ``wrong``."""
 
     case: str
     wrong: float
@@ -33,12 +33,12 @@ class Row:
 
 
 def rows(cases: Iterable[Case] = CASES) -> list[Row]:
-    """Of every case and start."""
+    """Return the results of every case and start."""
     return [row(case, seen, wrong) for case in cases for seen in [capture(case)] for wrong in WRONG]
 
 
 def row(case: Case, seen: Capture, wrong: float) -> Row:
-    """Of one run."""
+    """Return the result of one run."""
     estimator = Estimator(seen.cell, initial_soc=float(np.clip(seen.soc[0] + wrong, 0.0, 1.0)))
     run = run_of(estimator, seen.samples)
     result = score(seen.samples["time_s"], run.soc, run.soc_std, seen.soc, case.after_s)
@@ -52,12 +52,12 @@ HEAD = ("case", "wrong", *(f.name for f in fields(Score)), "nis", "capacity", "r
 
 
 def numbers(r: Row) -> tuple[float, ...]:
-    """In the order of ``HEAD``, from the third on."""
+    """Return the numbers in the order of ``HEAD``, from the third on."""
     return (*astuple(r.score), r.nis, r.capacity, float(r.reopened))
 
 
 def write(table: list[Row]) -> None:
-    """As it is checked in."""
+    """Write the table as it is checked in."""
     with PATH.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(HEAD)

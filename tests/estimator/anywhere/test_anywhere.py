@@ -1,4 +1,4 @@
-"""What users are promised of the SOC and its band wherever the service is switched on, on cells that no model contains."""
+"""Promises of the SOC and its interval for any start, on cells that differ from the model."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ LIMITS = {
 The OCV of the cell file is wrong by 0.7 % of SOC and 4 mV, which an estimator cannot know: RMSE is that and its own.
 """
 LAST_DIGITS = 0.02
-"""Numbers may differ by so much: they are rounded to 0.01, and other processors' exp and log differ in the last bit.
+"""Tolerance of the numbers: they are rounded to 0.01, and exp and log of other processors differ in the last bit.
 1e-9 V on every voltage changes none of them by more than 0.005."""
 NIS_BOUNDS = 0.2, 2.0
 
@@ -66,7 +66,7 @@ def table() -> list[Row]:
 
 
 def test_the_summary_is_as_checked_in(table) -> None:
-    """Where a change of the estimator is meant: ``python -m tests.estimator.anywhere`` writes the summary anew."""
+    """After an intended change of the estimator ``python -m tests.estimator.anywhere`` rewrites the summary."""
     expected = read()
     assert {(r.case, r.wrong) for r in table} == set(expected)
     changes = [
@@ -95,7 +95,7 @@ def test_a_capacity_that_is_wrong_by_a_fifth_is_found(table, case: str) -> None:
 
 
 def test_errors_are_of_the_size_of_their_std(table) -> None:
-    """NEES: errors within one capture go together, those of two do not, so each capture is one degree of freedom.
+    """NEES: errors within one capture are correlated, so each capture is one degree of freedom.
 
     The packs are left out: their one weak cell is not drawn from what is common. A band that is too wide is the lesser fault,
     and every file is given more than these captures hold: the lower bound is at 0.1 %.

@@ -68,5 +68,5 @@ def test_a_charge_from_empty_neither_teaches_a_capacity_nor_initializes_the_filt
 
 @pytest.mark.parametrize("chemistry", ["nmc", "nca", "lfp", "lmo"])
 def test_no_capture_of_these_initializes_the_filter_again(table, chemistry: str) -> None:
-    """Of lco and lto some do, in the middle of a charge or at rest after the discharge."""
+    """Some of lco and lto do, in the middle of a charge or at rest after the discharge."""
     assert [r.cycle.name for r in table[chemistry] if r.initializations] == []

@@ -1,4 +1,4 @@
-"""The same promises on other draws of load, cell file and noise: what one capture of a kind does not show.
+"""The same promises on other draws of load, cell file and noise, which one capture of a kind cannot show.
 
 Two failures hid behind one capture each: an LFP cell, switched on full, that was searched anew on its plateau (20 % off, said
 to be 4), and hypotheses at the knee that lost their weight while nothing moved (40 % off).
@@ -46,7 +46,7 @@ def test_the_band_is_true_on_other_draws(name: str) -> None:
 
 
 def test_a_full_cell_at_rest_stays_full() -> None:
-    """Half an hour in which nothing moves tells nothing new: hypotheses keep their weights."""
+    """Half an hour at rest gives no information, so hypotheses keep their weights."""
     samples = np.zeros(1800, dtype=SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(1800.0), 3.575, 25.0
     trace = Estimator(load_cell("lfp", 2.0), initial_soc=0.8).run(samples)

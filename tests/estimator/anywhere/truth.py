@@ -1,4 +1,4 @@
-"""Cells that the estimator's model does not contain: what a sensor sees of them, and what is true.
+"""Cells that differ from the estimator's model: their samples and true values.
 
 Eight processes with time constants of their own between those of the ladder, which slow down in the cold, each with an
 activation energy of its own; one of them obeys Butler-Volmer kinetics, so its resistance falls with the current; two
@@ -145,13 +145,13 @@ def smooth(rng: np.random.Generator, length_soc: float) -> Floats:
 
 
 def curve_of(name: str) -> Floats:
-    """Of a generic cell, at ``GRID`` [V]."""
+    """Return the curve of a generic cell at ``GRID`` [V]."""
     ocv = load_cell(name, 1.0).ocv
     assert isinstance(ocv, TableOcv)
     return PchipInterpolator(ocv.soc, ocv.ocv_v)(GRID)
 
 
 def measured_curve() -> Floats:
-    """Of an LG M50, NMC811 with silicon in the graphite, at ``GRID`` [V]."""
+    """Return the curve of an LG M50, NMC811 with silicon in the graphite, at ``GRID`` [V]."""
     table = np.genfromtxt(Path(__file__).parents[2] / "data" / "lgm50" / "ocv_25c.csv", delimiter=",", names=True)
     return PchipInterpolator(table["soc"], table["ocv_v"])(GRID)

@@ -16,7 +16,7 @@ def drive(rng: np.random.Generator, one_c: float, mean_c: float, seconds: int) -
 
 
 def charge(one_c: float, rate_c: float, soc: float) -> Floats:
-    """By ``soc``."""
+    """Return the charge current by ``soc``."""
     return np.full(round(3600.0 * soc / rate_c), -rate_c * one_c)
 
 

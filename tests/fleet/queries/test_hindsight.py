@@ -1,4 +1,4 @@
-"""Hindsight beside the truth, on a real capture that comes with the tests."""
+"""Hindsight beside the truth, on a real capture of the tests."""
 
 import numpy as np
 import pytest

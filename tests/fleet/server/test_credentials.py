@@ -1,4 +1,4 @@
-"""Who may do what, asked of the real server: edges, workers and readers of two tenants, and who is none of them."""
+"""Permissions, tested on the real server: edges, workers and readers of two tenants, and others."""
 
 import asyncio
 import os
@@ -51,7 +51,7 @@ class Fleet:
 
     @asynccontextmanager
     async def program(self, role: Role, tenant: str = "acme") -> AsyncIterator[tuple[Client, list[str]]]:
-        """A connection by credentials, and what the server has said against it."""
+        """Return a connection by credentials, and the server's complaints about it."""
         refused: list[str] = []
 
         async def hear(error: Exception) -> None:
@@ -73,7 +73,7 @@ class Fleet:
         os.kill(self.engine.pid(0), signal.SIGHUP)
 
     async def kept(self, tenant: str = "acme") -> list[tuple[str, bytes]]:
-        """What the stream of a tenant has: (pack, block)."""
+        """Return the blocks in the stream of a tenant: (pack, block)."""
         async with self.program(Role.READER, tenant) as (nc, _):
             js = nc.jetstream(timeout=LONG_S)
             last = (await js.stream_info(subjects.RAW_STREAM)).state.last_seq
@@ -108,7 +108,7 @@ async def is_let_in(client: aiomqtt.Client) -> bool:
 
 
 async def connect_with(url: str, token: str) -> None:
-    """By the protocol of programs, with the token of an edge."""
+    """Connect by the protocol of programs, with the token of an edge."""
     nc = Client()
     try:
         await nc.connect(
@@ -125,7 +125,7 @@ async def connect_with(url: str, token: str) -> None:
 
 
 async def is_put_out(client: aiomqtt.Client, act: Callable[[], None]) -> bool:
-    """Whether the server ends the connection after ``act``."""
+    """Return whether the server ends the connection after ``act``."""
     try:
         async with asyncio.timeout(LONG_S), client:
             act()
@@ -136,7 +136,7 @@ async def is_put_out(client: aiomqtt.Client, act: Callable[[], None]) -> bool:
 
 
 async def are_refused(nc: Client, refused: list[str], *publications: str) -> None:
-    """Publish what must not be, until the server has said so of each."""
+    """Publish forbidden messages until the server has rejected each."""
     for subject in publications:
         await nc.publish(subject, b"evil")
     async with asyncio.timeout(LONG_S):

@@ -76,7 +76,7 @@ class Serving:
             )
 
     def wait(self, wanted: str) -> None:
-        """Until it says a line with ``wanted``."""
+        """Wait for a line with ``wanted``."""
         assert self.process.stdout
         late = threading.Timer(LONG_S, self.process.kill)
         late.start()

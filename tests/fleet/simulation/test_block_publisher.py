@@ -1,4 +1,4 @@
-"""Simulated edges against the real server: their blocks come into the stream, and again when a worker asks."""
+"""Simulated edges with the real server: their blocks reach the stream, and again on request."""
 
 import asyncio
 import contextlib
@@ -23,7 +23,7 @@ PACKS, BLOCKS, AGAIN = 20, 4, 3
 
 
 async def sent(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]], int]:
-    """Let the edges send; a worker asks one of them for its third block again, once it has seen all.
+    """Let the edges send; a worker requests the third block of one of them again.
 
     Returns:
         What they say, how often each block came, and how often the worker has asked.

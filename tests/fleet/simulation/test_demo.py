@@ -1,4 +1,4 @@
-"""``fleet demo`` as a program: it tells of two workers, a kill and a takeover, and leaves nothing behind."""
+"""``fleet demo`` as a program: it reports two workers, a kill and a takeover, and leaves nothing behind."""
 
 import subprocess
 

@@ -1,4 +1,4 @@
-"""Checkpoints on the real server: damaged, left behind, and written by one who has lost the partition."""
+"""Checkpoints on the real server: damaged, old, and written by a worker that lost the partition."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""What is done before a worker connects, so that nothing stops it later."""
+"""Preparation before a worker connects, so that nothing delays it later."""
 
 import subprocess
 import sys
@@ -26,6 +26,6 @@ def test_a_block_and_the_row_of_an_hour_go_through_it(monkeypatch) -> None:
 
 
 def test_each_kernel_is_there_for_one_kind_of_arguments() -> None:
-    """In a process of its own: others here may have called them with arrays of other kinds."""
+    """In a separate process, because others here may have called them with other arrays."""
     done = subprocess.run([sys.executable, "-c", KINDS], check=True, capture_output=True, text=True)
     assert done.stdout == "[1, 1, 1, 1, 1]\n"

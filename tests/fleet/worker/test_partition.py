@@ -1,4 +1,4 @@
-"""A partition: whatever happens on the way, each pack is as if one estimator had run over its samples."""
+"""A partition: after any event each pack's state equals that of one estimator over its samples."""
 
 import json
 from dataclasses import replace

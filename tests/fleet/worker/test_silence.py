@@ -1,5 +1,5 @@
-"""Partitions to which nothing comes: what a worker was given that died, a partition that was somebody else's
-meanwhile, and a block that is a fault of ours."""
+"""Partitions without messages: messages of a dead worker, a partition with another owner meanwhile, and a block
+with an internal error."""
 
 import asyncio
 from pathlib import Path
@@ -106,7 +106,7 @@ def _packs_of(partition: int) -> int:
 
 
 async def _holding_first_blocks(nc: Client, table: Table) -> tuple[PartitionLease, asyncio.Task[None]]:
-    """A worker's only partition, once it has stepped the first block of each pack; and what goes on with it."""
+    """Run a worker's only partition once it has stepped the first block of each pack."""
     inbox = nc.new_inbox()
     holding = PartitionLease(
         nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock(), partitions=1, is_busy=lambda: False

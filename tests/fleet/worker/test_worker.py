@@ -71,7 +71,7 @@ async def test_whatever_is_killed_the_states_are_those_of_one_run(tmp_path: Path
 
 
 async def _hours(nc) -> dict[str, bytes]:
-    """All rows, by their ids; none came twice."""
+    """Return all rows by their ids, without duplicates."""
     js = nc.jetstream(timeout=LONG_S)
     rows = {}
     state = (await js.stream_info(subjects.HOURS_STREAM)).state

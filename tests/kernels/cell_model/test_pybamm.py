@@ -1,4 +1,4 @@
-"""The simulated cell against PyBaMM's Thevenin model: the same elements, somebody else's equations and solver."""
+"""The simulated cell against PyBaMM's Thevenin model: equal elements, independent equations and solver."""
 
 import os
 from collections.abc import Callable
@@ -23,7 +23,7 @@ AT_MOST_V = 1e-4
 
 
 def constant_elements() -> np.ndarray:
-    """Chen and Mora's cell whose elements do not follow SOC: amplitudes 0."""
+    """Return Chen and Mora's cell with constant elements: amplitudes 0."""
     a = CELL.a.copy()
     a[[1, 4, 7, 10, 13]] = 0.0
     return a

@@ -1,4 +1,4 @@
-"""The filter against what it claims to be: Jacobians, a textbook update, mixtures, and what it does for hours."""
+"""The filter against its definition: Jacobians, a textbook update, mixtures, and hours of operation."""
 
 from itertools import pairwise
 
@@ -141,7 +141,7 @@ def test_the_update_is_that_of_the_textbook() -> None:
 def test_an_update_over_the_bend_near_empty_is_that_of_bayes(
     name: str, before: float, std: float, true_soc: float
 ) -> None:
-    """Of the SOC alone, against the posterior on a grid: the OCV is ten times as steep where the filter begins."""
+    """SOC alone, against the posterior on a grid: the OCV is ten times as steep where the filter starts."""
     cell, noise_v = load_cell(name, None if name == "chen_mora" else 3.0), 0.03
     p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(), 1e-3, None)[0]
     s = np.zeros(1, EKF_STATE)[0]
@@ -209,7 +209,7 @@ def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float)
 
 @pytest.mark.parametrize("first_c", [1.5, 3.0, 6.0])
 def test_the_load_in_a_gap_after_a_peak_may_have_gone_on_or_ended(first_c: float) -> None:
-    """Beyond the usual RMS, 1.285 C, nobody knows which."""
+    """Beyond the usual RMS, 1.285 C, the load is unknown."""
     p = settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
@@ -228,7 +228,7 @@ def test_outside_the_temperatures_of_the_cell_file_r_grows() -> None:
 
 
 def test_above_the_temperatures_of_the_cell_file_nothing_is_surer() -> None:
-    """Resistances fall there, and what is relative to them would."""
+    """Resistances fall there, and relative errors would fall too."""
     p = settings(low_c=0.0, high_c=30.0)
     s = somewhere(p)
     sizes = []
@@ -355,7 +355,7 @@ def test_what_is_unlikely_goes_and_what_agrees_becomes_one() -> None:
 
 @pytest.mark.parametrize("true", [0, 1])
 def test_a_hypothesis_that_holds_its_model_for_wrong_loses_against_one_that_does_not(true: int) -> None:
-    """Its biases have followed what they saw, 0.2 V: no innovation tells."""
+    """Its biases have followed its observations, 0.2 V, so no innovation shows it."""
     p, apart = settings(), (0.4, 0.7)
     s, _ = several(p, 2)
     voltage_v = 0.0
@@ -441,7 +441,7 @@ def is_covariance(f) -> None:
 
 
 def test_a_hundred_samples_a_second_tell_the_same_as_one(fast) -> None:
-    """The mean of a second's samples is an update, whatever their number."""
+    """The mean of a second's samples is one update, for any number of samples."""
     slow = fast.samples[::100]
     many, few = (start(fast).run(samples).copy() for samples in (fast.samples, slow))
     many = many[::100]
@@ -542,7 +542,7 @@ def test_a_sensor_that_says_85_degrees_now_and_then_is_not_followed(drive) -> No
 
 @pytest.mark.parametrize("unseen_s", [7200.0, np.inf])
 def test_after_a_restart_the_cell_is_as_cold_as_its_sensor_says_at_once(drive, unseen_s: float) -> None:
-    """What the hypotheses may be wrong by is that of the cold, not of the warm cell that it was."""
+    """The errors of the hypotheses are those of the cold cell, not of the warm cell before."""
     bias_v = []
     for before_c in (25.0, -15.0):
         estimator, samples = start(drive), drive.samples[:602].copy()

@@ -1,4 +1,4 @@
-"""The map gives back the functions it was filled from, and does not invent what it never saw."""
+"""The map returns the functions it was filled from, and nothing for unvisited SOC."""
 
 import math
 

@@ -45,7 +45,7 @@ def test_it_is_that_of_the_nodes_in_units_of_the_error() -> None:
 
 
 def test_a_curve_with_a_plateau_is_left_as_it_is() -> None:
-    """There a voltage tells neither SOC nor curve: nothing is learned, and the error stays that of the file."""
+    """There a voltage determines neither SOC nor curve: nothing is learned, and the error stays that of the file."""
     estimator = Estimator(load_cell("lfp", 2.0), initial_soc=0.5)
     for i in range(1200):
         estimator.step(float(i), 1.0, 3.25)
@@ -76,7 +76,7 @@ def partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, np.ndarray
 
 
 def test_the_same_curve_met_again_and_again_makes_no_certainty() -> None:
-    """A cell file that errs as much as it says, over six cycles: the band holds the truth to the end."""
+    """A cell file with its stated error, over six cycles: the interval contains the truth to the end."""
     errors = []
     for seed in (51, 54, 57):
         error, std, _ = partial_cycles(cell_file(Case("", seed=seed, capacity=1.03)), 6)
@@ -87,7 +87,7 @@ def test_the_same_curve_met_again_and_again_makes_no_certainty() -> None:
 
 
 def test_a_generic_curve_is_learned_as_far_as_the_soc_is_known() -> None:
-    """Between 0.35 and 0.85 no voltage says where the SOC is on a curve that is off: neither is taken for certain."""
+    """Between 0.35 and 0.85 no voltage determines the SOC on a wrong curve: neither becomes certain."""
     error, std, estimator = partial_cycles(GENERIC, 6)
     assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95
     soc = np.linspace(0.4, 0.8, 9)

@@ -63,7 +63,7 @@ def test_limits_are_those_of_table_5() -> None:
 
 
 def test_runtime_error_falls_below_ten_microvolts_within_seconds() -> None:
-    """What does hold of Theorem 4.1.2 (E3): the output is tracked."""
+    """The valid part of Theorem 4.1.2 (E3): the output is tracked."""
     cell = load_cell("chen_mora")
     trace = Estimator(cell, PRINTED_LAW, initial_soc=1.0, identifier=None).run(discharge(cell, 0.2, 100.0, 1e-4))
     settled = trace["time_s"] > 20.0

@@ -1,4 +1,4 @@
-"""Times that a device tells place its samples, unless they cannot be right."""
+"""Timestamps of a device place its samples, unless they are implausible."""
 
 import itertools
 from math import nan

@@ -1,4 +1,4 @@
-"""What a printed line says."""
+"""Values of a printed line."""
 
 import math
 

@@ -1,4 +1,5 @@
-"""BMS that are asked: published answers are read as their publishers read them, bad bytes are counted, questions keep their pace."""
+"""Polled BMS: published responses are decoded as by their publishers, bad bytes are counted, polls keep their
+period."""
 
 import itertools
 from typing import cast
@@ -45,7 +46,7 @@ def decoder(protocol: str, **options: object) -> PolledProtocol:
 
 
 def fed(decoder: PolledProtocol, *reads: bytes, arrival_s: float = 1.0) -> tuple[SampleBlock, list[list[float]]]:
-    """Samples of reads that come at once, and their cells."""
+    """Return samples of reads that arrive at once, and their cells."""
     blocks, cells = [], []
     for read in reads:
         blocks.append(decoder.feed(arrival_s, read))
@@ -267,7 +268,7 @@ def test_the_baud_rate_is_the_protocols_unless_it_is_told(protocol: str, baud: i
 
 
 def questions(device: PolledProtocol, seconds: float, answer: bytes = b"") -> list[tuple[float, bytes]]:
-    """When what is asked, looked at 20 times a second; each question gets an answer."""
+    """Return the times of the requests, checked 20 times a second; each request gets a response."""
     asked = []
     for tick in range(round(20 * seconds)):
         now_s = tick / 20.0

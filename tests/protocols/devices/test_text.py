@@ -1,4 +1,5 @@
-"""Boards that print text: however their bytes come, the same is read, and what cannot be read is shown."""
+"""Boards that print text: the result does not depend on how their bytes are divided, and unreadable lines are
+shown."""
 
 import itertools
 
