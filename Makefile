@@ -13,7 +13,7 @@ HOME_ASSISTANT ?= 2025.2.5
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
-APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev chromium
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
 .PHONY: help venv apt audit check docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere resolution unseen nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
@@ -57,7 +57,7 @@ fleet: venv ## what a fleet costs, in processes on this machine, e.g. make fleet
 fleet-kills: venv ## workers and servers of a fleet killed 100 times, one node and three, states compared bit by bit: 15 minutes
 	@$(BIN)/python -m tests.benchmarks.fleet_kills $(ARGS)
 
-nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
+nats: venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/mqtt/test_nats_server.py $(ARGS)
 
 real-home-assistant:

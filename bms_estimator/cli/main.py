@@ -56,7 +56,6 @@ COMMANDS = {
 
 EXTRAS = {
     "pyarrow": "parquet",
-    "amqtt": "demo",
     "matplotlib": "report",
     "prometheus_client": "prometheus",
     "pymodbus": "modbus",

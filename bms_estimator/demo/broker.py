@@ -1,84 +1,25 @@
-"""An MQTT broker inside the process, for the demo: nothing to install, loopback only.
-
-Not for a real pack: it has no passwords and no persistence, see ``_Broker``.
-"""
+"""MQTT broker of the demo: a nats-server on loopback, without passwords, that forgets everything at its end."""
 
 import asyncio
 import contextlib
 import errno
-import logging
+import json
 import socket
+import tempfile
+from pathlib import Path
 from typing import Self
 
-from amqtt.adapters import StreamReaderAdapter, StreamWriterAdapter
-from amqtt.broker import Broker
-from amqtt.contexts import BrokerConfig, ListenerConfig
-from amqtt.session import Session
-
+from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.child_process import ends_with_us
 
 MQTT_PORT = 1883
 """Default port of MQTT clients."""
 LOOPBACK = "127.0.0.1"
-DELIVERY_S, LOOK_S = 5.0, 0.02
-"""Time that the broker gives its clients at its end for pending messages, and its poll interval [s]."""
-ANONYMOUS = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
-MQTT_5 = b"MQTT\x05"
-"""Bytes of an MQTT 5 client's CONNECT after its length."""
-UNSUPPORTED_VERSION = b"\x20\x02\x00\x01"
-"""CONNACK for an unsupported protocol version."""
-
-
-class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
-    """amqtt 0.12, put right where it is wrong.
-
-    It hands a client that connects the retained messages of everyone's subscriptions: only its own are right. It
-    misreads the MQTT 5 fields of a CONNECT and waits for more; the client must learn that it speaks 3.1.1.
-    """
-
-    async def stream_connected(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, listener_name: str
-    ) -> None:
-        try:
-            start = await reader.readuntil(MQTT_5[:-1]) + await reader.readexactly(1)
-        except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, ConnectionError):
-            writer.close()
-            return
-        if not start.endswith(MQTT_5):
-            await self.external_connected(_Again(start, reader), StreamWriterAdapter(writer), listener_name)
-            return
-        writer.write(UNSUPPORTED_VERSION)
-        with contextlib.suppress(ConnectionError):
-            await writer.drain()
-        writer.close()
-
-    @property
-    def idle(self) -> bool:
-        """True if all received messages were delivered or dropped."""
-        handed_on = all(
-            session is None or session.delivered_message_queue.empty() for session, _ in self._sessions.values()
-        )
-        return handed_on and self._broadcast_queue.empty() and all(task.done() for task in self._tasks_queue)
-
-    async def _publish_retained_messages_for_subscription(
-        self, subscription: tuple[str, int], session: Session
-    ) -> None:
-        topic_filter, _ = subscription
-        if any(subscriber is session for subscriber, _ in self._subscriptions.get(topic_filter, ())):
-            await super()._publish_retained_messages_for_subscription(subscription, session)
-
-
-class _Again(StreamReaderAdapter):  # type: ignore[misc]  # as above
-    """A reader whose first bytes were already read."""
-
-    def __init__(self, start: bytes, reader: asyncio.StreamReader) -> None:
-        super().__init__(reader)
-        self._start = start
-
-    async def read(self, n: int = -1) -> bytes:
-        start, self._start = self._start[:n], self._start[n:]
-        rest: bytes = await super().read(n - len(start))
-        return start + rest
+POLL_S = 0.02
+"""Interval at which the server's start is checked [s]."""
+START_S = 60.0
+"""Timeout of the server's start on a busy machine [s]."""
 
 
 class DemoBroker:
@@ -88,16 +29,13 @@ class DemoBroker:
         port: TCP port; None: 1883 when it is free, else any that is.
 
     Raises:
-        UserError: The requested port is in use.
+        UserError: The requested port is in use, or nats-server is missing.
     """
 
     def __init__(self, port: int | None = None) -> None:
         self.port = choose_port(port, MQTT_PORT)
-        logging.getLogger("amqtt").setLevel(
-            logging.CRITICAL
-        )  # it logs a stack trace when a client disconnects without a packet
-        listener = ListenerConfig(bind=f"{LOOPBACK}:{self.port}")
-        self._broker = _Broker(BrokerConfig(listeners={"default": listener}, plugins=ANONYMOUS))
+        self._server = find_server("demo")
+        self._stack = contextlib.AsyncExitStack()
 
     @property
     def url(self) -> str:
@@ -111,23 +49,58 @@ class DemoBroker:
         return f"mosquitto_sub{port} -t 'bms/#' -v"
 
     async def __aenter__(self) -> Self:
-        """Start listening."""
-        await self._broker.start()
+        """Start the server.
+
+        Raises:
+            UserError: It does not start.
+        """
+        async with contextlib.AsyncExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bms-estimator-demo-")))
+            await self._start(folder, stack)
+            self._stack = stack.pop_all()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Disconnect all clients after their queued messages, which would otherwise be dropped."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(DELIVERY_S):
-                await self._stand_idle()
-        await self._broker.shutdown()
+        """End the server, which first sends its clients what it has for them."""
+        await self._stack.aclose()
 
-    async def _stand_idle(self) -> None:
-        """Wait until nothing has moved between two checks: a message in transit is in no queue."""
-        looks = 0
-        while looks < 2:
-            await asyncio.sleep(LOOK_S)
-            looks = looks + 1 if self._broker.idle else 0
+    async def _start(self, folder: Path, stack: contextlib.AsyncExitStack) -> None:
+        config, log = folder / "nats.conf", folder / "log"
+        config.write_text(_configuration(folder / "streams", self.port))
+        process = await asyncio.create_subprocess_exec(
+            *(self._server, "-c", config, "-l", log, "--ports_file_dir", folder),
+            preexec_fn=ends_with_us(),
+            start_new_session=True,  # Ctrl-C in the terminal must end the service before its broker
+        )
+        stack.push_async_callback(_end, process)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(START_S):
+                while not _listens(folder) and process.returncode is None:  # noqa: ASYNC110 - a file is the only sign
+                    await asyncio.sleep(POLL_S)
+        if not _listens(folder):
+            reason = log.read_text(errors="replace").strip() if log.exists() else ""
+            raise UserError(f"the demo's broker {self._server} does not start: {reason or 'it wrote no log'}")
+
+
+def _listens(folder: Path) -> bool:
+    """Return True once the server has written the file with its ports, on all of which it then listens."""
+    return any(folder.glob("*.ports"))
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        process.terminate()
+    await process.wait()
+
+
+def _configuration(folder: Path, mqtt_port: int) -> str:
+    """Return the server's settings. Its port for NATS clients, which nobody uses here, is any free one (-1)."""
+    return f"""
+server_name: demo
+listen: "{LOOPBACK}:-1"
+jetstream {{ store_dir: {json.dumps(str(folder))} }}
+mqtt {{ listen: "{LOOPBACK}:{mqtt_port}" }}
+"""
 
 
 def choose_port(port: int | None, usual: int) -> int:

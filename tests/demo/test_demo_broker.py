@@ -130,14 +130,6 @@ async def test_the_printed_command_shows_the_topics(free_port):
         assert sorted(shown.decode().split()[::2]) == sorted(RETAINED[:3])
 
 
-async def test_a_client_of_mqtt_5_hears_at_once_that_it_is_not_spoken(free_port):
-    will = aiomqtt.Will("bms/p/availability", b"offline", qos=1, retain=True)
-    newer = aiomqtt.Client("127.0.0.1", free_port, will=will, protocol=aiomqtt.ProtocolVersion.V5, timeout=LONG_S)
-    async with DemoBroker(free_port):
-        with pytest.raises(aiomqtt.MqttError, match="Unsupported protocol version"):
-            await newer.__aenter__()
-
-
 async def test_what_came_before_its_end_is_handed_on(free_port):
     async with DemoBroker(free_port):
         listener = aiomqtt.Client("127.0.0.1", free_port)

@@ -37,7 +37,7 @@ def needed(name: str, found: set[str]) -> set[str]:
 def test_every_package_of_the_service_is_named_and_none_of_the_tests_alone(bom):
     named = {one["name"] for one in bom["components"]}
     assert needed("bms_estimator", set()) <= named
-    assert not named & {"pytest", "ruff", "pybamm", "amqtt"}
+    assert not named & {"pytest", "ruff", "pybamm"}
 
 
 def test_versions_and_digests_are_those_of_the_lock(bom):

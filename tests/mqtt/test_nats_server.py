@@ -9,19 +9,20 @@ from typing import Self
 import aiomqtt
 import pytest
 
-from tests import nats
-from tests.nats import Node, leader, running, skip_without_nats
+from tests.fleet.engine import Engine, running
 from tests.sinks.service import STATE, Sink, assert_all_in_order, state, until
 
 COUNT = 400
-"""Number of states of the measurement in which none arrived."""
+"""Number of published states."""
+MESSAGES = "$MQTT_msgs"
+"""Stream in which the server keeps messages of QoS 1 until all subscribers have them."""
 
 
 class Collector:
     """Receives the pack's messages over any live node without a loss: its session is in the cluster."""
 
-    def __init__(self, nodes: list[Node]) -> None:
-        self._nodes = nodes
+    def __init__(self, server: Engine) -> None:
+        self._ports = server.mqtt_ports
         self.states: list[int] = []
         self.availability: list[bytes] = []
 
@@ -37,11 +38,9 @@ class Collector:
 
     async def _listen(self) -> None:
         while True:
-            for node in self._nodes:
+            for port in self._ports:
                 try:
-                    async with aiomqtt.Client(
-                        "127.0.0.1", node.port, identifier="collector", clean_session=False
-                    ) as client:
+                    async with aiomqtt.Client("127.0.0.1", port, identifier="collector", clean_session=False) as client:
                         await client.subscribe([(STATE, 1), ("bms/pack/availability", 1)])
                         self._listening.set()
                         async for message in client.messages:
@@ -63,15 +62,18 @@ async def publish(sink: Sink, first: int, after: int) -> None:
         await asyncio.sleep(0.005)
 
 
+def mqtt_url(server: Engine, node: int) -> str:
+    return f"mqtt://127.0.0.1:{server.mqtt_ports[node]}"
+
+
 async def test_one_node_that_is_killed_and_comes_back_gets_all_states(tmp_path: Path) -> None:
-    skip_without_nats()
-    with running(nats.alone(tmp_path)) as [node]:
-        async with Collector([node]) as live, Sink(node.url, most_kept=10_000) as sink:
+    with running(tmp_path) as server:
+        async with Collector(server) as live, Sink(mqtt_url(server, 0), most_kept=10_000) as sink:
             await publish(sink, 0, COUNT // 2)
             await until(lambda: live.states)
-            node.kill()
+            server.kill(0)
             await publish(sink, COUNT // 2, COUNT)
-            node.start()
+            server.start(0)
             await until(lambda: live.states and live.states[-1] == COUNT - 1)
             assert live.availability[-1] == b"online"
     assert_all_in_order(live.states, COUNT)
@@ -80,20 +82,20 @@ async def test_one_node_that_is_killed_and_comes_back_gets_all_states(tmp_path: 
 @pytest.mark.parametrize("serving", [pytest.param(True, id="serves us"), pytest.param(False, id="serves others")])
 @pytest.mark.parametrize("leading", [pytest.param(True, id="leads"), pytest.param(False, id="follows")])
 async def test_a_node_killed_in_mid_stream_costs_no_state(tmp_path: Path, *, serving: bool, leading: bool) -> None:
-    skip_without_nats()
     if "CLUSTER" not in os.environ:
         pytest.skip("takes 6 to 30 s: part of `make nats`")
-    with running(nats.three(tmp_path)) as nodes:
-        async with Collector(nodes) as live:
-            await until(lambda: leader(nodes))
-            victim = next(node for node in nodes if (node.name == leader(nodes)) == leading)
-            first = victim if serving else next(node for node in nodes if node is not victim)
-            urls = tuple(node.url for node in (first, *(node for node in nodes if node is not first)))
+    with running(tmp_path, 3) as server:
+        async with Collector(server) as live:
+            await until(lambda: server.leader(MESSAGES) >= 0)
+            leader = server.leader(MESSAGES)
+            victim = leader if leading else (leader + 1) % 3
+            first = victim if serving else (victim + 1) % 3
+            urls = tuple(mqtt_url(server, (first + i) % 3) for i in range(3))
             async with Sink(urls, most_kept=10_000) as sink:
                 await until(lambda: live.availability == [b"online"])
                 await publish(sink, 0, COUNT // 2)
                 await until(lambda: len(live.states) > COUNT // 4)
-                victim.kill()
+                server.kill(victim)
                 await publish(sink, COUNT // 2, COUNT)
                 await until(lambda: live.states[-1] == COUNT - 1)
                 await until(lambda: sink.delivery.waiting == 0)

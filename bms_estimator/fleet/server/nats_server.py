@@ -6,12 +6,8 @@ It ends with this process, even if that is killed. It is not restarted here: sys
 import asyncio
 import contextlib
 import functools
-import re
-import shutil
 import signal
 import ssl
-import subprocess
-import sys
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +23,7 @@ from bms_estimator.fleet.nats.streams import NoAnswerError, make_streams
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls, configuration
+from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us
 from bms_estimator.process.private_file import write_private
@@ -35,9 +32,6 @@ from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSetti
 
 log = structlog.get_logger(__name__)
 
-OLDEST = (2, 11)
-"""The first with pinned consumers."""
-INSTALL = "pip install 'bms_estimator[fleet]' brings one"
 ASK_AGAIN_S = 0.1
 ASK_S = 5.0
 """One request to the monitor of a server that is busy."""
@@ -66,27 +60,6 @@ class NodeLocation:
     def keys(self) -> Path:
         """Folder of the keys."""
         return self.folder / "keys"
-
-
-def find_server() -> Path:
-    """Find nats-server beside the running Python, otherwise in PATH.
-
-    Raises:
-        UserError: It is missing or too old.
-    """
-    beside = Path(sys.executable).with_name("nats-server")
-    found = str(beside) if beside.exists() else shutil.which("nats-server")
-    if not found:
-        raise UserError(f"nats-server: neither in {beside.parent} nor in PATH; {INSTALL}")
-    try:
-        said = subprocess.run([found, "-v"], capture_output=True, text=True, check=True, timeout=60).stdout  # noqa: S603 - found above
-    except (OSError, subprocess.SubprocessError) as error:
-        raise UserError(f"{found}: does not say its version: {error}; {INSTALL}") from None
-    version = re.search(r"v(\d+)\.(\d+)", said)
-    if not version or (int(version[1]), int(version[2])) < OLDEST:
-        oldest = ".".join(map(str, OLDEST))
-        raise UserError(f"{found}: {said.strip() or 'says no version'}; {oldest} or later is needed: {INSTALL}")
-    return Path(found)
 
 
 @dataclass(frozen=True)

