@@ -94,7 +94,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 
 
 def _configuration(folder: Path, mqtt_port: int) -> str:
-    """Return the server's settings. Its port for NATS clients, which nobody uses here, is any free one (-1)."""
+    """Return the server's settings. Its port for NATS clients is unused, so any free port will do (-1)."""
     return f"""
 server_name: demo
 listen: "{LOOPBACK}:-1"

@@ -22,7 +22,7 @@ from bms_estimator.telemetry.health import sample_counters, suspicions
 
 UNUSABLE = "not_finite", "range", "saturated"
 """Kinds of dropped samples that indicate a sensor fault."""
-JUDGE_S, JUDGE_ROWS = 0.1, 1024
+EVALUATION_S, EVALUATION_ROWS = 0.1, 1024
 """Interval [s] and number of samples after which samples are checked; a check of each block would take as long as the
 estimate."""
 
@@ -63,33 +63,33 @@ class AlarmMonitor:
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
         self.alarms = AlarmEvaluator(watched(settings, cell), charging_a(cell), gap_s, inputs, silent_limit_s(settings))
-        self._heard_s, self._arrival_s = clock.monotonic(), clock.wall()  # of the last sample, accepted or not
-        self._judged_s = -math.inf
+        self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()  # of the last sample, accepted or not
+        self._evaluated_s = -math.inf
 
     def add(self, block: SampleBlock, trace: TraceBlock, now_s: float) -> None:
         """Take a block and what the estimator made of it at ``now_s`` of the monotonic clock [s]."""
         self.alarms.add(block, trace, self._source.cells)
-        self._heard_s, self._arrival_s = now_s, self._clock.wall()
-        if now_s - self._judged_s >= JUDGE_S or self.alarms.rows >= JUDGE_ROWS:
+        self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
+        if now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS:
             self.evaluate(now_s)
 
     def evaluate(self, now_s: float) -> None:
         """Judge the samples since the last call, or their absence, at ``now_s`` of the monotonic clock [s]."""
-        passed_s, self._judged_s = now_s - self._judged_s, now_s
+        passed_s, self._evaluated_s = now_s - self._evaluated_s, now_s
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
-        said = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
-        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, said)
-        self.alarms.on_silence(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
+        texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
+        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts)
+        self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.message or "")
         if (hooks := self._hooks()) is not None:
-            self.alarms.judge_hooks(hooks.failing, passed_s, self._clock.wall())
+            self.alarms.evaluate_hooks(hooks.failing, passed_s, self._clock.wall())
         self._report_changes()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Acknowledge an alarm, or all with None. Return the acknowledged ones."""
-        known = self.alarms.acknowledge(name)
+        acknowledged = self.alarms.acknowledge(name)
         self._report_changes()
-        return known
+        return acknowledged
 
     def _counts(self) -> SampleCounts:
         """Return the sample counters. A damaged frame also counts as missing in a numbered sequence."""
@@ -100,9 +100,9 @@ class AlarmMonitor:
     def _report_changes(self) -> None:
         for change in self.alarms.changes():
             alarm = change.alarm
-            if change.turn == "watched":
-                say = log.info if alarm.watched else log.warning
-                say("alarm watched", alarm=alarm.name, watched=alarm.watched, reason=alarm.unwatched_reason)
+            if change.field == "watched":
+                write_log = log.info if alarm.watched else log.warning
+                write_log("alarm watched", alarm=alarm.name, watched=alarm.watched, reason=alarm.unwatched_reason)
             elif alarm.active:
                 log.warning("alarm raised", alarm=alarm.name, severity=alarm.severity, reason=alarm.text)
             else:

@@ -1,4 +1,4 @@
-"""Writer of checkpoints: with the first sample, as the SOC moves, at intervals, and at the end."""
+"""Writer of checkpoints: after the first sample, when the SOC changes, at intervals, and at the end."""
 
 import asyncio
 import math
@@ -10,34 +10,32 @@ import structlog
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.estimator import Estimator
 from bms_estimator.service.publisher import Publisher
+from bms_estimator.telemetry.alarms import AlarmEvaluator
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 
-SAVED_SOC = 0.002
-"""Change of the SOC since the checkpoint that triggers a save, so that a kill loses no more."""
-LOOK_S = 1.0
+SOC_CHANGE = 0.002
+"""Change of the SOC since the last save that triggers the next save; a kill therefore loses no more than this."""
+CHECK_S = 1.0
 """Interval at which that change is checked [s]."""
-HUNG_S = 10.0
-"""Time after which a disk that has not accepted the state counts as hung [s]."""
-LAST_S = 5.0
-"""Timeout of the last save at shutdown [s]; service managers wait for about a minute."""
+DISK_HUNG_S = 10.0
+"""Time after which a disk that has not completed a write counts as hung [s]."""
+FINAL_SAVE_S = 5.0
+"""Timeout of the save at shutdown [s]; systemd waits 90 s before it kills a service."""
 
 log = structlog.get_logger(__name__)
 
 
 class CheckpointWriter:
-    """Saves what samples have taught; the disk is waited for in a thread, and nothing else waits for it.
+    """Saves the estimator's state in a thread of its own, so that a slow disk delays nothing else.
 
     Args:
         checkpoint: Destination.
-        estimator: Read only.
-        publisher: Gets the result.
-        tally: Totals over restarts.
-        restarts: Starts that found a checkpoint.
-        every_s: Maximum interval between two saves [s].
-
-    Attributes:
-        every_s: May be changed.
+        estimator: Estimator; read only.
+        publisher: Publishes the outcome of each save.
+        totals: Totals over restarts.
+        restarts: Number of starts that found a checkpoint.
+        interval_s: Maximum interval between two saves [s].
     """
 
     def __init__(
@@ -45,83 +43,100 @@ class CheckpointWriter:
         checkpoint: CheckpointFile,
         estimator: Estimator,
         publisher: Publisher,
-        tally: LifetimeTotals,
+        totals: LifetimeTotals,
         *,
         restarts: int,
-        every_s: float,
+        interval_s: float,
     ) -> None:
-        self.every_s = every_s
+        self._interval_s = interval_s
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
-        self._tally, self._restarts = tally, restarts
-        self._alarms = publisher.watch.alarms.kept  # as the disk has them
-        publisher.kept = tally.flow
+        self._totals, self._restarts = totals, restarts
+        self._saved_alarms = self._alarms.saved_state
+        publisher.saved_flow = totals.flow
         self._saved: tuple[int, float] | None = None
-        """Samples and SOC of the state that was saved last; None: none was by this run."""
+        """Progress (``_progress``) of the state that was saved last; None: this run has saved none."""
 
     async def run(self) -> None:
-        """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC``, a latching alarm turns or a first sample is there."""
-        await self._write(self._mark(clean=False))  # from now on a run that leaves no word has crashed
+        """Save at each interval, and earlier after the first sample, a change of the SOC, or a change of a latching alarm."""
+        # until the final save marks the file as clean, the next start counts this run as crashed
+        await self._write(self._update_counters(clean=False))
         loop = asyncio.get_running_loop()
-        saved_s, failed = -math.inf, False
+        tried_s, failed = -math.inf, False
         while True:
-            await asyncio.sleep(min(LOOK_S, self.every_s))
-            moved = self._saved is None or abs(self._estimator.state["soc"][0] - self._saved[1]) >= SAVED_SOC
-            moved = moved or self._alarms != self._publisher.watch.alarms.kept
-            if loop.time() >= saved_s + self.every_s or (moved and not failed):
+            await asyncio.sleep(min(CHECK_S, self._interval_s))
+            if loop.time() >= tried_s + self._interval_s or (self._has_news and not failed):
                 failed = not await self._save()
-                saved_s = loop.time()
+                tried_s = loop.time()
 
     async def save_final(self, *, clean: bool) -> None:
-        """Save as the run ends, by itself where it is ``clean``; a disk that hangs is left alone after ``LAST_S``."""
+        """Save at the end of a run; give up after ``FINAL_SAVE_S``.
+
+        Args:
+            clean: True if the run ended as requested, False after an exception.
+        """
         try:
-            async with asyncio.timeout(LAST_S):
+            async with asyncio.timeout(FINAL_SAVE_S):
                 await self._save(clean=clean)
         except TimeoutError:
             log.warning("the disk hangs: the last checkpoint is not written", file=str(self._checkpoint.path))
 
     @property
-    def _taught(self) -> tuple[int, float]:
-        """Samples and SOC now."""
+    def _alarms(self) -> AlarmEvaluator:
+        return self._publisher.alarm_monitor.alarms
+
+    @property
+    def _has_news(self) -> bool:
+        """True if the state has changed enough to be saved before the interval ends."""
+        if self._saved is None or self._saved_alarms != self._alarms.saved_state:
+            return True
+        return bool(abs(self._estimator.state["soc"][0] - self._saved[1]) >= SOC_CHANGE)
+
+    @property
+    def _progress(self) -> tuple[int, float]:
+        """Number of samples and SOC; the SOC of a fuel cell is NaN, replaced by 0 because NaN is equal to nothing."""
         state = self._estimator.state[0]
-        return int(state["samples"]), float(np.nan_to_num(state["soc"]))  # a fuel cell has none, NaN equals nothing
+        return int(state["samples"]), float(np.nan_to_num(state["soc"]))
 
     async def _save(self, *, clean: bool = False) -> bool:
         """Save unsaved state. Return False if it cannot be written.
 
         An unchanged state is not saved again: a new save time would hide the gap since the last sample.
         """
-        taught, ledger = self._taught, self._ledger(clean=clean)
-        if not taught[0] or taught == self._saved:
-            if clean or self._alarms != ledger.alarms:
-                return await self._write_with(ledger, lambda: self._checkpoint.update_counters(ledger))
+        progress, counters = self._progress, self._counters(clean=clean)
+        if not progress[0] or progress == self._saved:
+            if clean or self._saved_alarms != counters.alarms:
+                return await self._write_counters(counters, lambda: self._checkpoint.update_counters(counters))
             return True
         state = self._estimator.record.copy()
-        if not await self._write_with(ledger, lambda: self._checkpoint.save(state, ledger)):
-            self._publisher.kept = None
+        if not await self._write_counters(counters, lambda: self._checkpoint.save(state, counters)):
+            self._publisher.saved_flow = None
             return False
-        self._publisher.checkpoint, self._saved, self._publisher.kept = "saved", taught, ChargeEnergy.of(ledger.total)
+        self._publisher.checkpoint, self._saved = "saved", progress
+        self._publisher.saved_flow = ChargeEnergy.of(counters.total)
         return True
 
-    def _mark(self, *, clean: bool) -> Callable[[], None]:
-        ledger = self._ledger(clean=clean)
-        return lambda: self._checkpoint.update_counters(ledger)
+    def _update_counters(self, *, clean: bool) -> Callable[[], None]:
+        """Return a call that writes the counters only."""
+        counters = self._counters(clean=clean)
+        return lambda: self._checkpoint.update_counters(counters)
 
-    def _ledger(self, *, clean: bool) -> RunCounters:
-        return RunCounters(self._restarts, self._tally.total, clean, self._publisher.watch.alarms.kept)
+    def _counters(self, *, clean: bool) -> RunCounters:
+        return RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state)
 
-    async def _write_with(self, ledger: RunCounters, write: Callable[[], None]) -> bool:
-        """Write as ``_write`` does; then the alarms are on disk, too."""
+    async def _write_counters(self, counters: RunCounters, write: Callable[[], None]) -> bool:
+        """Call ``write``, which also writes the counters. Return False if it fails."""
         written = await self._write(write)
         if written:
-            self._alarms = ledger.alarms
+            self._saved_alarms = counters.alarms
         return written
 
     async def _write(self, write: Callable[[], None]) -> bool:
-        """Have the disk take something. False: it does not."""
+        """Call ``write`` in the disk's thread. Return False if it fails."""
         file = str(self._checkpoint.path)
         future = asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, write)
         try:
-            await asyncio.wait({future}, timeout=HUNG_S)  # wait_for of Python 3.11 may swallow that we are to end
+            # asyncio.wait_for of Python 3.11 may swallow a cancellation
+            await asyncio.wait({future}, timeout=DISK_HUNG_S)
             if not future.done():
                 self._publisher.checkpoint = "not saved: the disk hangs"
                 log.warning("checkpoint cannot be saved", file=file, error="the disk hangs")

@@ -19,7 +19,7 @@ from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import Source
 
-UNTENDED_S = 30.0
+SOURCE_HUNG_S = 30.0
 """Time without a run of a source's task after which it counts as hung [s]."""
 PAT_S = 5.0
 """Maximum interval between two watchdog notifications [s]."""
@@ -72,7 +72,7 @@ async def _keep_alive(
     """Notify the watchdog while the source's task runs, and report the status."""
     said = ""
     while True:
-        if source.pulse().task_idle_s <= UNTENDED_S:
+        if source.pulse().task_idle_s <= SOURCE_HUNG_S:
             notifier.alive(name)
         status = f"no samples: {source.message}" if source.message else f"{edge.store.waiting} blocks not sent"
         if status != said:

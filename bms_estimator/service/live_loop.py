@@ -55,7 +55,7 @@ async def run_estimation_loop(
     current_zero: Callable[[], Awaitable[None]] | None = None,
     notifier: SystemdNotifier | None = None,
     clock: Clock | None = None,
-    pulse: Callable[[], SourceHealth] | None = None,
+    source_health: Callable[[], SourceHealth] | None = None,
     recording: Callable[[], RecordingHealth | None] = lambda: None,
     hooks: AlarmHooks | None = None,
     edge: BlockSender | None = None,
@@ -71,24 +71,24 @@ async def run_estimation_loop(
         checkpoint: File of the state; None: the state is not saved.
         requests: Dispatcher at which this loop registers its handlers.
         delivery: Counters of sent messages and received requests.
-        current_zero: Has the board take the present current as zero; None: it cannot.
+        current_zero: Makes the board take the present current as zero; None: it cannot.
         notifier: Is notified that the loop is ready and alive.
         clock: The clocks.
-        pulse: Whether the source lives; None: not reported.
-        recording: State of a recording; None where nothing is recorded.
+        source_health: Returns the health of the source; None: not reported.
+        recording: Returns the state of a recording; None where nothing is recorded.
         hooks: Alarm hooks; opened and closed here.
-        edge: Receives all samples as well; None: they are sent nowhere. Opened and closed by its owner.
+        edge: Also receives all samples; opened and closed by its owner. None: they are not sent.
 
     Returns:
-        The estimator as the last sample left it.
+        The estimator after the last sample.
     """
     name, clock = settings.pack.name, clock or Clock()
     hooks = hooks or AlarmHooks((), name, None, None)
     notifier = notifier or SystemdNotifier([name])
     estimator = new_estimator(settings, cell)
-    ledger, restored = _restore(estimator, checkpoint, clock)
+    counters, outcome = _restore(estimator, checkpoint, clock)
     restored_s = since_boot()
-    tally = LifetimeTotals(estimator, ledger.total)
+    totals = LifetimeTotals(estimator, counters.total)
     publisher = Publisher(
         settings,
         cell,
@@ -96,23 +96,23 @@ async def run_estimation_loop(
         source=source,
         sinks=sinks,
         clock=clock,
-        restarts=ledger.restarts,
-        tally=tally,
-        checkpoint=restored,
+        restarts=counters.restarts,
+        totals=totals,
+        checkpoint=outcome,
         delivery=delivery,
-        pulse=pulse,
+        source_health=source_health,
         recording=recording,
         edge=edge.health if edge else lambda: None,
         hooks=lambda: hooks.health,
         on_alarm=hooks.on_alarm_change,
     )
-    _restore_alarms(publisher, ledger.alarms)
-    hooks.restore_active(publisher.watch.alarms.report())
+    _restore_alarms(publisher, counters.alarms)
+    hooks.restore_active(publisher.alarm_monitor.alarms.report())
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
-    every_s = settings.state.checkpoint_s
-    saving = (
-        CheckpointWriter(checkpoint, estimator, publisher, tally, restarts=ledger.restarts, every_s=every_s)
+    interval_s = settings.state.checkpoint_s
+    writer = (
+        CheckpointWriter(checkpoint, estimator, publisher, totals, restarts=counters.restarts, interval_s=interval_s)
         if checkpoint
         else None
     )
@@ -123,20 +123,20 @@ async def run_estimation_loop(
         await stack.enter_async_context(hooks)
         notifier.ready(name)
         tasks = [
-            _estimate(source, tally, publisher, edge, lambda: since_boot() - restored_s),
+            _estimate(source, estimator, totals, publisher, edge, restored_s),
             _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),
         ]
-        if saving:
-            tasks.append(saving.run())
+        if writer:
+            tasks.append(writer.run())
         clean = False
         try:
             await until_first_ends(*tasks, stop.wait())
             clean = True
-        finally:  # a fault ends the loop, too
+        finally:  # an exception ends the loop, too
             notifier.stopping(name)
-            if saving:  # before the sinks close, which may take seconds: the caller must not wait for them
-                await saving.save_final(clean=clean)
+            if writer:  # save before the sinks close: that may take seconds, and the service may be killed meanwhile
+                await writer.save_final(clean=clean)
         publisher.publish_last()
     return estimator
 
@@ -149,36 +149,48 @@ def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
 
 async def _estimate(
     source: Source,
-    tally: LifetimeTotals,
+    estimator: Estimator,
+    totals: LifetimeTotals,
     publisher: Publisher,
     edge: BlockSender | None,
-    waited_s: Callable[[], float],
+    restored_s: float,
 ) -> None:
-    """Take what the source gives; ``waited_s`` is how long it has given nothing since the state was restored [s]."""
-    estimator = tally.estimator
+    """Pass each block of samples to the edge, the estimator, the totals and the publisher.
+
+    Args:
+        source: Supplies the blocks.
+        estimator: Estimator.
+        totals: Totals over restarts.
+        publisher: Publisher.
+        edge: Receives all samples; None: they are not sent.
+        restored_s: Time since boot at which the state was restored [s].
+    """
     unseen_s = estimator.record["unseen_s"].copy()
     async for block in source:
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
-            estimator.record["unseen_s"] = unseen_s + waited_s()
+            # the gap before the first sample after a restart also includes the wait for that sample
+            estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s
         if edge:
             edge.take(block)
-        publisher.add(block, tally.run(block))
+        trace = estimator.run(block)
+        totals.add(trace)
+        publisher.add(block, trace)
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
 
 async def _keep_alive(publisher: Publisher, notifier: SystemdNotifier, name: str, clock: Clock) -> None:
     """Publish missing samples, and notify the watchdog while samples arrive or the source still tries."""
-    longest_s = notifier.watchdog_s / 3.0 or publisher.period_s
-    said, online, said_s = "", False, -math.inf
+    max_wait_s = notifier.watchdog_s / 3.0 or publisher.period_s
+    sent_status, sent_online, sent_s = "", False, -math.inf
     while True:
         if publisher.alive:
             notifier.alive(name)
         publisher.log_lines_lost = stderr.lost
-        now_s, status, now_online = clock.monotonic(), publisher.status, publisher.snapshot.health.sensor_online
-        if status != said and (now_s - said_s >= STATUS_S or now_online != online):
+        now_s, status, online = clock.monotonic(), publisher.status, publisher.snapshot.health.sensor_online
+        if status != sent_status and (now_s - sent_s >= STATUS_S or online != sent_online):
             notifier.status(name, status)
-            said, online, said_s = status, now_online, now_s
-        await asyncio.sleep(min(max(publisher.wait_s, 0.01), longest_s))
+            sent_status, sent_online, sent_s = status, online, now_s
+        await asyncio.sleep(min(max(publisher.wait_s, 0.01), max_wait_s))
         if publisher.wait_s == 0.0:
             publisher.publish()
 
@@ -193,26 +205,27 @@ async def _measure_lag(publisher: Publisher) -> None:
 
 
 def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clock) -> tuple[RunCounters, str]:
-    """Continue from a valid checkpoint. Returns the totals of earlier runs, and a description of what was done."""
+    """Restore a valid checkpoint. Return the counters of earlier runs, and the outcome as text."""
     if checkpoint is None:
         return RunCounters(0, new_totals(clock.wall())), "off"
-    found = checkpoint.load()
-    outcome = found.reason
+    content = checkpoint.load()
+    outcome = content.reason
     if not outcome:
-        wrong = restore_state(estimator, found.state, found.unseen_s)
-        outcome = f"{REFUSED}{wrong}" if wrong else f"restored{_soc_text(estimator)}"
+        error = restore_state(estimator, content.state, content.unseen_s)
+        outcome = f"{REFUSED}{error}" if error else f"restored{_soc_text(estimator)}"
     if refused := outcome.startswith(REFUSED):
         outcome = f"{outcome}; {checkpoint.quarantine()}"
-    say = log.warning if refused else log.info
-    say("checkpoint", file=str(checkpoint.path), outcome=outcome)
-    return found.ledger, outcome
+    write_log = log.warning if refused else log.info
+    write_log("checkpoint", file=str(checkpoint.path), outcome=outcome)
+    return content.ledger, outcome
 
 
-def _restore_alarms(publisher: Publisher, kept: str) -> None:
+def _restore_alarms(publisher: Publisher, saved: str) -> None:
+    """Restore the alarms of an earlier run; damaged ones are logged and dropped."""
     try:
-        publisher.watch.alarms.restore(kept)
+        publisher.alarm_monitor.alarms.restore(saved)
     except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        log.warning("the checkpoint's alarms cannot be: none is taken up", reason=str(error))
+        log.warning("the alarms of the checkpoint are damaged and were not restored", reason=str(error))
 
 
 def _soc_text(estimator: Estimator) -> str:
@@ -265,8 +278,8 @@ def _offer(
     async def current_zero(_: Mapping[str, Any]) -> Mapping[str, Any]:
         if board_zero is None:
             raise UserError("this source has no zero to be set")
-        if publisher.disturbed:
-            raise UserError(publisher.disturbed)
+        if publisher.not_at_rest_reason:
+            raise UserError(publisher.not_at_rest_reason)
         await board_zero()
         log.info("present current taken as zero on request")
         return {}
@@ -284,9 +297,9 @@ def _offer(
 
 async def _acknowledge_alarm(publisher: Publisher, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Acknowledge the alarm ``name``, or all."""
-    name, watched = arguments.get("name"), publisher.watch.alarms.names()
+    name, watched = arguments.get("name"), publisher.alarm_monitor.alarms.names()
     if name is not None and name not in watched:
         raise UserError(f"name = {reprlib.repr(name)}: must be one of {', '.join(watched)}, or left out for all")
-    known = publisher.watch.acknowledge(name)
-    log.info("alarms acknowledged on request", alarms=known)
-    return {"acknowledged": known}
+    acknowledged = publisher.alarm_monitor.acknowledge(name)
+    log.info("alarms acknowledged on request", alarms=acknowledged)
+    return {"acknowledged": acknowledged}

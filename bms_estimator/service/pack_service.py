@@ -121,7 +121,7 @@ async def run_pack_service(
             delivery=delivery,
             current_zero=source.current_zero,
             notifier=notifier,
-            pulse=source.pulse,
+            source_health=source.pulse,
             recording=partial(recording_health, tap),
             hooks=hooks,
             edge=edge,

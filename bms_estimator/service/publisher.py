@@ -42,38 +42,37 @@ log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
 """Minimum interval of the payloads for parameters, health and info, at any publish rate [s]."""
-UNTENDED_S = 20.0
-"""Time without a run of a source's task after which it counts as hung [s]: a missing port is tried at least each 10
-s."""
+SOURCE_HUNG_S = 20.0
+"""Time after which a source whose task has not run counts as hung [s]. It opens a missing port at least every 10 s."""
 
 
 class Publisher:
-    """Makes a snapshot when one is due and gives it to the sinks.
+    """Makes a snapshot when one is due and passes it to the sinks.
 
     Args:
         settings: The pack's settings.
         cell: The pack as one object.
-        estimator: Read only.
+        estimator: Estimator; read only.
         source: Supplies counters, message and board.
         sinks: Destinations of the snapshots.
         clock: The clocks.
-        tally: Totals over restarts; default: new totals.
-        restarts: Starts that found a checkpoint.
-        checkpoint: What became of the checkpoint at start.
+        totals: Totals over restarts; default: new totals.
+        restarts: Number of starts that found a checkpoint.
+        checkpoint: Outcome of restoring the checkpoint at the start.
         delivery: Counters of sent messages and received requests.
-        pulse: Whether the source lives; None: not reported.
-        recording: State of a recording; None where nothing is recorded.
-        edge: State of the fleet edge; None without one.
-        hooks: Successes and failures of alarm hooks; None without hooks.
+        source_health: Returns the health of the source; None: not reported.
+        recording: Returns the state of a recording; None where nothing is recorded.
+        edge: Returns the state of the fleet edge; None without one.
+        hooks: Returns successes and failures of alarm hooks; None without hooks.
         on_alarm: Called with each alarm that is raised or cleared.
 
     Attributes:
-        watch: Alarm monitor.
-        checkpoint: Result of restoring the last checkpoint.
+        alarm_monitor: Alarm monitor.
+        checkpoint: Outcome of the last restore or save of a checkpoint.
         disk_free_mib: Free space in the state folder [MiB].
-        log_lines_lost: Dropped log lines since start.
-        kept: Charge and energy as the next start will find them; None: nothing will be found.
-        latest: The last estimate that there was.
+        log_lines_lost: Number of log lines dropped since start.
+        saved_flow: Charge and energy in the last checkpoint; None without one.
+        latest: The last estimate.
         snapshot: The last snapshot.
     """
 
@@ -86,11 +85,11 @@ class Publisher:
         source: Source,
         sinks: Sequence[Sink],
         clock: Clock,
-        tally: LifetimeTotals | None = None,
+        totals: LifetimeTotals | None = None,
         restarts: int = 0,
         checkpoint: str = "off",
         delivery: DeliveryStats | None = None,
-        pulse: Callable[[], SourceHealth] | None = None,
+        source_health: Callable[[], SourceHealth] | None = None,
         recording: Callable[[], RecordingHealth | None] = lambda: None,
         edge: Callable[[], EdgeHealth | None] = lambda: None,
         hooks: Callable[[], HookHealth | None] = lambda: None,
@@ -98,26 +97,26 @@ class Publisher:
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
         self._source, self._sinks, self._clock = source, sinks, clock
-        self._tally = tally or LifetimeTotals(estimator, new_totals(clock.wall()))
+        self._totals = totals or LifetimeTotals(estimator, new_totals(clock.wall()))
         self._restarts, self._delivery = restarts, delivery or DeliveryStats()
         self._rest = RestDetector(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
-        self._pulse, self._recording, self._edge, self._latency = pulse, recording, edge, Latency()
+        self._source_health, self._recording, self._edge, self._latency = source_health, recording, edge, Latency()
         self._hooks = hooks
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
-        self.kept: ChargeEnergy | None = None
+        self.saved_flow: ChargeEnergy | None = None
         self._flow = ChargeEnergy()  # as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
-        self.watch = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks)
-        self._suspects = 0  # bits of ``InputFault``, as logged
+        self.alarm_monitor = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks)
+        self._logged_faults = 0  # bits of ``InputFault``
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
-        self._sample_s = -math.inf  # monotonic, of the last accepted sample
-        self._impossible: str | None = None  # reason why the last dropped sample was dropped; None: all are good
-        self._dropped_before = self._dropped()  # by kind, when that began
+        self._sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
+        self._drop_reason: str | None = None  # why the last sample was dropped; None: it was accepted
+        self._dropped_before = self._dropped()  # by kind, before the present series of dropped samples
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -134,23 +133,23 @@ class Publisher:
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
     def add(self, block: SampleBlock, trace: TraceBlock) -> None:
-        """Take a block and what the estimator made of it; publish when it is time."""
-        if self._pulse:
-            self._latency.add(self._pulse().block_age_s)
+        """Take a block of samples and its estimates; publish if that is due."""
+        if self._source_health:
+            self._latency.add(self._source_health().block_age_s)
         now_s = self._clock.monotonic()
         if trace.size:
             self._window.add(trace, self._clock.wall(), self._source.cells)
             self._sample_s = now_s
         if trace.size < block.size:
-            self._impossible = out_of_range_reason(block, self._estimator.settings[0]) or ""
-        elif self._impossible is not None:
-            self._impossible, self._dropped_before = None, self._dropped()
-        self.watch.add(block, trace, now_s)
+            self._drop_reason = out_of_range_reason(block, self._estimator.settings[0]) or ""
+        elif self._drop_reason is not None:
+            self._drop_reason, self._dropped_before = None, self._dropped()
+        self.alarm_monitor.add(block, trace, now_s)
         if now_s >= self._due_s:
             self.publish()
 
     def add_lag(self, lag_s: float) -> None:
-        """Take by how much the loop woke too late [s]."""
+        """Take a delay of the event loop [s]."""
         self._lag_s = max(self._lag_s, lag_s)
 
     def publish(self) -> None:
@@ -159,7 +158,7 @@ class Publisher:
         self._due_s += self.period_s
         if self._due_s <= now_s:  # behind: do not catch up
             self._due_s = now_s + self.period_s
-        self.watch.evaluate(now_s)
+        self.alarm_monitor.evaluate(now_s)
         self.snapshot = self._next_snapshot(now_s)
         if self.snapshot.estimate is not None:
             self.latest = self.snapshot.estimate
@@ -178,26 +177,30 @@ class Publisher:
     def alive(self) -> bool:
         """True if samples flow, or if the source still tries and reports why they do not."""
         fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
-        return fresh or self._pulse is None or self._pulse().task_idle_s <= UNTENDED_S
+        return fresh or self._source_health is None or self._source_health().task_idle_s <= SOURCE_HUNG_S
 
     @property
     def status(self) -> str:
-        """The pack in a few words."""
+        """Short text about the pack for systemd."""
         if self.snapshot.health.sensor_message:
             return f"no samples: {self.snapshot.health.sensor_message}"
         soc = self.latest.soc if self.latest else None
         return "" if soc is None else f"SOC {soc:.2f}"
 
     @property
-    def disturbed(self) -> str | None:
-        """Why the pack is not known to be at rest; None when it is."""
+    def not_at_rest_reason(self) -> str | None:
+        """Reason why the pack may not be at rest; None when it is at rest."""
         return self.snapshot.health.sensor_message or self._rest.not_at_rest_reason(self._clock.monotonic())
 
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_s = self._started_s
         parameters = make_parameters_payload(self._estimator, self._started_wall_s)
         return Snapshot(
-            None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info(), self.watch.alarms.report()
+            None,
+            parameters,
+            self._health(now_s, self._sensor_message(now_s)),
+            self._info(),
+            self.alarm_monitor.alarms.report(),
         )
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
@@ -212,13 +215,13 @@ class Publisher:
             parameters, info = make_parameters_payload(self._estimator, wall_s), self._info()
         if old or health.sensor_online != (message is None):
             health = self._health(now_s, message)
-            self._log_suspicions(health)
-        return Snapshot(estimate, parameters, health, info, self.watch.alarms.report())
+            self._log_input_faults(health)
+        return Snapshot(estimate, parameters, health, info, self.alarm_monitor.alarms.report())
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         remaining = remaining_charge(self._estimator, window.current_a)
         # only saved values, so that the next run continues from there
-        self._flow = self._flow.at_least(self.kept or self._tally.flow)
+        self._flow = self._flow.at_least(self.saved_flow or self._totals.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
         return make_state_payload(window, remaining, self._source.counters, wall_s, self._flow, capacity_ah)
 
@@ -236,42 +239,42 @@ class Publisher:
             sensor_message=message,
             delivery=self._delivery,
             clock_ppm=self._source.clock_ppm,
-            total=self._tally.total,
-            unseen_s=self._tally.unseen_s,
+            total=self._totals.total,
+            unseen_s=self._totals.unseen_s,
             loop=self._loop(),
             recording=self._recording(),
             edge=self._edge(),
             hooks=self._hooks(),
         )
 
-    def _log_suspicions(self, health: Health) -> None:
-        """Log that one is raised or cleared; numbers in the sentences may change."""
+    def _log_input_faults(self, health: Health) -> None:
+        """Log the suspected input faults when their set changes; the numbers in their texts change more often."""
         suspects = int(self._estimator.record["checks"]["suspects"][0])
-        if suspects != self._suspects:
-            self._suspects = suspects
-            log.warning("suspicion", suspects=health.suspects or "none any more")
+        if suspects != self._logged_faults:
+            self._logged_faults = suspects
+            log.warning("suspected input faults", suspects=health.suspects or "none")
 
     def _loop(self) -> LoopHealth:
-        p50_s, p99_s, most_s = self._latency.take() or (None, None, None)
+        p50_s, p99_s, max_s = self._latency.take() or (None, None, None)
         return LoopHealth(
             latency_p50_s=p50_s,
             latency_p99_s=p99_s,
-            latency_max_s=most_s,
-            reads_waiting=self._pulse().queued_reads if self._pulse else 0,
+            latency_max_s=max_s,
+            reads_waiting=self._source_health().queued_reads if self._source_health else 0,
             messages_waiting=self._delivery.waiting,
             log_lines_lost=self.log_lines_lost,
             disk_free_mib=self.disk_free_mib,
         )
 
     def _info(self) -> Info:
-        self._board = self._source.board or self._board  # a lost board is most likely to return
+        self._board = self._source.board or self._board  # of a board that was unplugged, the last known properties
         sensed = bool(self._estimator.record["filter"]["sensed"][0])
         return make_info_payload(
             self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed
         )
 
     def _sensor_message(self, now_s: float) -> str | None:
-        """Why values are not fresh, None when they are."""
+        """Return the reason why no fresh values arrive; None when they do."""
         silent_s = now_s - self._sample_s
         if silent_s <= self._fresh_s:
             return None
@@ -282,7 +285,7 @@ class Publisher:
         dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped().items()}
         text = f"no usable sample for {silent_s:.1f} s"
         text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
-        return f"{text}; {self._impossible}" if self._impossible else text
+        return f"{text}; {self._drop_reason}" if self._drop_reason else text
 
     def _dropped(self) -> dict[str, int]:
         """Return the dropped samples by kind."""

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.settings.alarm_kinds import ALARM_KINDS, AlarmKind
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
 from bms_estimator.settings.pack import Settings
 
@@ -19,40 +20,22 @@ SILENT_PERIODS = 3
 """Minimum number of missing samples or publications before an alarm on silence."""
 
 
-Quantity = Literal["voltage", "current", "temperature", "cells"]
-"""Measured quantity of a sample."""
-NEEDED: dict[AlarmName, tuple[Quantity, ...]] = {
-    "pack_over_voltage": ("voltage",),
-    "pack_under_voltage": ("voltage",),
-    "cell_over_voltage": ("cells",),
-    "cell_under_voltage": ("cells",),
-    "discharge_over_current": ("current",),
-    "charge_over_current": ("current",),
-    "over_temperature": ("temperature",),
-    "under_temperature": ("temperature",),
-    "charging_below_freezing": ("current", "temperature"),
-    "soc_low": ("voltage", "current"),
-    "stability_margin_low": ("voltage", "current"),
-    "cell_imbalance": ("cells",),
-    "model_mismatch": ("voltage", "current"),
-}
-"""Quantities without which an alarm cannot be watched. The alarms that are missing here judge the samples themselves."""
-
-
 class AlarmDefinition(NamedTuple):
     """One alarm that is watched."""
 
     name: AlarmName
     severity: Literal["warning", "critical"]
-    unit: str | None
-    above: bool
-    """Raised from ``limit`` on upwards, and else downwards."""
     limit: float
     clear: float
     """Level at which it ends; equal to ``limit`` without hysteresis."""
     delay_s: float
     clear_delay_s: float
     latch: bool
+
+    @property
+    def kind(self) -> AlarmKind:
+        """Properties of this alarm that are the same for every pack."""
+        return ALARM_KINDS[self.name]
 
 
 class Chemistry(NamedTuple):
@@ -87,8 +70,6 @@ class _Default(NamedTuple):
 
     limit: float | None
     clear: float | None
-    unit: str | None
-    above: bool = True
 
 
 def watched(settings: Settings, cell: PackModel) -> tuple[AlarmDefinition, ...]:
@@ -142,16 +123,16 @@ def _out_of_range(alarms: tuple[AlarmDefinition, ...], cell: PackModel) -> Itera
     for alarm in alarms:
         low, high = ranges.get(alarm.name, (-math.inf, math.inf))
         if not low <= alarm.limit <= high:
-            key = f"alarms.{alarm.name}.limit_{'a' if alarm.unit == 'A' else 'v'}"
+            key = f"alarms.{alarm.name}.limit_{'a' if alarm.kind.unit == 'A' else 'v'}"
             yield (
-                f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {alarm.unit}, as the cell file has it; "
+                f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {alarm.kind.unit}, as the cell file has it; "
                 "is it meant for a cell, or for the pack?"
             )
 
 
 def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDefinition | None:
     """Return the monitored alarm; None if it is switched off or has no limit."""
-    told = rule.model_dump(exclude_none=True)
+    told, kind = rule.model_dump(exclude_none=True), ALARM_KINDS[name]
     key = next((key for key in type(rule).model_fields if key.startswith("limit")), "limit")
     limit = told.get(key, default.limit)
     if not rule.enabled or limit is None:
@@ -159,33 +140,31 @@ def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDefini
     hysteresis = 0.0 if default.clear is None or default.limit is None else default.clear - default.limit
     clear_key = key.replace("limit", "clear")
     clear = told.get(clear_key, round(limit + hysteresis, DIGITS))
-    if (clear > limit) if default.above else (clear < limit):
-        beyond = "above" if default.above else "below"
+    if (clear > limit) if kind.is_upper_limit else (clear < limit):
+        beyond = "above" if kind.is_upper_limit else "below"
         raise UserError(
             f"alarms.{name}.{clear_key} = {clear:g}: must not be {beyond} {key} = {limit:g}: there the alarm is raised"
         )
     delay_s = rule.delay_s
     if name == "link_lost":  # silence is its own delay
         limit, clear, delay_s = limit + delay_s, clear + delay_s, 0.0
-    return AlarmDefinition(
-        name, rule.severity, default.unit, default.above, limit, clear, delay_s, rule.clear_delay_s, rule.latch
-    )
+    return AlarmDefinition(name, rule.severity, limit, clear, delay_s, rule.clear_delay_s, rule.latch)
 
 
 def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
     """Return the defaults by alarm; a fuel cell has no SOC and no chemistry, and must not be charged."""
     n = cell.cell.series_count
     common: dict[AlarmName, _Default] = {
-        "over_temperature": _Default(60.0, 55.0, "°C"),
-        "under_temperature": _Default(-20.0, -15.0, "°C", above=False),
-        "charging_below_freezing": _Default(0.0, 2.0, "°C", above=False),
-        "soc_low": _Default(0.1, 0.15, None, above=False),
-        "stability_margin_low": _Default(0.05, 0.08, None, above=False),
-        "cell_imbalance": _Default(0.05, 0.03, "V"),
-        "sensor_fault": _Default(0.1, 0.02, None),
-        "model_mismatch": _Default(0.05 * n, 0.03 * n, "V"),
-        "link_lost": _Default(_silent_s(settings), None, "s"),
-        "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0, None),
+        "over_temperature": _Default(60.0, 55.0),
+        "under_temperature": _Default(-20.0, -15.0),
+        "charging_below_freezing": _Default(0.0, 2.0),
+        "soc_low": _Default(0.1, 0.15),
+        "stability_margin_low": _Default(0.05, 0.08),
+        "cell_imbalance": _Default(0.05, 0.03),
+        "sensor_fault": _Default(0.1, 0.02),
+        "model_mismatch": _Default(0.05 * n, 0.03 * n),
+        "link_lost": _Default(_silent_s(settings), None),
+        "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0),
     }
     return common | (_of_battery(cell) if isinstance(cell, CellModel) else _of_stack(cell))
 
@@ -197,25 +176,25 @@ def _of_battery(cell: CellModel) -> dict[AlarmName, _Default]:
     charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
     discharge_a = min(MAX_DISCHARGE * c.capacity_ah, c.current_max_a)
     return {
-        "pack_over_voltage": _Default(n * v.over_v, n * v.over_clear_v, "V"),
-        "pack_under_voltage": _Default(n * v.under_v, n * v.under_clear_v, "V", above=False),
-        "cell_over_voltage": _Default(v.over_v, v.over_clear_v, "V"),
-        "cell_under_voltage": _Default(v.under_v, v.under_clear_v, "V", above=False),
-        "discharge_over_current": _Default(discharge_a, 0.95 * discharge_a, "A"),
-        "charge_over_current": _Default(charge_a, 0.95 * charge_a, "A"),
+        "pack_over_voltage": _Default(n * v.over_v, n * v.over_clear_v),
+        "pack_under_voltage": _Default(n * v.under_v, n * v.under_clear_v),
+        "cell_over_voltage": _Default(v.over_v, v.over_clear_v),
+        "cell_under_voltage": _Default(v.under_v, v.under_clear_v),
+        "discharge_over_current": _Default(discharge_a, 0.95 * discharge_a),
+        "charge_over_current": _Default(charge_a, 0.95 * charge_a),
     }
 
 
 def _of_stack(cell: PackModel) -> dict[AlarmName, _Default]:
     c = cell.cell
-    nothing = _Default(None, None, "V")
+    nothing = _Default(None, None)
     return {
-        "pack_over_voltage": _Default(c.voltage_max_v, 0.98 * c.voltage_max_v, "V"),
-        "pack_under_voltage": _Default(c.voltage_min_v, 1.1 * c.voltage_min_v, "V", above=False),
+        "pack_over_voltage": _Default(c.voltage_max_v, 0.98 * c.voltage_max_v),
+        "pack_under_voltage": _Default(c.voltage_min_v, 1.1 * c.voltage_min_v),
         "cell_over_voltage": nothing,
-        "cell_under_voltage": nothing._replace(above=False),
-        "discharge_over_current": _Default(c.current_max_a, 0.95 * c.current_max_a, "A"),
-        "charge_over_current": _Default(None, None, "A"),
-        "charging_below_freezing": _Default(None, None, "°C", above=False),
-        "over_temperature": _Default(90.0, 85.0, "°C"),
+        "cell_under_voltage": nothing,
+        "discharge_over_current": _Default(c.current_max_a, 0.95 * c.current_max_a),
+        "charge_over_current": _Default(None, None),
+        "charging_below_freezing": _Default(None, None),
+        "over_temperature": _Default(90.0, 85.0),
     }

@@ -1,4 +1,4 @@
-"""Measured quantities that alarms need: which were measured before, and which of these are lost."""
+"""Measured quantities that alarms need, and the loss of their measurement."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import Floats
-from bms_estimator.settings.alarm_limits import Quantity
+from bms_estimator.settings.alarm_kinds import Quantity
 
 Counts = NDArray[np.int64]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
@@ -18,30 +18,30 @@ LOST: dict[Quantity, str] = {
     "temperature": "the temperature is no longer measured",
     "cells": "cell voltages are missing that were measured before",
 }
-"""Reasons for people."""
+"""Description of the loss, by quantity."""
 
 
 @dataclass
 class _Input:
-    """One quantity.
+    """State of one measured quantity.
 
     Attributes:
-        measured: Largest number of values that a sample had; 0: it was never measured.
-        lost: Values have been missing for longer than the delay.
+        measured: Largest number of values in a sample so far; 0: the quantity was never measured.
+        lost: True after values were missing for longer than the delay.
     """
 
     measured: int = 0
     lost: bool = False
     _missing_s: float | None = None
-    """Time since the first sample in a row that lacks a value [s]; None: the last sample had all."""
+    """Time since the first of the latest samples without a value [s]; None: the last sample had all values."""
     _back_s: float | None = None
-    """Time since the first value after a loss [s]; None: no value yet."""
+    """Time since the first value after a loss [s]; None: no value has arrived since."""
 
     def take(self, times_s: Floats, steps_s: Floats, counts: Counts, lost_s: float) -> list[float]:
-        """Take the number of values in each sample. Returns the times at which it was lost or measured again [s]."""
-        known = np.maximum.accumulate(np.concatenate(([self.measured], counts)))[1:]
-        self.measured = int(known[-1])
-        present = counts >= known
+        """Take the number of values in each sample. Return the times at which the quantity was lost or measured again [s]."""
+        expected = np.maximum.accumulate(np.concatenate(([self.measured], counts)))[1:]
+        self.measured = int(expected[-1])
+        present = counts >= expected
         if not self.lost and bool(present.all()):
             self._missing_s = None
             return []
@@ -49,7 +49,7 @@ class _Input:
         return [at_s for at_s, step_s, there in steps if self._step(step_s, lost_s, present=there)]
 
     def _step(self, step_s: float, lost_s: float, *, present: bool) -> bool:
-        """Take one sample. Returns whether ``lost`` has changed."""
+        """Take one sample. Return True if ``lost`` has changed."""
         before = self.lost
         self._missing_s = None if present else 0.0 if self._missing_s is None else self._missing_s + step_s
         if self._missing_s is not None and self._missing_s >= lost_s:
@@ -62,11 +62,12 @@ class _Input:
 
 @dataclass
 class Inputs:
-    """All quantities of one pack.
+    """State of all measured quantities of one pack.
 
     Args:
-        lost_s: A quantity is lost after this time without a value, and measured again after this time with values [s].
-        series: Cells in series: more cell voltages than these are not expected.
+        lost_s: Time without a value after which a quantity is lost, and time with values after which it is measured
+            again [s].
+        series: Number of cells in series, the maximum number of cell voltages.
     """
 
     lost_s: float
@@ -79,21 +80,21 @@ class Inputs:
         return tuple(name for name, each in self._inputs.items() if each.lost)
 
     @property
-    def kept(self) -> dict[str, Any]:
-        """State that outlives a restart, as ``restore`` takes it."""
+    def saved_state(self) -> dict[str, Any]:
+        """State for ``restore`` after a restart."""
         return {name: [each.measured, each.lost] for name, each in self._inputs.items() if each.measured}
 
     def measured(self, names: Collection[Quantity]) -> bool:
-        """Return True if all of these were measured at some time."""
+        """Return True if all these quantities were measured at some time."""
         return all(self._inputs[name].measured for name in names)
 
     def take(self, times_s: Floats, steps_s: Floats, counts: Mapping[Quantity, Counts]) -> list[float]:
         """Take samples.
 
         Args:
-            times_s: Shape (n,): time of each sample [s].
-            steps_s: Shape (n,): time since the sample before, 0 after a gap [s].
-            counts: Shape (n,) each: number of values of a quantity in each sample.
+            times_s: Time of each sample [s], shape (n,).
+            steps_s: Time since the previous sample [s], 0 after a gap, shape (n,).
+            counts: Number of values in each sample by quantity, each of shape (n,).
 
         Returns:
             Times at which a quantity was lost or measured again [s].
@@ -105,19 +106,19 @@ class Inputs:
             for at_s in each.take(times_s, steps_s, bounded[name], self.lost_s)
         ]
 
-    def restore(self, kept: Mapping[str, Any]) -> None:
-        """Go on from the state that an earlier run has saved.
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Restore the state of an earlier run.
 
         Raises:
-            ValueError, TypeError: It is damaged.
+            ValueError, TypeError: ``saved`` is damaged.
         """
         for name, each in self._inputs.items():
-            measured, lost = kept.get(name, (0, False))
+            measured, lost = saved.get(name, (0, False))
             if not 0 <= int(measured) <= max(self.series, 1) or not isinstance(lost, bool):
                 raise ValueError(f"{name}: measured = {measured}, lost = {lost}")
             each.measured, each.lost = int(measured), lost
 
 
 def counted(values: Floats) -> Counts:
-    """Shape (n,): 1 where a sample has a value, and 0 where it has none."""
+    """Return 1 for each sample with a value, otherwise 0; shape (n,)."""
     return np.isfinite(values).astype(np.int64)

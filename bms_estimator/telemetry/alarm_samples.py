@@ -1,4 +1,4 @@
-"""Samples that wait to be judged, and the times between them."""
+"""Buffer of samples for the alarms, and the intervals between samples."""
 
 import math
 from dataclasses import dataclass
@@ -12,20 +12,20 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
 
-WAITING_ROWS = 256
+INITIAL_ROWS = 256
 """Initial capacity of a buffer [rows]."""
 RECENT_STEPS = 4.0
-"""A long step is usual until this multiple of it has passed without another one of about its length."""
+"""Multiple of a long interval's length within which another one of about its length must follow for both to be usual."""
 _NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
-"""``_extremes`` of a sample without cell voltages."""
+"""Row of ``_extremes`` for a sample without cell voltages."""
 
 
 @dataclass
-class Steps:
-    """Times between samples. Between two samples a value is assumed to hold, unless there is a gap.
+class SampleIntervals:
+    """Intervals between samples. A value is assumed to hold between two samples, unless there is a gap.
 
-    A gap is much longer than the longest step shortly before. Samples that arrive in bursts have one long step for
-    each burst: from the second on these are no gaps.
+    A gap is much longer than the longest interval shortly before. Samples that arrive in bursts have one long interval
+    before each burst; from the second burst on, these intervals are no gaps.
 
     Attributes:
         gap_s: Minimum length of a gap [s].
@@ -35,24 +35,28 @@ class Steps:
     _last_s: float = math.nan
     _step_s: float = math.inf
     _longest_s: float = 0.0
-    """Longest recent step [s]."""
+    """Longest recent interval [s]."""
     _longest_at_s: float = -math.inf
-    """Time at which a step of about this length was last seen [s]."""
+    """Time of the last interval of about this length [s]."""
 
-    def of(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """Shape (n,) each: the time before each sample [s], 0 where the clock was set back; and 0 in gaps, too."""
+    def measure(self, times_s: Floats) -> tuple[Floats, Floats]:
+        """Return two arrays of shape (n,) for the interval before each sample.
+
+        Returns:
+            The interval [s], 0 where the clock was set back; and the interval during which values held [s], 0 in gaps.
+        """
         passed_s = np.diff(times_s, prepend=self._last_s)
         passed_s = np.where(passed_s > 0.0, passed_s, 0.0)
         before_s = np.concatenate(([self._step_s], passed_s[:-1]))
-        seen_s = np.where(passed_s > np.maximum(self.gap_s, GAP_RATIO * before_s), 0.0, passed_s)
+        observed_s = np.where(passed_s > np.maximum(self.gap_s, GAP_RATIO * before_s), 0.0, passed_s)
         for i in np.flatnonzero(passed_s > self.gap_s).tolist():
             if self._is_usual(float(times_s[i]), float(passed_s[i])):
-                seen_s[i] = passed_s[i]
+                observed_s[i] = passed_s[i]
         self._last_s, self._step_s = float(times_s[-1]), float(passed_s[-1]) or self._step_s
-        return passed_s, seen_s
+        return passed_s, observed_s
 
     def _is_usual(self, at_s: float, step_s: float) -> bool:
-        """Return whether a step of about this length was seen recently, and record this one."""
+        """Return True if an interval of about this length occurred recently; record this one."""
         is_recent = abs(at_s - self._longest_at_s) <= RECENT_STEPS * self._longest_s
         is_usual = is_recent and step_s <= GAP_RATIO * self._longest_s
         if not is_recent or step_s >= self._longest_s:
@@ -62,8 +66,8 @@ class Steps:
         return is_usual
 
 
-class Waiting:
-    """Samples that wait, with the estimator's trace of them and the extremes of their cell voltages.
+class SampleBuffer:
+    """Samples that the alarms have not evaluated yet, with their trace and the extremes of their cell voltages.
 
     Attributes:
         size: Number of samples.
@@ -84,17 +88,22 @@ class Waiting:
         self._extremes.add(_extremes(cells) if len(cells) == block.size else _NO_EXTREMES, block.size)
 
     def take(self) -> tuple[SampleBlock, TraceBlock, Floats]:
-        """Remove and return all samples of known time, the trace, and lowest and highest cell voltage [V] and their number."""
+        """Remove and return all rows.
+
+        Returns:
+            Samples with a finite time stamp; trace; and for each of these samples the minimum and maximum cell voltage [V]
+            and the number of cell voltages, shape (n, 3).
+        """
         samples, trace, extremes_v = self._samples.take(), self._traces.take(), self._extremes.take()
-        known = np.isfinite(samples["time_s"])
-        return (samples, trace, extremes_v) if known.all() else (samples[known], trace, extremes_v[known])
+        timed = np.isfinite(samples["time_s"])
+        return (samples, trace, extremes_v) if timed.all() else (samples[timed], trace, extremes_v[timed])
 
 
 class _Rows:
-    """Buffer of rows of one dtype, written in place because joining hundreds of short structured arrays takes milliseconds."""
+    """Buffer of rows of one dtype. Rows are copied in place: joining hundreds of short structured arrays takes milliseconds."""
 
     def __init__(self, dtype: Any, columns: tuple[int, ...] = ()) -> None:
-        self._rows = np.zeros((WAITING_ROWS, *columns), dtype=dtype)
+        self._rows = np.zeros((INITIAL_ROWS, *columns), dtype=dtype)
         self.size = 0
 
     def add(self, values: Any, count: int) -> None:
@@ -113,7 +122,7 @@ class _Rows:
 
 
 def _extremes(cells: CellBlock) -> Floats:
-    """Return lowest and highest cell voltage of each sample [V], NaN without any, and their number. Shape (n, 3)."""
+    """Return the minimum and maximum cell voltage of each sample [V] (NaN without any) and their number, shape (n, 3)."""
     if not cells.shape[1]:
         return np.tile(_NO_EXTREMES, (len(cells), 1))
     measured = np.count_nonzero(np.isfinite(cells), axis=1)

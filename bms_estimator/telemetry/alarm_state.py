@@ -1,4 +1,4 @@
-"""One alarm: hysteresis, delays, latch. Pure: it uses the time of the samples and no clock."""
+"""State machine of one alarm: hysteresis, delays, latch. Its time is that of the samples; it reads no clock."""
 
 import math
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ class AlarmTransition(NamedTuple):
     """Start or end of an alarm."""
 
     at_s: float
-    """On the samples' clock [s]."""
-    raising: RaisedAlarm | None
-    """Raised alarm; None: it has ended."""
+    """Time on the samples' clock [s]."""
+    raised: RaisedAlarm | None
+    """The raised alarm; None: the alarm has ended."""
 
 
 @dataclass
@@ -32,19 +32,19 @@ class AlarmState:
     """State of an alarm.
 
     Attributes:
-        watched: Definition of the alarm.
-        raising: Time and value of an active alarm; None if inactive.
-        cause_cleared: The cause is gone, but it is latched.
+        definition: Definition of the alarm.
+        raised: Time and value of an active alarm; None if inactive.
+        cause_cleared: True if the cause is gone but the alarm is latched.
         acknowledged: True if acknowledged: the alarm ends once its cause is gone.
-        known: A value has arrived.
-        lost_s: Shorter times without values count toward a delay [s].
+        has_value: True once a value has arrived.
+        lost_s: Maximum time without values that counts toward a delay [s].
     """
 
-    watched: AlarmDefinition
-    raising: RaisedAlarm | None = None
+    definition: AlarmDefinition
+    raised: RaisedAlarm | None = None
     cause_cleared: bool = False
     acknowledged: bool = False
-    known: bool = False
+    has_value: bool = False
     lost_s: float = 0.0
     _missing_s: float = 0.0
     """Time without values since the last value [s]."""
@@ -55,75 +55,75 @@ class AlarmState:
         """Take values in the order of their arrival.
 
         Args:
-            times_s: Shape (n,): when, on the samples' clock [s].
-            steps_s: Shape (n,): since the sample before, 0 after a gap [s]: an unmeasured time does not count.
-            values: Shape (n,): in the unit of the limit; NaN: not measured, which neither raises nor ends anything.
-            wall_s: Wall clock less the samples' clock [s].
+            times_s: Times on the samples' clock [s], shape (n,).
+            steps_s: Interval since the previous sample [s], 0 after a gap, which does not count toward delays; shape (n,).
+            values: Values in the unit of the limit, shape (n,). NaN (not measured) neither raises nor ends the alarm.
+            wall_s: Wall clock minus the samples' clock [s].
 
         Returns:
-            Turns within, oldest first.
+            Transitions, oldest first.
         """
-        sign = 1.0 if self.watched.above else -1.0
+        sign = 1.0 if self.definition.kind.is_upper_limit else -1.0
         signed = sign * values
-        if self.raising is None and self._held_s is None and not bool((signed >= sign * self.watched.limit).any()):
-            self.known = self.known or not bool(np.isnan(values).all())
+        if self.raised is None and self._held_s is None and not bool((signed >= sign * self.definition.limit).any()):
+            self.has_value = self.has_value or not bool(np.isnan(values).all())
             return []
-        turns = []
+        transitions = []
         for at_s, step_s, value in zip(times_s.tolist(), steps_s.tolist(), signed.tolist(), strict=True):
             if math.isnan(value):
                 self._missing_s += step_s
                 continue
-            self.known = True
+            self.has_value = True
             missing_s, self._missing_s = self._missing_s, 0.0
-            if self._due(value, step_s + (missing_s if missing_s < self.lost_s else 0.0), sign):
-                turns += self._turn(at_s, sign * value, wall_s)
-        return turns
+            if self._is_due(value, step_s + (missing_s if missing_s < self.lost_s else 0.0), sign):
+                transitions += self._next_state(at_s, sign * value, wall_s)
+        return transitions
 
-    def raise_at(self, at_s: float, raising: RaisedAlarm) -> list[AlarmTransition]:
+    def raise_at(self, at_s: float, raised: RaisedAlarm) -> list[AlarmTransition]:
         """Raise the alarm, unless it is already raised."""
-        if self.raising is not None:
+        if self.raised is not None:
             return []
-        self.raising, self._held_s = raising, None
-        return [AlarmTransition(at_s, raising)]
+        self.raised, self._held_s = raised, None
+        return [AlarmTransition(at_s, raised)]
 
     def acknowledge(self) -> bool:
         """Acknowledge the alarm. Return True if that ends it."""
-        self.acknowledged = self.raising is not None
+        self.acknowledged = self.raised is not None
         if not self.cause_cleared:
             return False
         self._end()
         return True
 
-    def restore(self, raising: RaisedAlarm, *, gone: bool, acknowledged: bool) -> None:
-        """Go on from a run before."""
-        self.raising, self.cause_cleared, self.acknowledged = raising, gone, acknowledged
+    def restore(self, raised: RaisedAlarm, *, cause_cleared: bool, acknowledged: bool) -> None:
+        """Restore the state of an earlier run."""
+        self.raised, self.cause_cleared, self.acknowledged = raised, cause_cleared, acknowledged
         self._held_s = None
 
-    def _due(self, signed: float, step_s: float, sign: float) -> bool:
+    def _is_due(self, signed: float, step_s: float, sign: float) -> bool:
         """Return True if the condition of the next state has held long enough."""
-        raised = self.raising is not None and not self.cause_cleared
-        holds = signed < sign * self.watched.clear if raised else signed >= sign * self.watched.limit
+        raised = self.raised is not None and not self.cause_cleared
+        holds = signed < sign * self.definition.clear if raised else signed >= sign * self.definition.limit
         if not holds:
             self._held_s = None
             return False
         self._held_s = 0.0 if self._held_s is None else self._held_s + step_s
-        if self._held_s < (self.watched.clear_delay_s if raised else self.watched.delay_s):
+        if self._held_s < (self.definition.clear_delay_s if raised else self.definition.delay_s):
             return False
         self._held_s = None
         return True
 
-    def _turn(self, at_s: float, value: float, wall_s: float) -> list[AlarmTransition]:
-        """Go to the next state. Returns the transition for others."""
-        if self.raising is None:
+    def _next_state(self, at_s: float, value: float, wall_s: float) -> list[AlarmTransition]:
+        """Go to the next state. Return the transition if the alarm is raised or ends."""
+        if self.raised is None:
             return self.raise_at(at_s, RaisedAlarm(at_s + wall_s, value if math.isfinite(value) else None))
-        if self.cause_cleared:  # it is back
+        if self.cause_cleared:  # the cause has returned
             self.cause_cleared = False
             return []
-        if self.watched.latch and not self.acknowledged:
+        if self.definition.latch and not self.acknowledged:
             self.cause_cleared = True
             return []
         self._end()
         return [AlarmTransition(at_s, None)]
 
     def _end(self) -> None:
-        self.raising, self.cause_cleared, self.acknowledged, self._held_s = None, False, False, None
+        self.raised, self.cause_cleared, self.acknowledged, self._held_s = None, False, False, None

@@ -1,4 +1,4 @@
-"""Totals over all restarts: samples, crashes, unmeasured time, charge and energy."""
+"""Totals over all restarts: samples, crashes, time without samples, charge and energy."""
 
 import math
 from collections import Counter
@@ -11,31 +11,32 @@ from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads import Totals
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.health import sample_counters
 
 
 def new_totals(now_s: float) -> Totals:
-    """Nothing is counted yet, at ``now_s`` [s since 1970]."""
+    """Return zero totals whose counting starts at ``now_s`` [s since 1970]."""
     return Totals(since=iso_utc(now_s), crashes=0, samples={}, unseen_s=0.0)
 
 
 class LifetimeTotals:
-    """Passes blocks to the estimator and adds up their results.
+    """Totals of the runs before and of this run.
 
     Args:
-        estimator: Estimator of this run.
-        before: Counted by the runs before.
+        estimator: Estimator of this run, with its state restored; read only.
+        before: Totals of the runs before.
 
     Attributes:
-        estimator: Estimator.
-        unseen_s: Length of the last unmeasured gap, also before the start [s]; None if there was none or it is unknown.
+        unseen_s: Length of the last gap without samples, which may have begun before this run [s]; None without a gap
+            or if its length is unknown.
     """
 
     def __init__(self, estimator: Estimator, before: Totals) -> None:
-        self.estimator, self._before = estimator, before
-        self._meter = ChargeEnergyMeter(ChargeEnergy.of(before), float(estimator.settings["gap_s"][0]))
+        self._estimator, self._before = estimator, before
+        self._gap_s = float(estimator.settings["gap_s"][0])
+        self._meter = ChargeEnergyMeter(ChargeEnergy.of(before), self._gap_s)
+        self._last_time_s, self._last_step_s, self._gaps = self._clock()
         self._unseen_s = 0.0  # of this run
         self.unseen_s: float | None = None
 
@@ -43,43 +44,49 @@ class LifetimeTotals:
     def total(self) -> Totals:
         """Totals of all runs."""
         samples = Counter(self._before.samples)
-        samples.update(sample_counters(self.estimator.state[0]))
+        samples.update(sample_counters(self._estimator.state[0]))
         changed = {"samples": dict(samples), "unseen_s": self._before.unseen_s + self._unseen_s}
         return self._before.model_copy(update=changed | self.flow._asdict())
 
     @property
     def flow(self) -> ChargeEnergy:
-        """Through the terminals, in all runs."""
+        """Charge and energy through the terminals in all runs."""
         return self._meter.flow
 
-    def run(self, block: SampleBlock) -> TraceBlock:
-        """Run the estimator as ``Estimator.run`` does."""
-        s = self.estimator.state
-        before_s, step_s, gaps = float(s["time_s"][0]), float(s["step_s"][0]), int(s["gaps"][0])
-        trace = self.estimator.run(block)
+    def add(self, trace: TraceBlock) -> None:
+        """Add the accepted samples of a block that the estimator has just run.
+
+        Args:
+            trace: Shape (n,), dtype TRACE.
+        """
         self._meter.add(trace)
-        if s["gaps"][0] != gaps or (trace.size and math.isinf(before_s)):
-            restart_s = float(self.estimator.record["unseen_s"][0])
-            gap_s = float(self.estimator.settings["gap_s"][0])
-            lengths_s = gap_lengths(trace["time_s"], before_s, step_s, gap_s, restart_s)
+        time_s, step_s, gaps = self._clock()
+        if gaps != self._gaps or (trace.size and math.isinf(self._last_time_s)):
+            restart_s = float(self._estimator.record["unseen_s"][0])
+            lengths_s = gap_lengths(trace["time_s"], self._last_time_s, self._last_step_s, self._gap_s, restart_s)
             self._unseen_s += sum(lengths_s)
             self.unseen_s = lengths_s[-1] if lengths_s else None
-        return trace
+        self._last_time_s, self._last_step_s, self._gaps = time_s, step_s, gaps
+
+    def _clock(self) -> tuple[float, float, int]:
+        """Return the estimator's last time stamp [s], its last step [s] and its number of gaps."""
+        state = self._estimator.state[0]
+        return float(state["time_s"]), float(state["step_s"]), int(state["gaps"])
 
 
 def gap_lengths(
     times_s: NDArray[np.float64], before_s: float, step_s: float, gap_s: float, restart_s: float
 ) -> list[float]:
-    """Return the lengths of the gaps before some samples [s], as ``kernels.step.is_gap`` finds them.
+    """Return the lengths of the gaps among some samples [s]; gaps are defined by ``kernels.step.is_gap``.
 
     Args:
-        times_s: Shape (n,): time stamps of accepted samples [s].
-        before_s: Length of the previous step [s]; infinite at the first of a new clock.
-        step_s: Length of the step before [s].
+        times_s: Time stamps of accepted samples [s], shape (n,).
+        before_s: Time stamp of the sample before the first [s]; infinite if the device's clock restarted since.
+        step_s: Time between the two samples before the first [s].
         gap_s: Minimum length of a gap [s].
-        restart_s: Before the first sample of a new clock [s].
+        restart_s: Time without samples before the first sample of a restarted clock [s].
     """
-    found = []
+    lengths_s = []
     for time_s in times_s:
         new_clock = math.isinf(before_s)
         length_s = restart_s if new_clock else float(time_s) - before_s
@@ -87,7 +94,7 @@ def gap_lengths(
         if not 0.0 <= length_s < math.inf:
             continue
         if new_clock or length_s > max(gap_s, GAP_RATIO * step_s):
-            found.append(length_s)
+            lengths_s.append(length_s)
         if not new_clock:
             step_s = length_s
-    return found
+    return lengths_s

@@ -359,7 +359,7 @@ async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_
 
 async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first sample is saved, and the state after this change of the SOC."""
-    monkeypatch.setattr(checkpoint_writer, "LOOK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     saved: asyncio.Queue[float] = asyncio.Queue()
     loop = asyncio.get_running_loop()
 
@@ -412,7 +412,7 @@ async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes
 async def test_a_disk_that_is_full_is_not_tried_again_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkpoint_writer, "LOOK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     attempts = []
 
     class Full(CheckpointFile):

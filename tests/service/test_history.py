@@ -232,8 +232,8 @@ async def test_a_state_folder_that_is_deleted_is_made_anew_for_its_owner_alone(t
 async def test_a_disk_that_hangs_stops_neither_the_estimate_nor_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkpoint_writer, "HUNG_S", 0.01)
-    monkeypatch.setattr(checkpoint_writer, "LAST_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "DISK_HUNG_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "FINAL_SAVE_S", 0.01)
     release = threading.Event()
 
     class Hung(CheckpointFile):

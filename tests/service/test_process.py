@@ -48,7 +48,7 @@ hangs = threading.Event()
 os.fsync = lambda _: hangs.wait()
 from bms_estimator.cli.main import main
 from bms_estimator.service import checkpoint_writer
-checkpoint_writer.HUNG_S = checkpoint_writer.LAST_S = 0.1
+checkpoint_writer.DISK_HUNG_S = checkpoint_writer.FINAL_SAVE_S = 0.1
 main()
 """
 """The program on a disk that never answers once something is to be on it."""

@@ -1,4 +1,4 @@
-"""What is logged of what is published."""
+"""Log lines of the publisher."""
 
 from structlog.testing import capture_logs
 
@@ -11,13 +11,13 @@ from bms_estimator.settings.pack import Settings
 from tests.scripted_source import ScriptedSource
 
 
-def test_a_suspicion_is_logged_when_it_is_raised_and_when_it_is_cleared_whatever_number_it_names() -> None:
+def test_suspected_input_faults_are_logged_when_their_set_changes() -> None:
     now_s, cell = 0.0, load_cell("chen_mora")
     estimator = Estimator(cell, initial_soc=0.5)
     estimator.step(0.0, 0.0, 3.8, temperature_c=25.0)
     clock = Clock(monotonic=lambda: now_s)
     publisher = Publisher(Settings(), cell, estimator, source=ScriptedSource(), sinks=[], clock=clock)
-    said = []
+    logged = []
     for temperature_c, suspects in (
         (41.0, InputFault.TEMPERATURE),
         (42.0, InputFault.TEMPERATURE),
@@ -29,5 +29,5 @@ def test_a_suspicion_is_logged_when_it_is_raised_and_when_it_is_cleared_whatever
         estimator.record["filter"]["temperature_c"] = temperature_c
         with capture_logs() as lines:
             publisher.publish()
-        said.append([str(line["suspects"])[:30] for line in lines])
-    assert said == [["['no data at 41 C, the cell fi"], [], ["none any more"], []]
+        logged.append([str(line["suspects"])[:30] for line in lines])
+    assert logged == [["['no data at 41 C, the cell fi"], [], ["none"], []]

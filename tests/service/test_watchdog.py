@@ -61,12 +61,12 @@ def systemd(tmp_path: Path):
 
 
 async def test_a_source_that_hangs_is_not_covered_by_the_loop_that_turns(systemd: Systemd) -> None:
-    pulse = SourceHealth(0.0, 0.0, 0)
+    health = SourceHealth(0.0, 0.0, 0)
     source, sink = ScriptedSource(), Collector()
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
-    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges, pulse=lambda: pulse))
+    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges, source_health=lambda: health))
     await systemd.hear("WATCHDOG=1")  # nothing comes, but somebody tries
-    pulse = SourceHealth(publisher.UNTENDED_S + 1.0, 0.0, 0)
+    health = SourceHealth(publisher.SOURCE_HUNG_S + 1.0, 0.0, 0)
     for _ in range(3):
         await sink.until(lambda _: True, skip=len(sink.snapshots))
     systemd.heard()
@@ -120,7 +120,7 @@ async def test_health_tells_how_long_bytes_wait_and_how_many_reads() -> None:
     source, sink = ScriptedSource(), Collector()
     late_s = [0.3]
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
-    live = run_estimation_loop(SETTINGS, CELL, **edges, pulse=lambda: SourceHealth(0.0, late_s[0], 7))
+    live = run_estimation_loop(SETTINGS, CELL, **edges, source_health=lambda: SourceHealth(0.0, late_s[0], 7))
     task = asyncio.create_task(live)
     first = await sink.until(lambda _: True)
     assert first.health.loop.latency_p50_s is None

@@ -34,33 +34,33 @@ class Line(NamedTuple):
     silent: bool = False
 
     def text(self) -> bytes:
-        said: dict[str, Any] = {"voltage": self.voltage_v, "current": self.current_a}
-        said |= {} if self.temperature_c is None else {"temperature": self.temperature_c}
-        said |= {"cells": self.cells_v} if self.cells_v else {}
-        return json.dumps(said).encode() + b"\n"
+        reading: dict[str, Any] = {"voltage": self.voltage_v, "current": self.current_a}
+        reading |= {} if self.temperature_c is None else {"temperature": self.temperature_c}
+        reading |= {"cells": self.cells_v} if self.cells_v else {}
+        return json.dumps(reading).encode() + b"\n"
 
 
 @dataclass
-class Told:
-    """What came of a replay."""
+class ReplayResult:
+    """Changes of alarms, snapshots and saved alarms of a replay."""
 
     changes: list[Change] = field(default_factory=list)
     snapshots: list[Snapshot] = field(default_factory=list)
-    kept: str = ""
+    saved_state: str = ""
 
-    def turns(self, name: str) -> list[tuple[float, bool]]:
-        """When an alarm was raised and when it ended, in seconds of the capture."""
-        turns = [change for change in self.changes if change.alarm.name == name and change.turn == "active"]
-        return [(round(change.at_s, 3), change.alarm.active) for change in turns]
+    def transitions(self, name: str) -> list[tuple[float, bool]]:
+        """Return the times at which an alarm was raised (True) and cleared (False), in seconds of the capture."""
+        changes = [change for change in self.changes if change.alarm.name == name and change.field == "active"]
+        return [(round(change.at_s, 3), change.alarm.active) for change in changes]
 
     def watched(self, name: str) -> list[tuple[float, bool]]:
-        """When an alarm could no longer be watched and when it could again, in seconds of the capture."""
-        turns = [change for change in self.changes if change.alarm.name == name and change.turn == "watched"]
-        return [(round(change.at_s, 3), change.alarm.watched) for change in turns]
+        """Return the times at which an alarm could be watched again (True) and no longer (False), in seconds of the capture."""
+        changes = [change for change in self.changes if change.alarm.name == name and change.field == "watched"]
+        return [(round(change.at_s, 3), change.alarm.watched) for change in changes]
 
 
 def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
-    """A raw capture of these lines."""
+    """Write a raw capture of these lines."""
     arrival_s = 100.0
     header = header_of(settings().sensor)
     writer = CaptureWriter(path, header)
@@ -75,41 +75,41 @@ def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
 
 
 def settings(alarms: dict[str, Any] | None = None, **sections: Any) -> Settings:
-    """Of a board that prints text."""
+    """Return settings of a board that prints text."""
     tables = {"sensor": {"protocol": "text"}, "pack": {"initial_soc": 0.5}, "alarms": alarms or {}}
     return Settings.model_validate(tables | sections)
 
 
 async def replayed(
     path: Path,
-    told: Settings,
+    settings_: Settings,
     cell: CellModel = PACK,
-    kept: str = "",
+    saved_state: str = "",
     *,
     at_once: bool = False,
     begin_s: float = WALL_S,
-) -> Told:
-    """The capture through estimator and publisher, whose clocks are the capture's.
+) -> ReplayResult:
+    """Replay a capture through estimator and publisher with the clock of the capture.
 
     Args:
         path: The capture.
-        told: The pack's settings.
+        settings_: The pack's settings.
         cell: The pack.
-        kept: Alarms of a run before.
-        begin_s: Wall clock at its begin [s since 1970].
-        at_once: As few and long blocks as the capture has; else each sample as it came.
+        saved_state: Alarms of a run before.
+        begin_s: Wall clock at the start of the capture [s since 1970].
+        at_once: True: the blocks are as long as the capture allows. False: one sample a block.
     """
-    now_s, result, sink = 0.0, Told(), Collector()
-    source = Replay(open_capture(path, told.sensor), longest_s=math.inf if at_once else 0.05)
-    estimator = new_estimator(told, cell)
+    now_s, result, sink = 0.0, ReplayResult(), Collector()
+    source = Replay(open_capture(path, settings_.sensor), longest_s=math.inf if at_once else 0.05)
+    estimator = new_estimator(settings_, cell)
     clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
     publisher = Publisher(
-        told, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
+        settings_, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
     )
-    publisher.watch.alarms.restore(kept)
+    publisher.alarm_monitor.alarms.restore(saved_state)
     async for block in source:
         now_s = float(block["time_s"][-1])
         publisher.add(block, estimator.run(block))
     publisher.publish_last()
-    result.snapshots, result.kept = sink.snapshots, publisher.watch.alarms.kept
+    result.snapshots, result.saved_state = sink.snapshots, publisher.alarm_monitor.alarms.saved_state
     return result

@@ -22,7 +22,7 @@ from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarm_state import AlarmState
 from bms_estimator.telemetry.alarms import AlarmEvaluator, SampleCounts
-from tests.telemetry.alarm_captures import PACK, WALL_S, Line, Told, record, replayed, settings
+from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, record, replayed, settings
 
 NAN = math.nan
 GOOD_CELLS = (3.70, 3.70)
@@ -81,27 +81,27 @@ def test_there_is_a_capture_of_each_alarm() -> None:
 async def test_each_alarm_is_raised_and_ends_on_a_capture(name: str, tmp_path: Path) -> None:
     lines, sections, expected = CAPTURES[name]
     latched = len(expected) == 1
-    told = await replayed(record(tmp_path / "capture.bms", lines), settings(**sections))
-    turns = told.turns(name)
-    assert [active for _, active in turns] == [active for _, active in expected]
-    for (at_s, _), (expected_s, _) in zip(turns, expected, strict=True):
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings(**sections))
+    transitions = result.transitions(name)
+    assert [active for _, active in transitions] == [active for _, active in expected]
+    for (at_s, _), (expected_s, _) in zip(transitions, expected, strict=True):
         assert expected_s in (0.0, at_s)
     raised = next(
-        alarm for snapshot in told.snapshots for alarm in snapshot.alarms if alarm.name == name and alarm.since
+        alarm for snapshot in result.snapshots for alarm in snapshot.alarms if alarm.name == name and alarm.since
     )
     assert raised.active
     assert raised.text
-    last = next(alarm for alarm in told.snapshots[-1].alarms if alarm.name == name)
+    last = next(alarm for alarm in result.snapshots[-1].alarms if alarm.name == name)
     assert (last.active, last.latched, bool(last.text)) == (latched, latched, latched)
 
 
-async def test_no_alarm_is_raised_by_a_pack_that_is_well_and_none_is_shown_of_what_is_not_measured(
+async def test_a_healthy_pack_raises_no_alarm_and_unmeasured_quantities_show_none(
     tmp_path: Path,
 ) -> None:
     lines = [Line(60, current_a=5.0, temperature_c=None), Line(60, current_a=-5.0, temperature_c=None)]
-    told = await replayed(record(tmp_path / "capture.bms", lines), settings())
-    assert told.changes == []
-    shown = {alarm.name for alarm in told.snapshots[-1].alarms}
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert result.changes == []
+    shown = {alarm.name for alarm in result.snapshots[-1].alarms}
     assert set(ALARMS) - shown == {
         "hook_failed",
         "cell_over_voltage",
@@ -113,124 +113,124 @@ async def test_no_alarm_is_raised_by_a_pack_that_is_well_and_none_is_shown_of_wh
     }
 
 
-async def test_an_over_current_of_200_ms_is_seen_and_published_once_though_it_is_over(tmp_path: Path) -> None:
+async def test_an_over_current_of_200_ms_is_published_once_after_it_has_ended(tmp_path: Path) -> None:
     rule = {"delay_s": 0.0, "clear_delay_s": 0.0, "latch": False}
     path = record(tmp_path / "capture.bms", [Line(5), Line(0.2, current_a=60.0), Line(5)], period_s=0.1)
-    told = await replayed(path, settings({"discharge_over_current": rule}))
-    turns = told.turns("discharge_over_current")
-    assert [active for _, active in turns] == [True, False]
-    shown = [a.active for s in told.snapshots for a in s.alarms if a.name == "discharge_over_current"]
+    result = await replayed(path, settings({"discharge_over_current": rule}))
+    transitions = result.transitions("discharge_over_current")
+    assert [active for _, active in transitions] == [True, False]
+    shown = [a.active for s in result.snapshots for a in s.alarms if a.name == "discharge_over_current"]
     assert True in shown
     assert not shown[-1]
-    named = [event.name for before, after in itertools.pairwise(told.snapshots) for event in events(before, after)]
+    named = [event.name for before, after in itertools.pairwise(result.snapshots) for event in events(before, after)]
     assert [name for name in named if name.startswith("alarm")] == ["alarm_raised", "alarm_cleared"]
 
 
-async def test_however_a_capture_is_cut_into_blocks_the_same_is_raised_at_the_same_time(tmp_path: Path) -> None:
+async def test_alarms_do_not_depend_on_the_size_of_blocks(tmp_path: Path) -> None:
     path = record(tmp_path / "capture.bms", CAPTURES["pack_under_voltage"][0])
-    told = await replayed(path, settings())
+    result = await replayed(path, settings())
     again = await replayed(path, settings(), at_once=True)
-    assert _named(again) == _named(told) != []
+    assert _named(again) == _named(result) != []
 
 
-def _named(told: Told) -> list[tuple[float, str, bool]]:
-    return [(change.at_s, change.alarm.name, change.alarm.active) for change in told.changes]
+def _named(result: ReplayResult) -> list[tuple[float, str, bool]]:
+    return [(change.at_s, change.alarm.name, change.alarm.active) for change in result.changes]
 
 
 def _values(state: AlarmState, *values: float, step_s: float = 1.0, begin_s: float = 0.0) -> list[tuple[float, bool]]:
-    """When it is raised and ends, of values each ``step_s``."""
+    """Return the times at which values at intervals of ``step_s`` raise (True) and clear (False) the alarm."""
     times_s = begin_s + step_s * np.arange(len(values))
     steps_s = np.full(len(values), step_s)
-    return [(turn.at_s, turn.raising is not None) for turn in state.take(times_s, steps_s, np.array(values), WALL_S)]
+    return [(each.at_s, each.raised is not None) for each in state.take(times_s, steps_s, np.array(values), WALL_S)]
 
 
-def _state(**told: Any) -> AlarmState:
-    rule = {"severity": "warning", "unit": "V", "above": True, "limit": 10.0, "clear": 8.0, "delay_s": 2.0}
-    return AlarmState(
-        AlarmDefinition(**{"name": "pack_over_voltage", "clear_delay_s": 3.0, "latch": False, **rule, **told})
-    )
+def _state(**changes: Any) -> AlarmState:
+    rule = {"severity": "warning", "limit": 10.0, "clear": 8.0, "delay_s": 2.0, "clear_delay_s": 3.0, "latch": False}
+    return AlarmState(AlarmDefinition(**{"name": "pack_over_voltage", **rule, **changes}))
 
 
 @pytest.mark.parametrize(
-    ("values", "turns"),
+    ("values", "transitions"),
     [
-        ([9.9, 10.0, 10.0, 10.0, 9.0], [(3.0, True)]),  # reached is enough, for the whole delay
-        ([10.0, 10.0, 9.99, 10.0, 10.0, 9.0], []),  # the delay begins anew
-        ([11.0] * 3 + [8.0] * 9, [(2.0, True)]),  # back at clear is not back beyond it
+        ([9.9, 10.0, 10.0, 10.0, 9.0], [(3.0, True)]),  # a value equal to the limit counts
+        ([10.0, 10.0, 9.99, 10.0, 10.0, 9.0], []),  # a value below the limit restarts the delay
+        ([11.0] * 3 + [8.0] * 9, [(2.0, True)]),  # a value equal to the clear level does not end the alarm
         ([11.0] * 3 + [7.9] * 3 + [8.0] + [7.9] * 4, [(2.0, True), (10.0, False)]),
-        ([11.0, 11.0, NAN, NAN, 11.0, 11.0], [(4.0, True)]),  # what was not measured adds nothing and ends nothing
+        ([11.0, 11.0, NAN, NAN, 11.0, 11.0], [(4.0, True)]),  # NaN adds nothing to the delay and does not restart it
         ([11.0] * 3 + [NAN] * 20, [(2.0, True)]),
         ([NAN] * 5, []),
     ],
 )
-def test_limit_clear_and_delays_at_their_edges(values: list[float], turns: list[tuple[float, bool]]) -> None:
-    assert _values(_state(), *values) == turns
-    below = _state(above=False, limit=-10.0, clear=-8.0)
-    assert _values(below, *(-value for value in values)) == turns
+def test_limit_clear_level_and_delays_at_their_bounds(
+    values: list[float], transitions: list[tuple[float, bool]]
+) -> None:
+    assert _values(_state(), *values) == transitions
+    below = _state(name="pack_under_voltage", limit=-10.0, clear=-8.0)
+    assert _values(below, *(-value for value in values)) == transitions
 
 
-def test_how_values_are_cut_changes_nothing() -> None:
+def test_transitions_do_not_depend_on_how_values_are_split_into_blocks() -> None:
     values = [11.0, 11.0, 9.0, 11.0, 11.0, 11.0, NAN, 7.0, 7.0, 7.0, 7.0, 11.0]
     state = _state()
-    one_by_one = [turn for i, value in enumerate(values) for turn in _values(state, value, begin_s=float(i))]
+    one_by_one = [each for i, value in enumerate(values) for each in _values(state, value, begin_s=float(i))]
     assert one_by_one == _values(_state(), *values) == [(5.0, True), (10.0, False)]
 
 
-def test_no_delay_and_no_hysteresis_are_one_turn_for_each_side() -> None:
+def test_without_delay_and_hysteresis_each_crossing_is_a_transition() -> None:
     state = _state(clear=10.0, delay_s=0.0, clear_delay_s=0.0)
     assert _values(state, 9.0, 10.0, 9.9, 10.0) == [(1.0, True), (2.0, False), (3.0, True)]
 
 
-def test_one_that_latches_waits_until_somebody_knows_and_comes_again_unless_it_is_known() -> None:
+def test_a_latched_alarm_ends_only_after_it_was_acknowledged() -> None:
     state = _state(latch=True, delay_s=0.0, clear_delay_s=0.0)
     assert _values(state, 11.0, 7.0) == [(0.0, True)]
     assert state.cause_cleared
-    assert _values(state, 11.0) == []  # it never ended
+    assert _values(state, 11.0) == []  # the alarm has not ended
     assert not state.cause_cleared
-    assert not state.acknowledge(), "the cause is there"
+    assert not state.acknowledge(), "the cause is still there"
     assert _values(state, 7.0) == [(0.0, False)]
     assert not state.acknowledge()
-    assert _values(state, 11.0, 7.0) == [(0.0, True)], "nobody knows of this one"
+    assert _values(state, 11.0, 7.0) == [(0.0, True)], "an earlier acknowledgment does not count"
     assert state.acknowledge()
-    assert state.raising is None
+    assert state.raised is None
 
 
-async def test_a_gap_between_samples_counts_for_no_delay_and_slow_sampling_is_no_gap(tmp_path: Path) -> None:
+async def test_a_gap_does_not_count_toward_a_delay_and_slow_sampling_is_no_gap(tmp_path: Path) -> None:
     rule = {"over_temperature": {"delay_s": 25.0}, "link_lost": {"enabled": False}}
     hot = Line(20, temperature_c=70.0)
     lines = [Line(5), hot, hot._replace(silent=True), hot._replace(seconds=10)]
-    told = await replayed(record(tmp_path / "gap.bms", lines), settings(rule))
-    assert told.turns("over_temperature") == [(51.0, True)]  # 19 s, nothing, then 6 s
+    result = await replayed(record(tmp_path / "gap.bms", lines), settings(rule))
+    assert result.transitions("over_temperature") == [(51.0, True)]  # 19 s, nothing, then 6 s
     slow = [Line(50), Line(80, temperature_c=70.0)]
-    told = await replayed(record(tmp_path / "slow.bms", slow, period_s=10.0), settings(rule))
-    assert told.turns("over_temperature") == [(80.0, True)]
+    result = await replayed(record(tmp_path / "slow.bms", slow, period_s=10.0), settings(rule))
+    assert result.transitions("over_temperature") == [(80.0, True)]
 
 
-async def test_what_latches_outlives_a_restart(tmp_path: Path) -> None:
+async def test_a_latched_alarm_survives_a_restart(tmp_path: Path) -> None:
     before = await replayed(record(tmp_path / "one.bms", CAPTURES["pack_over_voltage"][0]), settings())
-    assert '"pack_over_voltage"' in before.kept
+    assert '"pack_over_voltage"' in before.saved_state
     well = record(tmp_path / "two.bms", [Line(30)])
-    after = await replayed(well, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    after = await replayed(well, settings(), saved_state=before.saved_state, begin_s=WALL_S + 1000.0)
     first, last = (next(a for a in s.alarms if a.active) for s in (after.snapshots[0], after.snapshots[-1]))
     assert (first, last.since, last.latched) == (last, first.since, True)
     assert after.changes == []
     named = [event.name for event in events(None, after.snapshots[0])]
-    assert "alarm_raised" not in named, "the run before has told of it"
-    off = await replayed(well, settings({"pack_over_voltage": {"latch": False}}), kept=before.kept)
+    assert "alarm_raised" not in named, "the run before has result of it"
+    off = await replayed(well, settings({"pack_over_voltage": {"latch": False}}), saved_state=before.saved_state)
     assert not any(alarm.active for alarm in off.snapshots[-1].alarms)
 
 
-async def test_what_is_raised_outlives_a_restart_and_ends_where_it_would_have_ended(tmp_path: Path) -> None:
+async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_path: Path) -> None:
     low = record(tmp_path / "one.bms", [Line(30), Line(20, voltage_v=5.3)])
     before = await replayed(low, settings())
     better = record(tmp_path / "two.bms", [Line(30, voltage_v=5.7), Line(60)])  # above its limit, below where it ends
-    after = await replayed(better, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    after = await replayed(better, settings(), saved_state=before.saved_state, begin_s=WALL_S + 1000.0)
     assert after.snapshots[0].alarms != ()
-    assert after.turns("pack_under_voltage") == [(60.0, False)]
-    assert json.loads(after.kept).keys() & {"pack_under_voltage"} == set()
+    assert after.transitions("pack_under_voltage") == [(60.0, False)]
+    assert json.loads(after.saved_state).keys() & {"pack_under_voltage"} == set()
 
 
-async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
+async def test_a_saturated_current_exceeds_any_limit() -> None:
     alarms = AlarmEvaluator(
         watched(settings({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}}), PACK),
         0.2,
@@ -248,19 +248,19 @@ async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
     assert change.alarm.since == iso_utc(WALL_S)
 
 
-def test_silence_that_is_back_is_the_cause_of_a_latched_link_lost_again() -> None:
+def test_a_second_silence_renews_the_cause_of_a_latched_link_lost() -> None:
     alarms = AlarmEvaluator(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     kept = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
     alarms.restore(json.dumps({"link_lost": kept}))
     alarms.on_silence(1.0, WALL_S, "")
-    assert json.loads(alarms.kept)["link_lost"]["gone"]
+    assert json.loads(alarms.saved_state)["link_lost"]["gone"]
     alarms.on_silence(1000.0, WALL_S, "")
-    assert json.loads(alarms.kept)["link_lost"] == kept | {"gone": False}
+    assert json.loads(alarms.saved_state)["link_lost"] == kept | {"gone": False}
     assert alarms.acknowledge(None) == ["link_lost"]
-    assert alarms.active == ("link_lost",), "the cause is there"
+    assert alarms.active == ("link_lost",), "the cause is still there"
 
 
-def test_an_alarm_that_was_kept_with_a_value_that_is_none_is_refused() -> None:
+def test_a_saved_alarm_with_an_invalid_value_is_rejected() -> None:
     alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     kept = {"since_s": WALL_S, "value": math.inf, "gone": False, "acknowledged": False}
     with pytest.raises(ValueError, match="pack_over_voltage: value = inf"):
@@ -274,23 +274,23 @@ def test_an_alarm_that_was_kept_with_a_value_that_is_none_is_refused() -> None:
         ({"soc_low": {"clear": 0.05}}, r"soc_low\.clear = 0\.05: must not be below limit = 0\.1"),
     ],
 )
-def test_an_alarm_that_would_end_where_it_is_raised_is_refused(alarms: dict[str, Any], reason: str) -> None:
+def test_a_clear_level_beyond_the_limit_is_rejected(alarms: dict[str, Any], reason: str) -> None:
     with pytest.raises(UserError, match=reason):
         watched(settings(alarms), PACK)
 
 
-def test_a_limit_that_the_pack_never_reaches_is_named() -> None:
+def test_a_limit_out_of_the_pack_s_range_is_reported() -> None:
     assert out_of_range(settings(), PACK) == []
     (line,) = out_of_range(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
     assert line.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 3.65 to 4.5 V")
 
 
-def test_limits_follow_chemistry_size_and_what_is_set() -> None:
+def test_limits_follow_from_chemistry_size_and_settings() -> None:
     lfp = {each.name: each for each in watched(settings(), load_cell("lfp", 100.0).pack(16, 2))}
     assert (lfp["pack_over_voltage"].limit, lfp["pack_over_voltage"].clear) == pytest.approx((58.4, 54.4))
     assert (lfp["discharge_over_current"].limit, lfp["charge_over_current"].limit) == (1000.0, 200.0)
-    told = {"pack_over_voltage": {"limit_v": 57.6}, "cell_imbalance": {"enabled": False}}
-    told_of = {each.name: each for each in watched(settings(told), load_cell("lfp", 100.0).pack(16, 2))}
+    result = {"pack_over_voltage": {"limit_v": 57.6}, "cell_imbalance": {"enabled": False}}
+    told_of = {each.name: each for each in watched(settings(result), load_cell("lfp", 100.0).pack(16, 2))}
     assert told_of["pack_over_voltage"].clear == pytest.approx(53.6)
     assert told_of["pack_over_voltage"].latch
     assert "cell_imbalance" not in told_of
@@ -308,59 +308,62 @@ LOSSES = [
 
 
 @pytest.mark.parametrize(("lost", "word", "blind"), LOSSES)
-async def test_a_quantity_that_is_lost_raises_sensor_fault_after_ten_seconds_and_its_alarms_say_so(
+async def test_a_lost_quantity_raises_sensor_fault_after_ten_seconds_and_its_alarms_are_unwatched(
     lost: Line, word: str, blind: tuple[str, ...], tmp_path: Path
 ) -> None:
     lines = [CHARGED, lost, CHARGED._replace(seconds=60)]
-    told = await replayed(record(tmp_path / "capture.bms", lines), settings())
-    assert told.turns("sensor_fault") == [(40.0, True), (100.0, False)]  # measured again for 10 s, then its own 30 s
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert result.transitions("sensor_fault") == [
+        (40.0, True),
+        (100.0, False),
+    ]  # measured again for 10 s, then its own 30 s
     for name in blind:
-        assert told.watched(name) == [(40.0, False), (70.0, True)]
-    assert told.watched("pack_over_voltage") == []
-    shown = [{a.name: a for a in s.alarms} for s in told.snapshots]
+        assert result.watched(name) == [(40.0, False), (70.0, True)]
+    assert result.watched("pack_over_voltage") == []
+    shown = [{a.name: a for a in s.alarms} for s in result.snapshots]
     unwatched = [alarms[name] for alarms in shown for name in blind if not alarms[name].watched]
     assert {alarm.active for alarm in unwatched} == {False}
     assert all(word in (alarm.unwatched_reason or "") for alarm in unwatched)
     fault = next(alarms["sensor_fault"] for alarms in shown if alarms["sensor_fault"].active)
     assert all(name in fault.text for name in (word, *blind))
-    named = [e.name for before, after in itertools.pairwise(told.snapshots) for e in events(before, after)]
+    named = [e.name for before, after in itertools.pairwise(result.snapshots) for e in events(before, after)]
     assert {"alarm_raised", "alarm_unwatched", "alarm_watched", "alarm_cleared"} <= set(named)
 
 
-async def test_a_loss_shorter_than_the_delay_and_one_that_no_critical_alarm_needs_raise_nothing(tmp_path: Path) -> None:
+async def test_a_short_loss_and_a_loss_that_no_critical_alarm_needs_raise_nothing(tmp_path: Path) -> None:
     short = [CHARGED, CHARGED._replace(seconds=10, temperature_c=None), CHARGED]
     path = record(tmp_path / "short.bms", short)
     assert (await replayed(path, settings())).changes == []
-    told = await replayed(path, settings({"lost_s": 5.0}))
-    assert told.turns("sensor_fault")[:1] == [(35.0, True)]
+    result = await replayed(path, settings({"lost_s": 5.0}))
+    assert result.transitions("sensor_fault")[:1] == [(35.0, True)]
     warnings = {name: {"severity": "warning"} for name in ("over_temperature", "charging_below_freezing")}
     lines = [CHARGED, CHARGED._replace(temperature_c=None)]
-    told = await replayed(record(tmp_path / "warning.bms", lines), settings(warnings))
-    assert told.turns("sensor_fault") == []
-    assert told.watched("over_temperature") == [(40.0, False)]
+    result = await replayed(record(tmp_path / "warning.bms", lines), settings(warnings))
+    assert result.transitions("sensor_fault") == []
+    assert result.watched("over_temperature") == [(40.0, False)]
 
 
-async def test_a_quantity_that_comes_beside_few_samples_is_measured_again_after_a_loss(tmp_path: Path) -> None:
+async def test_a_rarely_measured_quantity_is_watched_again_after_a_loss(tmp_path: Path) -> None:
     rare = [CHARGED._replace(seconds=1), CHARGED._replace(seconds=4, temperature_c=None)]
     lines = [*rare * 6, CHARGED._replace(temperature_c=None), *rare * 8]
-    told = await replayed(record(tmp_path / "capture.bms", lines), settings())
-    assert told.watched("over_temperature") == [(36.0, False), (70.0, True)]
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert result.watched("over_temperature") == [(36.0, False), (70.0, True)]
 
 
 async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None:
     lines = [CHARGED, CHARGED._replace(temperature_c=None)]
     before = await replayed(record(tmp_path / "one.bms", lines), settings())
     without = record(tmp_path / "two.bms", [CHARGED._replace(temperature_c=None)])
-    after = await replayed(without, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    after = await replayed(without, settings(), saved_state=before.saved_state, begin_s=WALL_S + 1000.0)
     first = {alarm.name: alarm for alarm in after.snapshots[0].alarms}
     assert (first["sensor_fault"].active, first["over_temperature"].watched) == (True, False)
-    assert (after.turns("sensor_fault"), after.watched("over_temperature")) == ([], [])
+    assert (after.transitions("sensor_fault"), after.watched("over_temperature")) == ([], [])
     lost_meanwhile = await replayed(record(tmp_path / "three.bms", [CHARGED]), settings())
-    after = await replayed(without, settings(), kept=lost_meanwhile.kept, begin_s=WALL_S + 1000.0)
-    assert after.turns("sensor_fault") == [(10.0, True)]
+    after = await replayed(without, settings(), saved_state=lost_meanwhile.saved_state, begin_s=WALL_S + 1000.0)
+    assert after.transitions("sensor_fault") == [(10.0, True)]
 
 
-def test_without_samples_alarms_are_unwatched_until_some_come() -> None:
+def test_alarms_are_unwatched_during_silence() -> None:
     alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     block = np.zeros(1, dtype=SAMPLE)
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
@@ -375,33 +378,33 @@ def test_without_samples_alarms_are_unwatched_until_some_come() -> None:
         assert "over_temperature" not in shown, "it was never measured"
 
 
-def test_an_alarm_that_silence_kept_from_being_watched_is_so_over_a_restart_until_samples_come() -> None:
+def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_a_sample_arrives() -> None:
     before, after = (AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0) for _ in range(2))
     block = np.zeros(1, dtype=SAMPLE)
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     before.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
     before.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     before.on_silence(10.0, WALL_S, "no cable")
-    after.restore(before.kept)
+    after.restore(before.saved_state)
     after.on_silence(0.0, WALL_S, "")
     assert "pack_over_voltage" in after.unwatched, "no sample has come since the restart"
     after.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
     after.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     after.on_silence(0.0, WALL_S, "")
     changed = {change.alarm.name: change for change in after.changes()}
-    assert (changed["pack_over_voltage"].turn, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
+    assert (changed["pack_over_voltage"].field, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
     assert after.unwatched == ()
-    assert "silence" not in json.loads(after.kept)
+    assert "silence" not in json.loads(after.saved_state)
 
 
-def test_saved_quantities_that_are_damaged_are_refused() -> None:
+def test_damaged_saved_quantities_are_rejected() -> None:
     alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     with pytest.raises(ValueError, match="temperature: measured = 77"):
         alarms.restore(json.dumps({"inputs": {"temperature": [77, True]}}))
 
 
 @pytest.mark.parametrize("spacing_s", [0.0, 0.1, 1.0])
-def test_a_delay_counts_the_time_between_bursts_of_samples(spacing_s: float) -> None:
+def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: float) -> None:
     """Two samples at a time, twice a minute: over the limit from the fifth burst on."""
     rule = {"pack_over_voltage": {"delay_s": 10.0}}
     alarms = AlarmEvaluator(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
@@ -410,11 +413,11 @@ def test_a_delay_counts_the_time_between_bursts_of_samples(spacing_s: float) -> 
         block["time_s"], block["voltage_v"] = 30.0 * burst + np.array([0.0, spacing_s]), 8.6 if burst >= 4 else 7.4
         alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
         alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
-    turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
-    assert turns == [150.0], "the first burst after which it has been over the limit for 10 s"
+    transitions = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
+    assert transitions == [150.0], "the first burst after which it has been over the limit for 10 s"
 
 
-def test_a_gap_that_does_not_come_again_soon_counts_for_no_delay() -> None:
+def test_a_single_gap_does_not_count_toward_a_delay() -> None:
     rule = {"pack_over_voltage": {"delay_s": 25.0}}
     alarms = AlarmEvaluator(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     times_s = [*range(5), *range(25, 200), *range(220, 300)]
@@ -423,13 +426,13 @@ def test_a_gap_that_does_not_come_again_soon_counts_for_no_delay() -> None:
     block["voltage_v"] = np.where((block["time_s"] < 180.0) & (block["time_s"] > 10.0), 7.4, 8.6)
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
     alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
-    turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
-    assert turns == [226.0]  # 180 to 199 s, nothing for 20 s, then 6 s
+    transitions = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
+    assert transitions == [226.0]  # 180 to 199 s, nothing for 20 s, then 6 s
 
 
-async def test_a_sensor_that_comes_and_goes_delays_its_alarm_no_longer_than_one_that_stays(tmp_path: Path) -> None:
+async def test_an_intermittent_sensor_does_not_prolong_the_delay(tmp_path: Path) -> None:
     """A loose wire: one value in five seconds, which is not yet a lost sensor."""
     hot = [Line(1, temperature_c=61.0), Line(4, temperature_c=None)] * 4
-    told = await replayed(record(tmp_path / "capture.bms", [Line(30), *hot]), settings())
-    assert told.turns("over_temperature") == [(40.0, True)]
-    assert told.turns("sensor_fault") == []
+    result = await replayed(record(tmp_path / "capture.bms", [Line(30), *hot]), settings())
+    assert result.transitions("over_temperature") == [(40.0, True)]
+    assert result.transitions("sensor_fault") == []

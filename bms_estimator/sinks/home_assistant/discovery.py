@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, get_args
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import FRESH_PERIODS, Info
+from bms_estimator.settings.alarm_kinds import ALARM_KINDS
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.mqtt import Command
@@ -16,13 +17,7 @@ VALUES = "home_assistant"
 """Topic below the device's."""
 MIN_EXPIRY_S = 30
 """Home Assistant calls no value unavailable that is younger than this [s]."""
-ALARM_CLASSES = {
-    "soc_low": "battery",
-    "over_temperature": "heat",
-    "under_temperature": "cold",
-    "charging_below_freezing": "cold",
-}
-"""Device classes of alarms other than "problem"."""
+_ALARM_CLASSES: Mapping[str, str] = {name: kind.device_class for name, kind in ALARM_KINDS.items()}
 _SEES = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
 """A raised alarm stays on, although its quantity may be lost later."""
 NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
@@ -173,7 +168,7 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
         "json_attributes_template": "{{ {'reason': value_json.text, 'severity': value_json.severity} | tojson }}",
         "availability": [{"topic": f"{root}/availability"}, {"topic": topic, "value_template": _SEES}],
         "availability_mode": "all",
-        "device_class": ALARM_CLASSES.get(name, "problem"),
+        "device_class": _ALARM_CLASSES[name],
     }
 
 

@@ -1,0 +1,87 @@
+"""Table of the alarms: what each one measures, needs and advises."""
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+from bms_estimator.settings.alarms import AlarmName
+
+Quantity = Literal["voltage", "current", "temperature", "cells"]
+"""Measured quantity of a sample."""
+
+
+class AlarmKind(NamedTuple):
+    """Properties of an alarm that are the same for every pack."""
+
+    fault: str
+    """Description of the fault."""
+    remedy: str
+    """Advice to the user."""
+    needs: tuple[Quantity, ...] = ()
+    """Quantities without which the alarm cannot be watched; empty for alarms about the samples themselves."""
+    unit: str | None = None
+    """Unit of value and limit; None without one."""
+    is_upper_limit: bool = True
+    """True if the alarm is raised at or above its limit, False if at or below."""
+    device_class: str = "problem"
+    """Device class in Home Assistant."""
+
+
+ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
+    "pack_over_voltage": AlarmKind("the pack's voltage is too high", "stop charging", ("voltage",), "V"),
+    "pack_under_voltage": AlarmKind(
+        "the pack's voltage is too low", "take the load off, charge", ("voltage",), "V", is_upper_limit=False
+    ),
+    "cell_over_voltage": AlarmKind(
+        "a cell's voltage is too high", "stop charging, let the cells be balanced", ("cells",), "V"
+    ),
+    "cell_under_voltage": AlarmKind(
+        "a cell's voltage is too low", "take the load off, charge", ("cells",), "V", is_upper_limit=False
+    ),
+    "discharge_over_current": AlarmKind("the load takes too much current", "reduce it", ("current",), "A"),
+    "charge_over_current": AlarmKind("too much current goes into the pack", "reduce the charger's", ("current",), "A"),
+    "over_temperature": AlarmKind(
+        "the pack is too hot", "stop the current, let it cool", ("temperature",), "°C", device_class="heat"
+    ),
+    "under_temperature": AlarmKind(
+        "the pack is too cold",
+        "warm it before it is used",
+        ("temperature",),
+        "°C",
+        is_upper_limit=False,
+        device_class="cold",
+    ),
+    "charging_below_freezing": AlarmKind(
+        "the pack is charged while it freezes",
+        "stop charging: it plates lithium",
+        ("current", "temperature"),
+        "°C",
+        is_upper_limit=False,
+        device_class="cold",
+    ),
+    "soc_low": AlarmKind(
+        "little charge is left (SOC less its standard deviation)",
+        "charge",
+        ("voltage", "current"),
+        is_upper_limit=False,
+        device_class="battery",
+    ),
+    "stability_margin_low": AlarmKind(
+        "the SOC is close to where the model ends", "charge", ("voltage", "current"), is_upper_limit=False
+    ),
+    "cell_imbalance": AlarmKind(
+        "the cells' voltages differ", "let them be balanced, look for a weak one", ("cells",), "V"
+    ),
+    "sensor_fault": AlarmKind(
+        "samples are lost, cannot be used or come from two publishers",
+        "check sensors and wiring; topic health counts what is wrong",
+    ),
+    "model_mismatch": AlarmKind(
+        "measured and estimated voltage disagree",
+        "check that the cell file belongs to this pack",
+        ("voltage", "current"),
+        "V",
+    ),
+    "link_lost": AlarmKind("no samples come", "check board, cable and power", unit="s"),
+    "hook_failed": AlarmKind("an alarm hook could not do its work", "check its program; do by hand what it is for"),
+}
+"""All alarms by name."""
