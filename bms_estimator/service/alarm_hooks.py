@@ -1,4 +1,4 @@
-"""Actions taken when an alarm is raised, ends or can no longer be watched. Each hook has its own task; nothing waits for it."""
+"""Alarm hooks: actions when an alarm is raised or ends. Each hook runs in a task of its own and delays nothing else."""
 
 import asyncio
 import contextlib
@@ -19,26 +19,27 @@ from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms import Change
 
-WAITING = 100
-"""Maximum number of alarms waiting for a slow program; then the oldest is dropped."""
-RELAY_S, RETRY_S = 2.0, 0.5
-"""Maximum interval between two relay commands, because the board may have been reset or replaced, and retry interval
-of a refused one [s]."""
+MAX_JOBS = 100
+"""Maximum number of jobs that wait for a slow program; beyond it the oldest is dropped."""
+RELAY_S = 2.0
+"""Interval between two relay commands [s]. They are repeated because the board may have been reset or replaced."""
+RELAY_RETRY_S = 0.5
+"""Interval between attempts after a failed relay command [s]."""
 CLOSE_S = 2.0
 """Timeout of running hooks at shutdown [s]."""
 FIRST_RETRY_S = 0.5
-"""First pause before a program that could not be started is tried again [s]; doubles each time, up to half a minute."""
+"""First delay before a program that could not be started is tried again [s]. It doubles with each attempt, up to 30 s."""
 
 PublishRaw = Callable[[str, bytes], None]
-"""Publishes a message on a topic."""
+"""Publishes a payload on a topic."""
 SetRelay = Callable[[Relay], Awaitable[None]]
-"""Sends the level of the board's relay. Raises UserError when it does not take it."""
+"""Sends the level of the relay to the board. Raises UserError if the board does not confirm it."""
 
 log = structlog.get_logger(__name__)
 
 
 class Job(NamedTuple):
-    """One thing to be done by a hook."""
+    """One job of a hook: report a change of an alarm."""
 
     alarm: Alarm
     state: Literal["raised", "cleared"]
@@ -50,17 +51,17 @@ class AlarmHooks:
     Args:
         hooks: Configured hooks.
         device: Name of the pack.
-        say: Publishes a message; None: there is no broker.
-        switch: Switches the relay; None: the source has none.
+        publish: Publishes a message; None without a broker.
+        set_relay: Switches the relay; None without a relay.
 
     Raises:
         UserError: A hook needs something that is missing.
     """
 
     def __init__(
-        self, hooks: Sequence[AlarmHook], device: str, say: PublishRaw | None, switch: SetRelay | None
+        self, hooks: Sequence[AlarmHook], device: str, publish: PublishRaw | None, set_relay: SetRelay | None
     ) -> None:
-        self._hooks = [_made(i, hook, device, say, switch) for i, hook in enumerate(hooks)]
+        self._hooks = [_make_hook(i, hook, device, publish, set_relay) for i, hook in enumerate(hooks)]
         self._tasks: list[asyncio.Task[None]] = []
 
     @property
@@ -71,7 +72,7 @@ class AlarmHooks:
         return HookHealth(
             done=sum(hook.done for hook in self._hooks),
             failures=sum(hook.failures for hook in self._hooks),
-            failing=[f"{hook.what}: {hook.trouble}" for hook in self._hooks if hook.trouble],
+            failing=[f"{hook.description}: {hook.error}" for hook in self._hooks if hook.error],
         )
 
     def on_alarm_change(self, change: Change) -> None:
@@ -81,10 +82,10 @@ class AlarmHooks:
                 hook.on_alarm_change(change)
 
     def restore_active(self, alarms: Sequence[Alarm]) -> None:
-        """Take over alarms of an earlier run.
+        """Restore the alarms of an earlier run.
 
-        Their jobs have been done, but the relay must be as it was. If a hook had failed, all jobs are done again: one that
-        could not be done would be lost.
+        Their jobs are not repeated, but the relay gets its level. If a hook had failed in the earlier run, all jobs are
+        repeated, so that none is lost.
         """
         raised = {alarm.name for alarm in alarms if _counts_as_raised(alarm)}
         if "hook_failed" not in raised:
@@ -102,7 +103,7 @@ class AlarmHooks:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Let running programs end within ``CLOSE_S``."""
+        """Wait up to ``CLOSE_S`` for running programs."""
         for hook in self._hooks:
             hook.close()
         if self._tasks:
@@ -113,29 +114,29 @@ class AlarmHooks:
 
 
 class _Hook:
-    """One hook, which does its jobs one after the other.
+    """One hook, which runs its jobs one after the other.
 
     Attributes:
-        done: Jobs done since start.
-        failures: Failed attempts since start.
-        trouble: Reason why the last attempt failed; empty if it did not.
+        done: Number of completed jobs since start.
+        failures: Number of failed attempts since start.
+        error: Reason why the last attempt failed; empty after a success.
     """
 
     def __init__(self, hook: AlarmHook, device: str) -> None:
         self._hook, self._device = hook, device
-        self.done, self.failures, self.trouble = 0, 0, ""
+        self.done, self.failures, self.error = 0, 0, ""
         self._raised: set[str] = set()
-        self._waiting: deque[Job] = deque(maxlen=WAITING)
+        self._jobs: deque[Job] = deque(maxlen=MAX_JOBS)
         self._wake = asyncio.Event()
         self._closing = False
 
     @property
-    def what(self) -> str:
-        """Short description. A program's arguments are left out, since they may hold secrets."""
+    def description(self) -> str:
+        """Short description, without the arguments of a program, which may hold secrets."""
         raise NotImplementedError
 
     def covers(self, name: str) -> bool:
-        """Return whether an alarm is one of this hook's. ``hook_failed`` must be listed."""
+        """Return True if the hook is for this alarm. ``hook_failed`` must be listed by name."""
         return name in self._hook.alarms if self._hook.alarms else name != "hook_failed"
 
     def on_alarm_change(self, change: Change) -> None:
@@ -143,47 +144,47 @@ class _Hook:
         job = self._job(change)
         if job is None or job.state not in self._hook.on:
             return
-        if len(self._waiting) == WAITING:
-            log.warning("an alarm hook is behind: its oldest alarm is left out", hook=self.what)
-        self._waiting.append(job)
+        if len(self._jobs) == MAX_JOBS:
+            log.warning("an alarm hook is too slow: its oldest job is dropped", hook=self.description)
+        self._jobs.append(job)
 
     def restore_active(self, raised: Collection[str]) -> None:
-        """Take over alarms of an earlier run."""
+        """Restore the alarms of an earlier run."""
         self._raised = {name for name in raised if self.covers(name)}
 
     def close(self) -> None:
-        """End: no more alarms follow."""
+        """End after the jobs that wait."""
         self._closing = True
         self._wake.set()
 
     async def supervise(self) -> None:
-        """Do all jobs until it is closed. An internal error must not end the hook; it is logged and counted."""
+        """Run jobs until the hook is closed. An internal error is logged and counted and does not end the hook."""
         while True:
             try:
                 return await self.work()
             except Exception as error:
-                self.failures, self.trouble = self.failures + 1, f"internal error: {error!r}"
-                log.exception("alarm hook: internal error", hook=self.what)
+                self.failures, self.error = self.failures + 1, f"internal error: {error!r}"
+                log.exception("alarm hook: internal error", hook=self.description)
                 await asyncio.sleep(FIRST_RETRY_S)
 
     async def work(self) -> None:
-        """Do all jobs until it is closed."""
-        while not self._closing or self._waiting:
+        """Run jobs until the hook is closed."""
+        while not self._closing or self._jobs:
             await self._wake.wait()
             if not self._closing:
                 self._wake.clear()
-            while self._waiting:
-                job = self._waiting.popleft()
+            while self._jobs:
+                job = self._jobs.popleft()
                 if self._hook.dry_run:
-                    log.warning("alarm hook, dry run", would=self.what, alarm=job.alarm.name, state=job.state)
+                    log.warning("alarm hook, dry run", would=self.description, alarm=job.alarm.name, state=job.state)
                 else:
-                    await self._do(job)
+                    await self._run_job(job)
 
-    async def _do(self, job: Job) -> None:
+    async def _run_job(self, job: Job) -> None:
         raise NotImplementedError
 
     def _job(self, change: Change) -> Job | None:
-        """Note a change. Return the job that follows, if one does."""
+        """Record a change of an alarm. Return its job, or None if nothing changes for the hook."""
         alarm = change.alarm
         is_raised = _counts_as_raised(alarm)
         if is_raised == (alarm.name in self._raised):
@@ -193,40 +194,40 @@ class _Hook:
         return Job(alarm, "raised" if is_raised else "cleared")
 
     def _is_due(self, job: Job) -> bool:
-        """Return whether a job must still be done: the hook is open and the alarm's state has not changed."""
+        """Return True if a job is still needed: the hook is open and the alarm's state has not changed."""
         return not self._closing and (job.alarm.name in self._raised) == (job.state == "raised")
 
     def _succeed(self) -> None:
         self.done += 1
-        self.trouble = ""
+        self.error = ""
 
-    def _fail(self, job: Job, trouble: str) -> None:
+    def _fail(self, job: Job, error: str) -> None:
         """Count a failure. A failed job for ``hook_failed`` does not raise ``hook_failed`` again: that would never end."""
         self.failures += 1
         if job.alarm.name != "hook_failed":
-            self.trouble = trouble
+            self.error = error
 
 
 def _counts_as_raised(alarm: Alarm) -> bool:
-    """Return true for a raised alarm, and for a critical one that cannot be watched: that is the safe side."""
+    """Return True for a raised alarm, and to be safe for a critical alarm that cannot be watched."""
     return alarm.active or (alarm.severity == "critical" and not alarm.watched)
 
 
 class _CommandHook(_Hook):
-    """Runs a program: the alarm as JSON on its standard input, its fields in the environment."""
+    """Runs a program with the alarm as JSON on its standard input and with the fields of the alarm in its environment."""
 
     @property
-    def what(self) -> str:
-        """The program."""
+    def description(self) -> str:
+        """Description with the name of the program."""
         return f"run {(self._hook.run or ('',))[0]}"
 
-    async def _do(self, job: Job) -> None:
-        """Run the program; one that cannot be started is tried again until it starts or the alarm's state changes."""
-        pauses = Backoff(FIRST_RETRY_S)
+    async def _run_job(self, job: Job) -> None:
+        """Run the program. If it cannot be started, try again until it starts or the alarm's state changes."""
+        backoff = Backoff(FIRST_RETRY_S)
         while not await self._run(job):
-            await self._pause(job, pauses.next_s())
+            await self._pause(job, backoff.next_s())
             if not self._is_due(job):
-                log.warning("alarm hook: the program was never started", hook=self.what, alarm=job.alarm.name)
+                log.warning("alarm hook: the program was never started", hook=self.description, alarm=job.alarm.name)
                 return
 
     async def _pause(self, job: Job, pause_s: float) -> None:
@@ -246,14 +247,14 @@ class _CommandHook(_Hook):
             code = await run(self._hook.run or (), text, variables, timeout_s)
         except StartError as error:
             self._fail(job, f"cannot be started: {error}")
-            log.warning("alarm hook: the program cannot be started", hook=self.what, error=str(error))
+            log.warning("alarm hook: the program cannot be started", hook=self.description, error=str(error))
             return False
         if code is None:
             self._fail(job, f"took longer than {timeout_s:g} s")
-            log.warning("alarm hook: the program takes too long and is killed", hook=self.what)
+            log.warning("alarm hook: the program takes too long and is killed", hook=self.description)
         elif code:
             self._fail(job, f"exit code {code}")
-            log.warning("alarm hook: the program has failed", hook=self.what, exit_code=code)
+            log.warning("alarm hook: the program has failed", hook=self.description, exit_code=code)
         else:
             self._succeed()
         return True
@@ -262,38 +263,38 @@ class _CommandHook(_Hook):
 class _PublishHook(_Hook):
     """Publishes a message."""
 
-    def __init__(self, hook: AlarmHook, device: str, topic: str, say: PublishRaw) -> None:
+    def __init__(self, hook: AlarmHook, device: str, topic: str, publish: PublishRaw) -> None:
         super().__init__(hook, device)
-        self._topic, self._say = topic, say
+        self._topic, self._publish = topic, publish
 
     @property
-    def what(self) -> str:
-        """The topic."""
+    def description(self) -> str:
+        """Description with the topic."""
         return f"publish on {self._topic}"
 
-    async def _do(self, job: Job) -> None:
-        self._say(self._topic, Template(self._hook.payload).substitute(_values(job, self._device)).encode())
+    async def _run_job(self, job: Job) -> None:
+        self._publish(self._topic, Template(self._hook.payload).substitute(_values(job, self._device)).encode())
         self._succeed()
 
 
 class _RelayHook(_Hook):
     """Hook that keeps the board's relay at its level by repeated commands, because a reset releases it."""
 
-    def __init__(self, hook: AlarmHook, device: str, switch: SetRelay) -> None:
+    def __init__(self, hook: AlarmHook, device: str, set_relay: SetRelay) -> None:
         super().__init__(hook, device)
-        self._switch = switch
+        self._set_relay = set_relay
 
     @property
-    def what(self) -> str:
-        """The level."""
+    def description(self) -> str:
+        """Description with the level of the relay pin."""
         return f"relay pin {'high' if self._wanted.high else 'low'}"
 
     @property
     def _wanted(self) -> Relay:
         high = (self._hook.relay == "high") == bool(self._raised)
         silent = self._hook.level_when_silent
-        kept = silent == "keep"
-        return Relay(high, None if kept else silent == "high", 0 if kept else self._hook.silent_s)
+        stays = silent == "keep"
+        return Relay(high, None if stays else silent == "high", 0 if stays else self._hook.silent_s)
 
     def on_alarm_change(self, change: Change) -> None:
         """Follow the alarms regardless of the hook's ``on``.
@@ -303,35 +304,37 @@ class _RelayHook(_Hook):
         before = self._wanted
         job = self._job(change)
         if job is not None and self._wanted != before:
-            log.warning("relay", dry_run=self._hook.dry_run, hook=self.what, alarm=job.alarm.name, state=job.state)
+            log.warning(
+                "relay", dry_run=self._hook.dry_run, hook=self.description, alarm=job.alarm.name, state=job.state
+            )
 
     async def work(self) -> None:
-        """Set the level again and again until it is closed."""
+        """Send the level repeatedly until the hook is closed."""
         while not self._hook.dry_run and not self._closing:
             self._wake.clear()
             try:
-                await self._switch(self._wanted)
-                if self.trouble:
-                    log.info("the board takes its relay's level again", hook=self.what)
-                self.trouble = ""
+                await self._set_relay(self._wanted)
+                if self.error:
+                    log.info("the board accepts relay commands again", hook=self.description)
+                self.error = ""
             except UserError as error:
-                if str(error) != self.trouble:
-                    log.warning("the board does not take its relay's level", hook=self.what, reason=str(error))
-                self.failures, self.trouble = self.failures + 1, str(error)
+                if str(error) != self.error:
+                    log.warning("the board does not accept a relay command", hook=self.description, reason=str(error))
+                self.failures, self.error = self.failures + 1, str(error)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(RETRY_S if self.trouble else RELAY_S):
+                async with asyncio.timeout(RELAY_RETRY_S if self.error else RELAY_S):
                     await self._wake.wait()
 
 
-def unusable(settings: Settings) -> list[str]:
-    """One line for each hook without its program, and for each relay without a configured level for a silent service.
+def hook_warnings(settings: Settings) -> list[str]:
+    """Return one line for each hook whose program is missing, and for each relay without ``when_silent``.
 
     Raises:
-        UserError: A hook needs a broker or a relay that is not there.
+        UserError: A hook needs a missing broker or relay.
     """
     hooks = settings.alarms.hook
     AlarmHooks(
-        hooks, settings.pack.name, (lambda *_: None) if settings.mqtt else None, relay_of(settings, _switch_nothing)
+        hooks, settings.pack.name, (lambda *_: None) if settings.mqtt else None, relay_of(settings, _ignore_relay)
     )
     return [
         f"alarms.hook.{i}.run = {hook.run[0]}: no such program here, or it may not be run"
@@ -345,31 +348,31 @@ def unusable(settings: Settings) -> list[str]:
     ]
 
 
-def relay_of(settings: Settings, switch: SetRelay | None) -> SetRelay | None:
-    """``switch`` where the source has a relay: no device but the firmware's board has a pin for one."""
-    return switch if settings.sensor.protocol == "binary" else None
+def relay_of(settings: Settings, set_relay: SetRelay | None) -> SetRelay | None:
+    """Return ``set_relay`` if the source has a relay: only the firmware's board has a pin for one."""
+    return set_relay if settings.sensor.protocol == "binary" else None
 
 
-async def _switch_nothing(_: Relay) -> None:
+async def _ignore_relay(_: Relay) -> None:
     """Do nothing, for a pack without a board."""
 
 
-def _made(i: int, hook: AlarmHook, device: str, say: PublishRaw | None, switch: SetRelay | None) -> _Hook:
+def _make_hook(i: int, hook: AlarmHook, device: str, publish: PublishRaw | None, set_relay: SetRelay | None) -> _Hook:
     if hook.topic:
-        if say is None:
+        if publish is None:
             raise UserError(f"alarms.hook.{i}.topic = {hook.topic}: there is no broker; add the section [mqtt]")
-        return _PublishHook(hook, device, hook.topic, say)
+        return _PublishHook(hook, device, hook.topic, publish)
     if hook.relay:
-        if switch is None:
+        if set_relay is None:
             raise UserError(
                 f"alarms.hook.{i}.relay: only the board of [sensor] with protocol = 'binary' has a relay pin"
             )
-        return _RelayHook(hook, device, switch)
+        return _RelayHook(hook, device, set_relay)
     return _CommandHook(hook, device)
 
 
 def _values(job: Job, device: str) -> dict[str, str]:
-    """Fields for a program or a payload; empty where there is no value."""
+    """Return the fields for a program or a payload; a field without a value is empty."""
     alarm = job.alarm
     fields = {name: getattr(alarm, name) for name in ("name", "severity", "since", "value", "limit", "unit")}
     values = {name: "" if value is None else str(value) for name, value in fields.items()}

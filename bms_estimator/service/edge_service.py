@@ -1,4 +1,4 @@
-"""The service of a pack whose samples are only sent, for ``bms-estimator edge``."""
+"""Service that only sends the samples of a pack, for ``bms-estimator edge``."""
 
 import asyncio
 from pathlib import Path
@@ -20,8 +20,8 @@ from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import Source
 
 SOURCE_HUNG_S = 30.0
-"""Time without a run of a source's task after which it counts as hung [s]."""
-PAT_S = 5.0
+"""Time after which a source whose task has not run counts as hung [s]."""
+MAX_WATCHDOG_S = 5.0
 """Maximum interval between two watchdog notifications [s]."""
 REPORT_S = 3600.0
 """Interval between two log lines about the blocks [s]."""
@@ -37,11 +37,11 @@ async def serve_edge(
     Args:
         settings: The pack's settings, with ``[edge]``.
         folder: Folder of the blocks.
-        stop: Set by someone else to end as a signal does.
+        stop: Set by the caller to end, as a signal does.
         notifier: Is notified that the loop is ready and alive.
 
     Raises:
-        UserError: A setting that cannot be used.
+        UserError: A setting cannot be used.
     """
     if settings.edge is None:
         raise UserError('edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"')
@@ -70,15 +70,15 @@ async def _keep_alive(
     source: SerialSource | LineSource, edge: BlockSender, notifier: SystemdNotifier, name: str
 ) -> None:
     """Notify the watchdog while the source's task runs, and report the status."""
-    said = ""
+    sent_status = ""
     while True:
         if source.pulse().task_idle_s <= SOURCE_HUNG_S:
             notifier.alive(name)
         status = f"no samples: {source.message}" if source.message else f"{edge.store.waiting} blocks not sent"
-        if status != said:
+        if status != sent_status:
             notifier.status(name, status)
-            said = status
-        await asyncio.sleep(min(PAT_S, notifier.watchdog_s / 3.0 or PAT_S))
+            sent_status = status
+        await asyncio.sleep(min(MAX_WATCHDOG_S, notifier.watchdog_s / 3.0 or MAX_WATCHDOG_S))
 
 
 async def _report(edge: BlockSender) -> None:

@@ -1,8 +1,8 @@
-"""One run of a hook's program: its environment, its time limit, and the end of every process that it started.
+"""One run of a hook's program: environment, time limit, and termination of all processes that it started.
 
-Descendants are found by the program's session, by a random mark in their environment and by their parents. Only a process
-that has left the session, cleared its environment and lost its parent is not found; a transient systemd scope would find it,
-but needs rights on the system bus that the service does not have.
+Descendants are found by their session, by a random mark in their environment, and by their parents. A process that has left
+the session, cleared its environment and lost its parent is not found. A transient systemd scope would find it, but needs
+rights on the system bus that the service does not have.
 """
 
 import asyncio
@@ -14,14 +14,14 @@ import signal
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-PASSED = ("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "TZ", "TMPDIR")
-"""Environment variables of the service that every program gets, beside ``LC_*``. Others may hold secrets of the service."""
+INHERITED = ("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "TZ", "TMPDIR")
+"""Environment variables of the service that every program inherits, besides ``LC_*``. Others may hold secrets."""
 MARK = "BMS_HOOK_RUN"
 """Environment variable with a random value that marks all processes of one run."""
 POLL_S = 0.05
 """Interval between two searches for descendants [s]."""
 KILL_S = 5.0
-"""Time limit for killing: a process in a hanging system call ends later [s]."""
+"""Time limit for killing [s]. A process that hangs in a system call may end later."""
 
 
 class StartError(Exception):
@@ -29,14 +29,14 @@ class StartError(Exception):
 
 
 def environment(passed: Collection[str], fields: Mapping[str, str]) -> dict[str, str]:
-    """Environment of a program.
+    """Return the environment of a program.
 
     Args:
-        passed: Names of further variables of the service that it gets.
-        fields: Fields of the alarm; each becomes ``BMS_`` and its name in capitals. A null character in a foreign
-            text becomes a space, because no program can be started with it.
+        passed: Names of further variables of the service that it inherits.
+        fields: Fields of the alarm; each becomes a variable named ``BMS_`` and the name in capitals. A null character
+            becomes a space, because no program can be started with it.
     """
-    names = {*PASSED, *passed}
+    names = {*INHERITED, *passed}
     inherited = {name: value for name, value in os.environ.items() if name in names or name.startswith("LC_")}
     return inherited | {f"BMS_{name.upper()}": value.replace("\0", " ") for name, value in fields.items()}
 
@@ -48,13 +48,13 @@ async def run(command: Sequence[str], text: bytes, variables: Mapping[str, str],
         command: The program and its arguments.
         text: Standard input.
         variables: Environment.
-        timeout_s: All that still runs after this time is killed [s].
+        timeout_s: Time after which the program and its descendants are killed [s].
 
     Returns:
-        Exit code of the program; None if something was killed.
+        Exit code of the program; None if a process was killed.
 
     Raises:
-        StartError: It cannot be started.
+        StartError: The program cannot be started.
     """
     mark = secrets.token_hex(8)
     try:
@@ -72,7 +72,7 @@ async def run(command: Sequence[str], text: bytes, variables: Mapping[str, str],
     try:
         async with asyncio.timeout(timeout_s):
             await process.communicate(text)
-            while await _find(process.pid, entry) != []:  # noqa: ASYNC110 - no event tells of a grandchild's end
+            while await _find(process.pid, entry) != []:  # noqa: ASYNC110 - the end of a grandchild causes no event
                 await asyncio.sleep(POLL_S)
     except TimeoutError:
         return None
@@ -82,14 +82,14 @@ async def run(command: Sequence[str], text: bytes, variables: Mapping[str, str],
 
 
 async def _kill(process: asyncio.subprocess.Process, entry: bytes) -> None:
-    """Kill the program and its descendants that still run."""
+    """Kill the program and its descendants."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(KILL_S):
-            while (found := await _find(process.pid, entry)) != []:
-                if found is None and process.returncode is None:  # until then the number is that of its group
+            while (pids := await _find(process.pid, entry)) != []:
+                if pids is None and process.returncode is None:  # while the program runs, its id is that of its group
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.killpg(process.pid, signal.SIGKILL)
-                for pid in found or ():
+                for pid in pids or ():
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.kill(pid, signal.SIGKILL)
                 await asyncio.sleep(POLL_S)
@@ -97,7 +97,7 @@ async def _kill(process: asyncio.subprocess.Process, entry: bytes) -> None:
 
 
 async def _find(leader: int, entry: bytes) -> list[int] | None:
-    """Find the processes of a run; None if that is not possible now."""
+    """Return the processes of a run; None if they cannot be listed at the moment."""
     try:
         return await asyncio.to_thread(_processes, leader, entry)
     except (OSError, RuntimeError):  # no free descriptor, no further thread
@@ -105,10 +105,10 @@ async def _find(leader: int, entry: bytes) -> list[int] | None:
 
 
 def _processes(leader: int, entry: bytes) -> list[int]:
-    """Return processes in the session of ``leader`` whose environment has ``entry``, and their descendants.
+    """Return the processes in the session of ``leader`` or with ``entry`` in their environment, and their descendants.
 
     Raises:
-        OSError: No descriptor is free.
+        OSError: No file descriptor is free.
     """
     parents: dict[int, int] = {}
     found: set[int] = set()
@@ -118,7 +118,7 @@ def _processes(leader: int, entry: bytes) -> list[int]:
         pid = int(folder.name)
         try:
             state, parent, _group, session = (folder / "stat").read_text().rpartition(")")[2].split()[:4]
-            if state in "ZX":  # it has ended
+            if state in "ZX":  # ended
                 continue
             parents[pid] = int(parent)
             if int(session) == leader or entry in (folder / "environ").read_bytes().split(b"\0"):

@@ -1,4 +1,4 @@
-"""All kernels of a live run, called once before it begins, so that nothing compiles once samples arrive."""
+"""Kernel warm-up: calls all kernels of a live run once, so that nothing compiles after the first sample."""
 
 import gc
 
@@ -15,7 +15,7 @@ from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 
 CELL = "chen_mora"
-"""Any: kernels are the same for all."""
+"""Any cell file; the kernels are the same for all."""
 
 
 def load_kernels() -> None:
@@ -33,4 +33,4 @@ def load_kernels() -> None:
     make_parameters_payload(estimator, 0.0)
     remaining_charge(estimator, 0.0)
     gc.collect()
-    gc.freeze()  # numba's objects stay: to look through them again and again stops the loop for 100 ms each time
+    gc.freeze()  # a full garbage collection over numba's objects would stop the loop for 100 ms each time

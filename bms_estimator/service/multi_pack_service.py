@@ -1,4 +1,4 @@
-"""Several packs in one process: a board and a connection to the broker each, one event loop, one service to systemd."""
+"""Several packs in one process, which share the event loop; each has its own source and broker connection."""
 
 import asyncio
 from collections.abc import Sequence
@@ -15,24 +15,24 @@ from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
 
 
-async def serve_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
-    """Serve packs until SIGINT, SIGTERM or SIGHUP. When one service ends, all end, so that systemd restarts all of them.
+async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None:
+    """Run the services of several packs until SIGINT, SIGTERM or SIGHUP. If one ends, all end, so that systemd restarts all.
 
     Args:
-        packs: The settings of each pack, and the pack as one object.
+        packs: Settings and model of each pack.
 
     Raises:
-        UserError: A setting that cannot be used, with the pack's name before it; or two packs share a name or a port.
+        UserError: A setting cannot be used (the text begins with the pack's name), or two packs share a name or a port.
     """
     names = [settings.pack.name for settings, _ in packs]
-    _differ("pack.name", names)
+    _require_unique("pack.name", names)
     sensors = [settings.sensor for settings, _ in packs if settings.source is None]
-    _differ("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
-    _differ("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
-    _differ("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
+    _require_unique("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
+    _require_unique("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
+    _require_unique("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
     stop, notifier, pages = stop_on_signal(), SystemdNotifier(names), Pages()
 
-    async def serve_one(settings: Settings, cell: PackModel) -> None:
+    async def run_one(settings: Settings, cell: PackModel) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
             folder = state_folder(settings)
@@ -42,17 +42,17 @@ async def serve_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
         finally:
             stop.set()
 
-    results = await asyncio.gather(*(serve_one(*pack) for pack in packs), return_exceptions=True)
+    results = await asyncio.gather(*(run_one(*pack) for pack in packs), return_exceptions=True)
     for result in results:
         if isinstance(result, BaseException):
             raise result
 
 
-def _differ(key: str, values: Sequence[str]) -> None:
-    """Have each pack a value of its own.
+def _require_unique(key: str, values: Sequence[str]) -> None:
+    """Check that no two packs share a value.
 
     Raises:
-        UserError: Two have the same.
+        UserError: Two packs share a value.
     """
     for value in values:
         if values.count(value) > 1:

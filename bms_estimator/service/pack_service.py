@@ -1,4 +1,4 @@
-"""The service of one pack as ``bms-estimator run`` starts it: board, estimator, broker, checkpoint, signals."""
+"""Service of one pack, for ``bms-estimator run``: source, estimator, broker, checkpoint, signals."""
 
 import asyncio
 import contextlib
@@ -54,25 +54,25 @@ async def run_pack_service(
     """Run until SIGINT, SIGTERM or SIGHUP.
 
     Args:
-        settings: The pack's settings; with ``[mqtt]`` a broker is served.
+        settings: The pack's settings.
         cell: The pack as one object (``CellModel.pack``).
-        sinks: Further sinks, such as the console.
-        tap: Gets all that the source is decoded from, with its arrival times.
-        stop: Set by someone else to end as a signal does.
+        sinks: Further sinks, such as the terminal.
+        tap: Receives all bytes of the source with their arrival times.
+        stop: Set by the caller to end, as a signal does.
         folder: State folder (``state_folder``); None: the state is not saved.
         notifier: Is notified that the loop is ready and alive.
         pages: The live pages of this process.
 
     Returns:
-        The estimator as the last sample left it.
+        The estimator after the last sample.
 
     Raises:
-        UserError: A setting that cannot be used.
+        UserError: A setting cannot be used.
     """
     stop = stop_on_signal(stop)
     set_level(settings.pack.name, settings.log.level)
     for line in [*implausible_settings(settings, cell), *out_of_range(settings, cell)]:
-        log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
+        log.warning("implausible setting", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = DeliveryStats(store_trouble=lambda: database.reason) if database else DeliveryStats()
     all_sinks = [*sinks, *export_sinks(settings)]
@@ -83,7 +83,7 @@ async def run_pack_service(
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
-    say: PublishRaw | None = None
+    publish_raw: PublishRaw | None = None
     if settings.mqtt is not None:
         mqtt = MqttSink(
             settings.mqtt,
@@ -96,8 +96,8 @@ async def run_pack_service(
             alarms=[each.name for each in watched(settings, cell)],
         )
         all_sinks.append(mqtt)
-        say = mqtt.publish_raw
-    hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, say, relay_of(settings, source.relay))
+        publish_raw = mqtt.publish_raw
+    hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, publish_raw, relay_of(settings, source.relay))
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None
         all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
@@ -129,18 +129,18 @@ async def run_pack_service(
 
 
 def export_sinks(settings: Settings) -> list[Sink]:
-    """Return the sinks beside MQTT.
+    """Return the sinks for InfluxDB and Prometheus.
 
     Raises:
-        UserError: A file of the settings cannot be used.
-        ModuleNotFoundError: The optional package that one needs is not installed.
+        UserError: A file named in the settings cannot be used.
+        ModuleNotFoundError: An optional package is not installed.
     """
-    found: list[Sink] = [InfluxSink(settings.influx)] if settings.influx else []
+    sinks: list[Sink] = [InfluxSink(settings.influx)] if settings.influx else []
     if settings.prometheus:
         from bms_estimator.sinks.exports.prometheus import PrometheusSink  # noqa: PLC0415 - needs an optional package
 
-        found.append(PrometheusSink(settings.prometheus))
-    return found
+        sinks.append(PrometheusSink(settings.prometheus))
+    return sinks
 
 
 def recording_health(tap: ReadTap | None) -> RecordingHealth | None:

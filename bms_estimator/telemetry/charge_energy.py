@@ -1,4 +1,4 @@
-"""Charge and energy through the pack's terminals, counted in each direction."""
+"""Charge and energy through the terminals of the pack, counted separately for each direction."""
 
 from typing import NamedTuple, Self
 
@@ -11,7 +11,7 @@ from bms_estimator.model.payloads import Totals
 
 
 class ChargeEnergy(NamedTuple):
-    """Charge and energy through the terminals; no field ever decreases."""
+    """Charge and energy through the terminals. No field ever decreases."""
 
     charge_out_ah: float = 0.0
     charge_in_ah: float = 0.0
@@ -20,11 +20,11 @@ class ChargeEnergy(NamedTuple):
 
     @classmethod
     def of(cls, total: Totals) -> Self:
-        """Return the charge and energy part of ``total``."""
+        """Return charge and energy of ``total``."""
         return cls(*(getattr(total, name) for name in cls._fields))
 
     def plus_net(self, charge_as: float, energy_ws: float) -> "ChargeEnergy":
-        """And ``charge_as`` [A s] and ``energy_ws`` [W s], positive on discharge, each in the direction in which it went."""
+        """Return the sum with net ``charge_as`` [A s] and ``energy_ws`` [W s], positive on discharge, each added to its direction."""
         charge_ah, energy_kwh = charge_as / 3600.0, energy_ws / 3.6e6
         return ChargeEnergy(
             self.charge_out_ah + max(charge_ah, 0.0),
@@ -39,15 +39,15 @@ class ChargeEnergy(NamedTuple):
 
 
 class ChargeEnergyMeter:
-    """Counts what flows: straight between samples, nothing over a gap.
+    """Integrates current and power by the trapezoidal rule, and adds nothing over a gap.
 
-    Values are net between two readings of ``flow``, because current noise around zero must not count as energy out
-    and in.
+    Between two readings of ``flow`` the integral is net, so that current noise around zero does not count in both
+    directions.
 
     Args:
-        before: Counted by the runs before.
-        gap_s: A step longer than this is a gap, unless the one before was about as long [s]; as ``kernels.step.is_gap``.
-        sums: Shape (1,), dtype ``FLOW_SUMS``: external storage of the sums, if it is shared.
+        before: Charge and energy of the runs before.
+        gap_s: Minimum length of a gap, see ``kernels.step.is_gap`` [s].
+        sums: External storage of the sums, shape (1,), dtype ``FLOW_SUMS``; None: internal.
     """
 
     def __init__(self, before: ChargeEnergy, gap_s: float, sums: NDArray[np.void] | None = None) -> None:
@@ -56,16 +56,16 @@ class ChargeEnergyMeter:
         self.continue_from(before)
 
     def continue_from(self, flow: ChargeEnergy) -> None:
-        """Count on from ``flow`` and what the sums hold."""
+        """Continue from ``flow``; the sums are kept."""
         self._flow = flow
 
     def add(self, trace: TraceBlock) -> None:
-        """Take accepted samples; ``trace`` has shape (n,), dtype TRACE."""
+        """Add accepted samples; ``trace`` has shape (n,), dtype TRACE."""
         accumulate_charge_energy(self._sums, trace, self._gap_s)
 
     @property
     def flow(self) -> ChargeEnergy:
-        """All that has flowed."""
+        """Charge and energy so far."""
         s = self._sums[0]
         self._flow = self._flow.plus_net(float(s["charge_as"]), float(s["energy_ws"]))
         s["charge_as"] = s["energy_ws"] = 0.0

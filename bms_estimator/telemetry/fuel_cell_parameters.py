@@ -11,11 +11,11 @@ from bms_estimator.model.payloads import Parameter
 from bms_estimator.telemetry.state import finite
 
 VALID_STD = 0.3
-"""An element or parameter known better than this, relative, is identified."""
+"""Maximum relative std of an identified element or parameter."""
 
 
 def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parameter]:
-    """Return the values of ``[fuel_cell]`` as learned now, at the file's temperature.
+    """Return the learned values of the cell file's section ``[fuel_cell]``, at the temperature of the file.
 
     Args:
         estimator: Estimator of a fuel cell, after a sample; read only.
@@ -23,20 +23,20 @@ def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parame
     """
     a, covariance = estimator.state[0]["a"], ln_covariance(estimator)
     std = np.sqrt(np.diagonal(covariance))
-    found = {}
+    parameters = {}
     for j, name in enumerate(NAMES):
         if j == ACTIVATION:
-            found["exchange_current_a"] = _exchange_current(a, covariance, now_s)
+            parameters["exchange_current_a"] = _exchange_current(a, covariance, now_s)
         else:
-            found[name] = _learned(float(a[1 + j]), float(std[j]), now_s)
-    return found
+            parameters[name] = _learned(float(a[1 + j]), float(std[j]), now_s)
+    return parameters
 
 
 def ln_covariance(estimator: Estimator) -> np.ndarray:
-    """Covariance of the ln of the learned parameters, shape (n, n), from the remembered data and the bounds.
+    """Return the covariance of the logarithms of the learned parameters, shape (n, n).
 
-    Information is in V^2 s; the leakage is that of bounds that are one standard deviation wide. What the model itself lacks
-    is not in it.
+    It follows from the information of past data [V^2 s] plus a prior: the bounds of each parameter count as one standard
+    deviation. Errors of the model itself are not included.
     """
     m, q = estimator.record[0]["learning"], estimator.settings_record[0]["learning"]
     n = int(q["count"])
@@ -46,11 +46,11 @@ def ln_covariance(estimator: Estimator) -> np.ndarray:
 
 
 def _exchange_current(a: np.ndarray, covariance: np.ndarray, now_s: float) -> Parameter:
-    """e^(-a / A): its ln varies with those of a and A by -a / A and a / A."""
+    """Return the exchange current e^(-a / A). The derivatives of its logarithm by ln a and ln A are -a / A and a / A."""
     ln_i_0 = -float(a[1 + ACTIVATION] / a[1 + TAFEL])
-    along = np.zeros(covariance.shape[0])
-    along[ACTIVATION], along[TAFEL] = ln_i_0, -ln_i_0
-    return _learned(math.exp(ln_i_0), math.sqrt(along @ covariance @ along), now_s)
+    gradient = np.zeros(covariance.shape[0])
+    gradient[ACTIVATION], gradient[TAFEL] = ln_i_0, -ln_i_0
+    return _learned(math.exp(ln_i_0), math.sqrt(gradient @ covariance @ gradient), now_s)
 
 
 def _learned(value: float, ln_std: float, now_s: float) -> Parameter:

@@ -59,8 +59,8 @@ def suspicions(record: np.void, settings: np.void) -> list[str]:
     texts = {suspect: suspect.text for suspect in InputFault if suspect in suspects}
     if InputFault.TEMPERATURE in texts:
         low_c, high_c = float(settings["filter"]["low_c"]), float(settings["filter"]["high_c"])
-        known = f"{low_c:.0f} C" if low_c == high_c else f"{low_c:.0f} to {high_c:.0f} C"
-        numbers = f"no data at {float(record['filter']['temperature_c']):.0f} C, the cell file knows {known}"
+        file_range = f"{low_c:.0f} C" if low_c == high_c else f"{low_c:.0f} to {high_c:.0f} C"
+        numbers = f"no data at {float(record['filter']['temperature_c']):.0f} C, the cell file knows {file_range}"
         texts[InputFault.TEMPERATURE] = f"{numbers}: {InputFault.TEMPERATURE.text}"
     return list(texts.values())
 
@@ -85,26 +85,26 @@ def make_health_payload(
     edge: EdgeHealth | None = None,
     hooks: HookHealth | None = None,
 ) -> Health:
-    """Topic ``health``.
+    """Return the payload of topic ``health``.
 
     Args:
         record: Record of dtype ESTIMATOR_STATE.
         settings: Record of dtype ESTIMATOR_SETTINGS.
-        line: The source's counters.
+        line: Counters of the source.
         now_s: Wall clock [s since 1970].
         uptime_s: Time since the service started [s].
         loop_lag_s: Longest delay of the event loop since the last report [s].
         restarts: Starts that found a checkpoint.
         checkpoint: Result of restoring the last checkpoint.
-        sensor_message: Why values are not fresh; None when they are.
+        sensor_message: Reason why no fresh values arrive; None when they do.
         delivery: Counters of sent messages and received requests.
-        clock_ppm: The source's.
-        total: Counted over restarts.
-        unseen_s: length of the last unmeasured gap [s]; None if there was none or it is unknown.
+        clock_ppm: Drift of the board's clock relative to the host [1e-6]; None if unknown.
+        total: Totals over restarts.
+        unseen_s: Length of the last gap without samples [s]; None if there was none or it is unknown.
         loop: Delays of the event loop.
-        recording: The state of one; None: nothing is recorded.
+        recording: State of the recording; None: nothing is recorded.
         edge: State of the fleet edge; None without one.
-        hooks: Successes and failures of alarm hooks; None: none.
+        hooks: Successes and failures of alarm hooks; None without hooks.
     """
     state = record["observer"]
     return Health(
@@ -145,21 +145,21 @@ def out_of_range_reason(block: SampleBlock, settings: np.void) -> str | None:
     """Describe the last sample of a block that is out of range or not a number; None without one.
 
     Args:
-        block: Some of its samples were dropped.
+        block: Samples, of which some were dropped.
         settings: A record of OBSERVER_SETTINGS.
     """
     low_v, high_v = float(settings["voltage_min_v"]), float(settings["voltage_max_v"])
-    most_a = float(settings["current_max_a"])
+    max_a = float(settings["current_max_a"])
     voltage_v, current_a = block["voltage_v"], block["current_a"]
-    outside = ~((voltage_v >= low_v) & (voltage_v <= high_v) & (np.abs(current_a) <= most_a))
+    outside = ~((voltage_v >= low_v) & (voltage_v <= high_v) & (np.abs(current_a) <= max_a))
     if not outside.any():
         return None
     volt, ampere = float(voltage_v[outside][-1]), float(current_a[outside][-1])
-    missing = [what for what, value in (("voltage", volt), ("current", ampere)) if math.isnan(value)]
+    missing = [name for name, value in (("voltage", volt), ("current", ampere)) if math.isnan(value)]
     if missing:
-        return f"the last of them tells no {' and no '.join(missing)}: is the sensor connected?"
-    said = (
-        f"the last of them {volt:g} V, {ampere:g} A, where {low_v:g}..{high_v:g} V and up to {most_a:g} A are possible"
+        return f"the last of them has no {' and no '.join(missing)}: is the sensor connected?"
+    text = (
+        f"the last of them {volt:g} V, {ampere:g} A, where {low_v:g}..{high_v:g} V and up to {max_a:g} A are possible"
     )
     for guess, v, a in (
         ("are the columns swapped?", abs(ampere), volt),
@@ -167,6 +167,6 @@ def out_of_range_reason(block: SampleBlock, settings: np.void) -> str | None:
         ("are these milliamperes?", volt, 1e-3 * ampere),
         ("are these millivolts and milliamperes?", 1e-3 * volt, 1e-3 * ampere),
     ):
-        if low_v <= v <= high_v and abs(a) <= most_a:
-            return f"{said}: {guess}"
-    return said
+        if low_v <= v <= high_v and abs(a) <= max_a:
+            return f"{text}: {guess}"
+    return text

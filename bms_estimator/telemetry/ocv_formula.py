@@ -1,4 +1,4 @@
-"""a16..a21 of (2.10) for a cell file that gives its OCV as a table: fitted to it, once for each table."""
+"""Parameters a16..a21 of (2.10), fitted to the OCV table of a cell file."""
 
 from functools import cache
 from typing import NamedTuple
@@ -8,15 +8,15 @@ import numpy as np
 from bms_estimator.model.cell import CellModel, TableOcv
 
 POINTS = 101
-"""Evenly spaced SOCs that the fit is made at."""
+"""Number of evenly spaced SOCs at which the formula is fitted."""
 
 
 class OcvFormulaFit(NamedTuple):
-    """(2.10) fitted to a table.
+    """Fit of (2.10) to an OCV table.
 
     Attributes:
         a: a16..a21.
-        std: Standard errors; NaN for one at its bound.
+        std: Standard errors; NaN for a parameter at its bound.
         rms_v: Deviation of the formula from the table, RMS over SOC [V].
     """
 
@@ -25,14 +25,14 @@ class OcvFormulaFit(NamedTuple):
     rms_v: float
 
 
-def formula(cell: CellModel) -> OcvFormulaFit | None:
+def fit_ocv_formula(cell: CellModel) -> OcvFormulaFit | None:
     """Fit (2.10) to a cell's OCV table; None if the cell file gives (2.10) itself."""
-    return _fitted(cell.ocv) if isinstance(cell.ocv, TableOcv) else None
+    return _fit_table(cell.ocv) if isinstance(cell.ocv, TableOcv) else None
 
 
 @cache
-def _fitted(ocv: TableOcv) -> OcvFormulaFit:
-    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - what fits is loaded only where there is a table
+def _fit_table(ocv: TableOcv) -> OcvFormulaFit:
+    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - scipy is needed for tables only
 
     from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora  # noqa: PLC0415
     from bms_estimator.calibration.ocv.points import Points, rms_v  # noqa: PLC0415

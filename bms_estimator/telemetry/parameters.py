@@ -1,7 +1,4 @@
-"""Topic ``parameters``.
-
-A1..a21 and the elements, each with its error, its source, and the reason if it is not valid.
-"""
+"""Topic ``parameters``: a1..a21 and the circuit elements, each with its std, its source, and the reason if it is not valid."""
 
 import math
 from functools import lru_cache
@@ -26,19 +23,20 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.payloads import OcvCurve, Parameter, ParameterReport
 from bms_estimator.telemetry.fuel_cell_parameters import VALID_STD, fuel_cell_parameters
-from bms_estimator.telemetry.ocv_formula import formula
+from bms_estimator.telemetry.ocv_formula import fit_ocv_formula
 from bms_estimator.telemetry.series_resistance import series_resistance_parameters
 from bms_estimator.telemetry.state import finite
 
 OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
 """SOCs at which the OCV is published."""
 CONFIGURED = "configured value: no data has identified it"
-LEARNED = "learned by the observer's law, which knows no error of it"
+LEARNED = "learned by the adaptive law, which gives no std"
 VALID_FIT_STD = 0.5
-"""Maximum relative std of a valid a1..a15: amplitudes and exponents show only where the SOC was swept."""
+"""Maximum relative std of a valid a1..a15. Amplitudes and exponents can be separated only after a sweep of the SOC."""
 VALID_CAPACITY_STD = 0.02
+"""Maximum std of a valid capacity, relative to the cell file."""
 VALID_OFFSET = 0.5
-"""An offset is identified when its standard deviation is below this part of the first one."""
+"""Maximum std of a valid current offset, as a fraction of its std at the start."""
 _FUNCTIONS = {
     "r_s_ohm": chen_mora.r_s,  # (2.9)
     "r_ts_ohm": chen_mora.r_ts,  # (2.5)
@@ -49,9 +47,9 @@ _FUNCTIONS = {
 
 
 def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterReport:
-    """Topic ``parameters``: a1..a15 as the observer holds them, a16..a21 of the cell file, elements at the present SOC.
+    """Return the payload: a1..a15 of the observer, a16..a21 of the cell file, and the elements at the present SOC.
 
-    Where the cell file gives the OCV as a table, a16..a21 are (2.10) fitted to it.
+    If the cell file gives the OCV as a table, a16..a21 are a fit of (2.10) to the table.
 
     Args:
         estimator: Read only.
@@ -73,21 +71,21 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
     parameters, elements = _of_cell_file(estimator.cell, a), _elements_of(estimator, a)
     health: dict[str, Parameter] = {}
     learning, record = bool(estimator.settings_record["learning"]["enabled"][0]), estimator.record[0]
-    led = _is_data_driven(estimator)
+    from_data = _is_data_driven(estimator)
     for i in range(1, 16):
-        held = parameters[f"a{i}"] = _of_source(parameters[f"a{i}"], led[i], learning)
+        held = parameters[f"a{i}"] = _mark_source(parameters[f"a{i}"], from_data[i], learning)
         if estimator.identifying and not learning:
-            parameters[f"a{i}"] = _parameter(held, fitted_parameter(record, i), now_s)
+            parameters[f"a{i}"] = _with_fit_std(held, fitted_parameter(record, i), now_s)
     for e, name in enumerate(ELEMENT_NAMES):
-        elements[name] = _of_source(elements[name], led[3 * e + 1 : 3 * e + 4].any(), learning)
+        elements[name] = _mark_source(elements[name], from_data[3 * e + 1 : 3 * e + 4].any(), learning)
     if estimator.identifying:
         for name, one in present_elements(record).items():
             elements[name] = _identified(one, elements[name], VALID_STD, now_s)
         health = _state_of_health(estimator, now_s)
     if estimator.settings_record["series_resistance"][0]:
-        found = series_resistance_parameters(estimator)
-        elements["r_s_ohm"] = found.pop("r_s_ohm")
-        parameters |= found
+        fitted = series_resistance_parameters(estimator)
+        elements["r_s_ohm"] = fitted.pop("r_s_ohm")
+        parameters |= fitted
     return ParameterReport(
         publish_time=iso_utc(now_s),
         soc=finite(state["soc"]),
@@ -99,14 +97,15 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
 
 
 def _of_fuel_cell(estimator: Estimator, now_s: float) -> ParameterReport:
-    """No SOC, no a1..a21; learned values are among the elements."""
+    """Return the payload of a fuel cell: no SOC, no a1..a21, and the learned values as elements."""
     elements = fuel_cell_parameters(estimator, now_s) if estimator.state[0]["started"] else {}
     return ParameterReport(publish_time=iso_utc(now_s), soc=None, a={}, ocv=None, elements=elements, state_of_health={})
 
 
 def _of_cell_file(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:
+    """Return a1..a21 as configured values; a16..a21 are fitted if the cell file has an OCV table."""
     parameters = {f"a{i}": _configured(a[i], "") for i in range(1, 22)}
-    fit = formula(cell)
+    fit = fit_ocv_formula(cell)
     if fit is None:
         return parameters
     reason = f"(2.10) fitted to the table of the cell file, {1e3 * fit.rms_v:.1f} mV RMS off it"
@@ -116,37 +115,37 @@ def _of_cell_file(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:
 
 
 def _ocv(estimator: Estimator) -> OcvCurve:
-    """Return the filter's OCV with its error: the cell file's plus the learned correction."""
+    """Return the filter's OCV with its std: the OCV of the cell file plus the learned correction."""
     record, settings = estimator.record[0], estimator.settings_record[0]
     p = settings["filter"]
     correction_v, std_v = ocv_correction_with_std(record, settings, OCV_SOC)
-    given_v = _given_v(p["ocv_v"].tobytes(), p["ocv_slope_v"].tobytes())
-    return OcvCurve(soc=OCV_SOC.tolist(), ocv_v=(given_v + correction_v).tolist(), std_v=std_v.tolist())
+    file_v = _cell_file_ocv(p["ocv_v"].tobytes(), p["ocv_slope_v"].tobytes())
+    return OcvCurve(soc=OCV_SOC.tolist(), ocv_v=(file_v + correction_v).tolist(), std_v=std_v.tolist())
 
 
 @lru_cache(maxsize=64)
-def _given_v(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
-    """Return the cell file's OCV at ``OCV_SOC`` [V], from the filter's tables."""
+def _cell_file_ocv(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
+    """Return the OCV of the cell file at ``OCV_SOC`` [V], from the tables of the filter."""
     curve, slope = np.frombuffer(bytearray(ocv_v)), np.frombuffer(bytearray(ocv_slope_v))
     return np.array([chen_mora.ocv(soc, curve, slope) for soc in OCV_SOC])
 
 
 def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
-    """(2.5)-(2.10) at the present SOC; below delta1 (delta2) the capacitance is not positive and is left out."""
+    """Return the elements of (2.5)-(2.10) at the present SOC. A capacitance that is not positive, below delta1 or delta2, is null."""
     state, ocv = estimator.state[0], estimator.settings[0]
     soc = float(state["soc"])
     limits = {"c_ts_farad": "delta_1", "c_tl_farad": "delta_2"}
     elements = {}
     for name, function in _FUNCTIONS.items():
         value, limit = function(soc, a), limits.get(name, "")
-        why_not = f"SOC {soc:.4f} is not above {limit} = {state[limit]:.4f}" if limit else ""
-        elements[name] = _configured(value if value > 0.0 else math.nan, why_not)
+        why_missing = f"SOC {soc:.4f} is not above {limit} = {state[limit]:.4f}" if limit else ""
+        elements[name] = _configured(value if value > 0.0 else math.nan, why_missing)
     elements["e_o_v"] = _configured(chen_mora.ocv(soc, ocv["ocv_v"], ocv["ocv_slope_v"]), "")
     return elements
 
 
 def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]:
-    """Capacity and R_s over those of the cell file."""
+    """Return capacity and R_s relative to the cell file, and the offset of the current sensor."""
     record, settings = estimator.record[0], estimator.settings_record[0]
     ratio, p = relative_series_resistance(record, settings), settings["filter"]
     capacity, offset_a = relative_capacity(record), current_offset(record)
@@ -159,41 +158,41 @@ def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]
 
 
 def _bias(learned: IdentifiedValue, limit: float, setting: str, now_s: float) -> Parameter:
-    """Bias of the sensor or the capacity, valid below ``limit`` [its unit]."""
+    """Return a bias of the sensor or of the capacity, valid if its std is below ``limit`` (in its unit)."""
     value, std = finite(learned.value), finite(learned.std)
     if std == 0.0:
-        declared = f"{setting} is 0: taken as declared"
+        declared = f"{setting} is 0: the configured value counts as exact"
         return Parameter(value=value, std=None, valid=False, source="configured", reason=declared)
     valid = learned.std < limit
-    reason = None if valid else f"known to {learned.std:.2g} so far, valid below {limit:.2g}"
+    reason = None if valid else f"std {learned.std:.2g} so far, valid below {limit:.2g}"
     return Parameter(value=value, std=std, valid=valid, source="identified", updated=iso_utc(now_s), reason=reason)
 
 
 def _is_data_driven(estimator: Estimator) -> np.ndarray:
-    """Return which of a1..a15 data have moved from the configured values: by the adaptive law, else by the fit that (3.18) follows."""
+    """Return which of a1..a15 data have changed, through the adaptive law or through the fit that (3.18) follows."""
     state, settings = estimator.state[0], estimator.settings_record[0]
     if settings["learning"]["enabled"]:
         return np.asarray(state["a"] != settings["learning"]["file"])
     return np.asarray(state["target"] != settings["observer"]["target"])
 
 
-def _of_source(held: Parameter, led: np.bool_, learning: bool) -> Parameter:
-    """Parameter of the observer; its source is the data where those have moved it."""
-    if not led:
+def _mark_source(held: Parameter, from_data: np.bool_, learning: bool) -> Parameter:
+    """Return a parameter of the observer, marked as identified if data have changed it."""
+    if not from_data:
         return held
     return held.model_copy(update={"source": "identified"} | ({"reason": LEARNED} if learning else {}))
 
 
-def _parameter(held: Parameter, fit: IdentifiedValue | None, now_s: float) -> Parameter:
-    """a_i as the observer holds it, with the error that the fit has."""
+def _with_fit_std(held: Parameter, fit: IdentifiedValue | None, now_s: float) -> Parameter:
+    """Return the observer's value of a parameter with the std of the fit."""
     if fit is None or held.source == "configured":
         return held
-    known = _identified(fit, held, VALID_FIT_STD, now_s)
-    return known.model_copy(update={"value": held.value}) if known.valid else known
+    fitted = _identified(fit, held, VALID_FIT_STD, now_s)
+    return fitted.model_copy(update={"value": held.value}) if fitted.valid else fitted
 
 
 def _identified(learned: IdentifiedValue, held: Parameter, limit: float, now_s: float) -> Parameter:
-    """Learned value if its error is small enough, otherwise the observer's value and the progress of learning."""
+    """Return the learned value if its std is small enough, otherwise the observer's value with the progress of learning."""
     if math.isinf(learned.age_s):
         return held
     if learned.relative_std < limit:
@@ -203,12 +202,15 @@ def _identified(learned: IdentifiedValue, held: Parameter, limit: float, now_s: 
         )
     if held.value is None:
         return held
-    why = f"identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
-    std = math.hypot(learned.std, learned.value - held.value)  # of the configured value, by the known error
-    return held.model_copy(update={"std": finite(std), "reason": why})
+    reason = f"identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
+    std = math.hypot(
+        learned.std, learned.value - held.value
+    )  # of the observer's value, which the learned value estimates
+    return held.model_copy(update={"std": finite(std), "reason": reason})
 
 
 def _configured(value: float, why_missing: str) -> Parameter:
+    """Return a configured value; ``why_missing`` is the reason if it is not finite."""
     number = finite(value)
     return Parameter(
         value=number,

@@ -13,18 +13,18 @@ from bms_estimator.model.sample import NO_CELLS, CellBlock
 
 @dataclass(frozen=True)
 class WindowSummary:
-    """Means over one window and its last row.
+    """Means over one publish window, and its last trace row.
 
     Attributes:
         arrival_s: Wall clock at the arrival of the last block [s since 1970].
         samples: Number of samples.
-        voltage_v: Mean [V].
-        current_a: Mean [A], positive on discharge.
-        power_w: Mean of voltage times current [W].
-        temperature_c: Mean [C], NaN without a sensor.
-        sample_rate_hz: On the stream's clock [Hz], NaN if unknown.
-        last: Row of dtype TRACE.
-        cells_v: Shape (m,): the last voltages of single cells [V], NaN if not reported; m is 0 without any.
+        voltage_v: Mean voltage [V].
+        current_a: Mean current [A], positive on discharge.
+        power_w: Mean power [W].
+        temperature_c: Mean temperature [C], NaN without a sensor.
+        sample_rate_hz: Sample rate on the clock of the samples [Hz], NaN if unknown.
+        last: Last row, dtype TRACE.
+        cells_v: Last cell voltages [V], shape (m,), NaN if not reported; m is 0 without cell voltages.
     """
 
     arrival_s: float
@@ -39,14 +39,14 @@ class WindowSummary:
 
 
 class Window:
-    """Gathers trace blocks until they are taken.
+    """Sums over trace blocks since the last publication.
 
     Attributes:
-        before_s: Stream clock at the end of the window before; NaN before the first.
+        previous_end_s: Last time stamp of the previous window [s]; NaN before the first window.
     """
 
     def __init__(self) -> None:
-        self.before_s = math.nan
+        self.previous_end_s = math.nan
         self._sums: NDArray[np.void] = np.zeros(1, dtype=WINDOW_SUMS)
         self._clear()
 
@@ -57,11 +57,11 @@ class Window:
         self._cells = NO_CELLS
 
     def add(self, trace: TraceBlock, arrival_s: float, cells: CellBlock = NO_CELLS) -> None:
-        """Take what the estimator made of one block.
+        """Add the trace of one block.
 
         Args:
-            trace: Shape (n,), dtype TRACE; n may be 0.
-            arrival_s: Wall clock [s since 1970].
+            trace: Accepted samples, shape (n,), dtype TRACE; n may be 0.
+            arrival_s: Wall clock at the arrival of the block [s since 1970].
             cells: Cell voltages of the block.
         """
         if cells.size:
@@ -72,12 +72,12 @@ class Window:
         self._arrival_s = arrival_s
 
     def take(self) -> WindowSummary | None:
-        """Summary since the last call, None without a sample."""
+        """Return the summary since the last call; None without a sample."""
         if self._last is None:
             return None
         n, first_s, voltage, current, power, temperatures, temperature = self._sums[0].item()
         last_s = float(self._last["time_s"])
-        steps, begin_s = (n, self.before_s) if math.isfinite(self.before_s) else (n - 1, first_s)
+        steps, begin_s = (n, self.previous_end_s) if math.isfinite(self.previous_end_s) else (n - 1, first_s)
         span_s = last_s - begin_s
         summary = WindowSummary(
             arrival_s=self._arrival_s,
@@ -90,6 +90,6 @@ class Window:
             last=self._last,
             cells_v=self._cells.ravel(),
         )
-        self.before_s = last_s
+        self.previous_end_s = last_s
         self._clear()
         return summary

@@ -11,26 +11,34 @@ from bms_estimator.estimator.identified_parameters import present_resistance, re
 from bms_estimator.kernels.cell_model import chen_mora
 
 MAX_H = 1000.0
-"""Longest published time to empty or full [h]; a smaller load or charge counts as none."""
+"""Maximum published time to empty or full [h]. A current that would take longer counts as zero."""
 
 
 @dataclass(frozen=True)
 class RemainingCharge:
-    """NaN where it is not known."""
+    """Remaining charge, energy and time; NaN if unknown.
 
-    capacity_ah: float = math.nan  # down to SOC 0
-    usable_ah: float = math.nan  # down to max(delta1, delta2), below which the model does not hold
-    energy_wh: float = math.nan  # at the terminals, down to SOC 0, at the present current
-    time_to_empty_s: float = math.nan  # down to SOC 0, at the present current
-    time_to_full_s: float = math.nan  # up to SOC 1, at the present current
+    Attributes:
+        capacity_ah: Charge down to SOC 0 [Ah].
+        usable_ah: Charge down to max(delta1, delta2), below which the model does not hold [Ah].
+        energy_wh: Energy at the terminals down to SOC 0 at the present current [Wh].
+        time_to_empty_s: Time to SOC 0 at the present current [s].
+        time_to_full_s: Time to SOC 1 at the present current [s].
+    """
+
+    capacity_ah: float = math.nan
+    usable_ah: float = math.nan
+    energy_wh: float = math.nan
+    time_to_empty_s: float = math.nan
+    time_to_full_s: float = math.nan
 
 
 def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
     """Return the remaining charge, energy and time.
 
     Args:
-        estimator: Read only.
-        current_a: At present [A], positive on discharge.
+        estimator: Estimator; read only.
+        current_a: Present current [A], positive on discharge.
     """
     state, settings = estimator.state[0], estimator.settings[0]
     if not state["started"] or math.isnan(state["soc"]):
@@ -54,13 +62,13 @@ def _time(charge_ah: float, current_a: float, capacity_ah: float) -> float:
 
 
 def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:
-    """Mean of the open-circuit voltage between empty and ``soc`` [V], to a node of its grid."""
+    """Return the mean open-circuit voltage between SOC 0 and ``soc`` [V], rounded to a node of the OCV grid."""
     below = ocv_v[: max(round(soc * (ocv_v.size - 1)), 1) + 1]
     return float((below.sum() - 0.5 * (below[0] + below[-1])) / (below.size - 1))
 
 
 def _resistance(estimator: Estimator, soc: float) -> float:
-    """All of it, settled [ohm]."""
+    """Return the total DC resistance with all RC pairs settled [ohm]."""
     if estimator.identifying:
         return present_resistance(estimator.record[0])
     a = estimator.state[0]["a"]

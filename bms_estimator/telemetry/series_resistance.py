@@ -1,4 +1,4 @@
-"""R_s by (4.2), step 3 of the thesis, as published parameters."""
+"""Published parameters of R_s by (4.2), step 3 of the thesis."""
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.observer.series_resistance import SMALLEST_CURRENT_C
@@ -6,13 +6,13 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Parameter
 from bms_estimator.telemetry.state import finite
 
-ORIGIN = "by (4.2), step 3 of the thesis; takes up what the OCV and a1..a12 have wrong, which std does not know"
+ORIGIN = "by (4.2), step 3 of the thesis; includes errors of the OCV and of a1..a12, which std does not cover"
 
 
 def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
-    """``r_s_ohm``, null until a current has flowed, and a13..a15 as soon as enough SOC was swept to fit (2.9).
+    """Return ``r_s_ohm``, and a13..a15 once the swept range of SOC is large enough to fit (2.9).
 
-    The error of ``r_s_ohm`` is the scatter of (4.2) about (2.9); before the fit it is not known.
+    ``r_s_ohm`` is null until a current has flowed. Its std is the scatter of (4.2) about (2.9), unknown before the fit.
 
     Args:
         estimator: Estimator of a battery, after a sample, with R_s by (4.2).
@@ -28,12 +28,12 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
         return {"r_s_ohm": Parameter(value=None, std=None, valid=False, source="identified", reason=missing)}
     try:
         fit = fit_series_resistance(summed(record), LOWEST_SOC)
-    except UserError:  # too few steps of SOC for three parameters: one value for all of them
+    except UserError:  # the swept range of SOC is too small for three parameters: use one mean value
         return {"r_s_ohm": _of_4_2(float(sums["product_va"].sum()) / square_a2, None)}
-    found = {f"a{i}": _of_4_2(*pair) for i, *pair in zip((13, 14, 15), fit.a, fit.std, strict=True)}
-    return found | {"r_s_ohm": _of_4_2(float(fit(record["observer"]["soc"])), fit.rms_ohm)}
+    parameters = {f"a{i}": _of_4_2(*pair) for i, *pair in zip((13, 14, 15), fit.a, fit.std, strict=True)}
+    return parameters | {"r_s_ohm": _of_4_2(float(fit(record["observer"]["soc"])), fit.rms_ohm)}
 
 
 def _of_4_2(value: float, std: float | None) -> Parameter:
-    known = None if std is None else finite(std)
-    return Parameter(value=finite(value), std=known, valid=False, source="identified", reason=ORIGIN)
+    finite_std = None if std is None else finite(std)
+    return Parameter(value=finite(value), std=finite_std, valid=False, source="identified", reason=ORIGIN)

@@ -1,4 +1,4 @@
-"""Topics ``state`` and ``info`` from what the estimator left: pure functions."""
+"""Payloads of the topics ``state`` and ``info``. All functions are pure."""
 
 import math
 from collections.abc import Mapping
@@ -18,6 +18,11 @@ from bms_estimator.telemetry.publish_window import WindowSummary
 from bms_estimator.telemetry.remaining_charge import RemainingCharge
 from bms_estimator.version import __version__
 
+COMPUTED = {"voltage_v", "current_a", "temperature_c", "converged", "lock"}
+"""Columns of the trace whose field of ``Estimate`` is not the last value: means, and integers that become booleans."""
+COPIED = tuple(name for name in TRACE.names or () if name in Estimate.model_fields and name not in COMPUTED)
+"""Columns of the trace whose last value becomes the field of ``Estimate`` of equal name."""
+
 
 def finite(value: float) -> float | None:
     """Return the value as a float, or None if it is NaN or infinite."""
@@ -33,19 +38,18 @@ def make_state_payload(
     flow: ChargeEnergy,
     capacity_ah: float | None,
 ) -> Estimate:
-    """Topic ``state``.
+    """Return the payload of topic ``state``.
 
     Args:
         window: Summary since the last publication.
         remaining: Remaining charge and energy.
-        counters: The source's.
+        counters: Counters of the source.
         now_s: Wall clock [s since 1970].
         flow: Charge and energy at the terminals.
-        capacity_ah: Capacity of the pack, rated; None of a fuel cell.
+        capacity_ah: Rated capacity of the pack [Ah]; None for a fuel cell.
     """
-    values = zip(
-        TRACE.names or (), window.last.item(), strict=True
-    )  # plain numbers: a field of a record costs as much as a sum
+    # plain numbers, because access to a field of a numpy record takes as long as a sum
+    values = zip(TRACE.names or (), window.last.item(), strict=True)
     last = {name: value if math.isfinite(value) else None for name, value in values}
     soc = last["soc"]
     return Estimate(
@@ -57,11 +61,8 @@ def make_state_payload(
         power_w=window.power_w,
         temperature_c=finite(window.temperature_c),
         **_cells(window.cells_v),
-        soc=soc,
+        **{name: last[name] for name in COPIED},
         soc_percent=None if soc is None else 100.0 * soc,
-        soc_std=last["soc_std"],
-        soc_coulomb=last["soc_coulomb"],
-        soc_ocv=last["soc_ocv"],
         remaining_capacity_ah=finite(remaining.capacity_ah),
         usable_capacity_ah=finite(remaining.usable_ah),
         remaining_energy_wh=finite(remaining.energy_wh),
@@ -69,16 +70,8 @@ def make_state_payload(
         time_to_full_s=finite(remaining.time_to_full_s),
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
-        voltage_estimate_v=last["voltage_estimate_v"],
-        innovation_v=last["innovation_v"],
-        tracking_error_v=last["tracking_error_v"],
-        delta_1=last["delta_1"],
-        delta_2=last["delta_2"],
         delta_configured=last["adaptation_gain_hz"] is not None and last["delta_1"] is not None,
-        stability_margin=last["stability_margin"],
         adaptive_gain_k=last["k"],
-        nussbaum_gain=last["nussbaum_gain"],
-        adaptation_gain_hz=last["adaptation_gain_hz"],
         converged=bool(last["converged"]),
         lock=bool(last["lock"]),
         frames_received=counters.get("frames_received", 0),
@@ -89,7 +82,7 @@ def make_state_payload(
 
 
 def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
-    """Fields of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
+    """Return the fields of single cells; ``cells_v`` has shape (m,) [V], NaN for an unknown voltage."""
     if not (cells_v.size and np.isfinite(cells_v).any()):
         return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))
     lowest, highest = int(np.nanargmin(cells_v)), int(np.nanargmax(cells_v))
@@ -105,14 +98,14 @@ def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
 def make_info_payload(
     settings: Settings, cell: PackModel, board: Mapping[str, str], started_s: float, *, temperature_sensor: bool
 ) -> Info:
-    """Topic ``info``.
+    """Return the payload of topic ``info``.
 
     Args:
         settings: The pack's settings.
         cell: The pack as one object.
         board: Properties that the board reported.
         started_s: Wall clock at start [s since 1970].
-        temperature_sensor: Whether the cell's temperature is measured.
+        temperature_sensor: True if the cell temperature is measured.
     """
     learns = settings.observer.law == "learning" or not isinstance(cell, CellModel)
     return Info(

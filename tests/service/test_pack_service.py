@@ -10,7 +10,7 @@ from structlog.testing import capture_logs
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.service.multi_pack_service import serve_several
+from bms_estimator.service.multi_pack_service import run_pack_services
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
@@ -23,7 +23,7 @@ async def test_the_log_says_what_of_the_settings_cannot_be():
     stop.set()
     with capture_logs() as lines:
         await run_pack_service(settings, load_cell("ncr18650").pack(14, 1), stop=stop)
-    said = [line["reason"] for line in lines if line["event"] == "a setting that cannot be"]
+    said = [line["reason"] for line in lines if line["event"] == "implausible setting"]
     assert len(said) == 2
     assert "14 in series of 3 Ah" in said[0]
     assert "the board's range ends at 25.0 V" in said[1]
@@ -50,7 +50,7 @@ async def test_one_of_several_packs_that_cannot_be_served_is_named(
         tables = {"pack": {"name": name}, "sensor": {"port": port}} | ({"mqtt": mqtt} if mqtt and name == "b" else {})
         packs.append((Settings.model_validate(tables), cell))
     with pytest.raises(UserError, match=f"^{re.escape(said)}"):
-        await asyncio.wait_for(serve_several(packs), LONG_S)
+        await asyncio.wait_for(run_pack_services(packs), LONG_S)
 
 
 async def test_packs_without_a_serial_line_need_no_port_of_their_own(state_home: Path) -> None:
@@ -59,7 +59,7 @@ async def test_packs_without_a_serial_line_need_no_port_of_their_own(state_home:
     tables = [{"pack": {"name": name}, "source": table} for name, table in sources.items()]
     packs = [(Settings.model_validate(table), load_cell("chen_mora")) for table in tables]
     with pytest.raises(UserError, match=r"^b: source.password_file = /none: cannot be read"):
-        await asyncio.wait_for(serve_several(packs), LONG_S)
+        await asyncio.wait_for(run_pack_services(packs), LONG_S)
 
 
 def test_a_user_without_a_home_is_served_and_told_that_the_state_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:

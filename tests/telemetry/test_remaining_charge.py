@@ -173,7 +173,7 @@ def test_what_is_not_to_be_learned_is_taken_as_declared() -> None:
     estimator.run(pulses(0.2, 0.1))
     health = make_parameters_payload(estimator, NOW_S).state_of_health
     assert (health["capacity"].value, health["current_offset_a"].value) == (1.0, 0.0)
-    assert "identifier.capacity_std is 0: taken as declared" in (health["capacity"].reason or "")
+    assert "identifier.capacity_std is 0: the configured value counts as exact" in (health["capacity"].reason or "")
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import startup_signals
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.kernel_warm_up import load_kernels
-from bms_estimator.service.multi_pack_service import serve_several
+from bms_estimator.service.multi_pack_service import run_pack_services
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.terminal.panels import LOG_LINES
@@ -69,7 +69,7 @@ def _run_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
     configure_logs()
     with flush_logs():
         _load_kernels()
-        asyncio.run(serve_several(packs))
+        asyncio.run(run_pack_services(packs))
 
 
 def _run_one(settings: Settings, cell: PackModel, record: Path | None, *, view: bool) -> None:

@@ -21,7 +21,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.access_control import guard_of
 from bms_estimator.process.systemd import is_for_the_service
-from bms_estimator.service.alarm_hooks import unusable
+from bms_estimator.service.alarm_hooks import hook_warnings
 from bms_estimator.settings.alarm_limits import out_of_range, watched
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings
@@ -101,7 +101,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     warnings = [
         *implausible_settings(settings, cell),
         *out_of_range(settings, cell),
-        *unusable(settings),
+        *hook_warnings(settings),
         *_lemma(cell),
     ]
     if settings.mqtt is not None:

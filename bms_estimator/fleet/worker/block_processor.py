@@ -61,7 +61,7 @@ class BlockProcessor:
         self._settle(of_type, former, block)
         rows, turned = self._turn_hour(pack, block, of_type)
         self._follow_clock(of_type.estimator, block)
-        self._window.before_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
+        self._window.previous_end_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
         self._note_clock(block)
         arrival_s, now_s = self._arrival_s(block), self._wall()
         self._estimate(block, of_type, arrival_s)
