@@ -120,7 +120,7 @@ async def test_garbage_and_cut_frames_cost_only_themselves(line: Line) -> None:
     assert sum(health.line[kind] for kind in ("crc_errors", "cobs_errors", "length_errors")) == 2
 
 
-async def test_a_wrong_checksum_is_counted_and_its_sample_not_used(line: Line) -> None:
+async def test_a_frame_with_a_wrong_checksum_is_counted_and_dropped(line: Line) -> None:
     async with service(line) as live:
         wrong = bytearray(sample(1).encode())
         wrong[7] ^= 0x10
@@ -132,7 +132,7 @@ async def test_a_wrong_checksum_is_counted_and_its_sample_not_used(line: Line) -
     assert live.sink.snapshots[-1].estimate is None or live.sink.snapshots[-1].estimate.crc_errors == 1
 
 
-async def test_a_board_with_a_newer_protocol_is_named_as_such(line: Line) -> None:
+async def test_a_board_with_a_newer_protocol_is_reported(line: Line) -> None:
     async with service(line, hello=HELLO.encode(version=2)) as live:
         live.line.write(sample(0).encode(version=2))
         said = await live.until(lambda s: "another version of the protocol" in (s.health.sensor_message or ""))
@@ -151,7 +151,7 @@ async def test_duplicates_and_late_frames_are_dropped(line: Line) -> None:
     assert health.samples["time_steps_back"] == 0
 
 
-async def test_sequence_and_microseconds_wrap_without_a_seam(line: Line) -> None:
+async def test_sequence_number_and_microseconds_may_wrap_around(line: Line) -> None:
     async with service(line) as live:
         start = MODULUS - 5
         at_us = MODULUS - 5 * PERIOD_US
@@ -166,7 +166,7 @@ async def test_sequence_and_microseconds_wrap_without_a_seam(line: Line) -> None
     assert estimator.state["time_steps_back"][0] == 0
 
 
-async def test_a_board_reset_in_mid_run_goes_on_in_time(line: Line) -> None:
+async def test_time_continues_after_a_reset_of_the_board(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 50))
         await live.received(50)
@@ -193,7 +193,7 @@ async def test_ten_seconds_without_frames_are_one_gap_and_the_lock_holds(line: L
     assert estimator.state["time_s"][0] == pytest.approx(10.99, abs=1e-3)
 
 
-async def test_saturated_and_impossible_voltages_are_dropped_and_the_sensor_is_not_called_fresh(line: Line) -> None:
+async def test_saturated_and_implausible_voltages_are_dropped_and_the_sensor_counts_as_offline(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 5) + frames(5, 5, status=1) + frames(10, 5, voltage_sum=0))
         stale = await live.until(lambda s: s.health.samples["samples"] == 5 and not s.health.sensor_online)
@@ -222,21 +222,21 @@ async def test_a_wrong_baud_rate_reaches_the_published_health(line: Line) -> Non
         (b"1e9,0.1\n", "the last of them 1e+09 V, 0.1 A, where 1.5..4.5 V and up to 5 A are possible"),
     ],
 )  # fmt: skip
-async def test_values_out_of_range_are_told_with_the_range_and_a_guess(line: Line, sent: bytes, told: str) -> None:
+async def test_values_out_of_range_are_reported_with_the_range_and_a_hint(line: Line, sent: bytes, told: str) -> None:
     async with service(line, hello=b"\n", protocol="text") as live:
         live.line.write(sent)
         said = await live.until(lambda s: "outside the cell's range" in (s.health.sensor_message or ""))
     assert (said.health.sensor_message or "").endswith(told)
 
 
-async def test_a_text_board_that_prints_something_else_is_quoted(line: Line) -> None:
+async def test_unexpected_text_of_a_board_is_quoted(line: Line) -> None:
     async with service(line, hello=b"\n", protocol="text") as live:
         live.line.write(b"Vbat=13.3V only\r\nmore\r\n")
         said = await live.until(lambda s: "the first: 'Vbat=13.3V only'" in (s.health.sensor_message or ""))
     assert "baud rate" not in (said.health.sensor_message or "")
 
 
-async def test_lowest_and_highest_cell_reach_the_published_state(line: Line) -> None:
+async def test_the_state_names_the_lowest_and_highest_cell(line: Line) -> None:
     async with service(line, hello=b"\n", protocol="text") as live:
         live.line.write(b"V=3.8 I=0.1\n")
         without = await live.until(lambda s: s.estimate is not None)
@@ -248,7 +248,7 @@ async def test_lowest_and_highest_cell_reach_the_published_state(line: Line) -> 
     assert (told.estimate.cell_lowest_v, told.estimate.cell_highest_v) == (3.79, 3.81)
 
 
-async def test_a_reason_that_has_passed_is_not_told_any_more(line: Line) -> None:
+async def test_a_former_reason_is_no_longer_reported(line: Line) -> None:
     """A board whose hello scales by zero has no numbers; before, its voltage was out of range."""
     async with service(line) as live:
         live.line.write(frames(0, 5, voltage_sum=16_000_000))
@@ -259,7 +259,7 @@ async def test_a_reason_that_has_passed_is_not_told_any_more(line: Line) -> None
     assert message.endswith("; the last of them tells no current: is the sensor connected?")
 
 
-async def test_a_temperature_and_cells_that_no_pack_has_are_not_published(line: Line) -> None:
+async def test_implausible_temperatures_and_cell_voltages_are_not_published(line: Line) -> None:
     async with service(line, hello=b"\n", protocol="text") as live:
         live.line.write(b"V=3.8 I=0.1 T=1e308 cells=3.8,1e308\n")
         told = await live.until(lambda s: s.estimate is not None)

@@ -29,7 +29,7 @@ SAVED = BootTimestamp(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, 
         ({"boot": "", "boot_s": 5007.0, "synchronised": False}, math.inf),
     ],
 )
-def test_a_checkpoint_is_as_old_as_the_clock_that_can_be_trusted_says(
+def test_the_age_of_a_checkpoint_follows_from_a_trusted_clock(
     tmp_path: Path, changes: dict[str, float | str | bool], unseen_s: float
 ) -> None:
     estimator = new_estimator(SETTINGS, CELL)
@@ -39,17 +39,17 @@ def test_a_checkpoint_is_as_old_as_the_clock_that_can_be_trusted_says(
     assert CheckpointFile(tmp_path, SETTINGS, CELL, lambda: later).load().unseen_s == unseen_s
 
 
-def test_a_wall_clock_that_was_wrong_when_it_was_saved_tells_nothing_after_a_reboot() -> None:
+def test_after_a_reboot_the_age_is_unknown_if_the_wall_clock_was_wrong() -> None:
     later = replace(SAVED, boot="two", wall_s=SAVED.wall_s + 5.0)
     assert later.since(replace(SAVED, synchronised=False)) == math.inf
 
 
-def test_a_clock_is_right_when_the_kernel_says_so_whoever_sets_it() -> None:
+def test_the_wall_clock_is_trusted_if_the_kernel_reports_synchronisation() -> None:
     """The C library's ntp_gettime tells the same, without the settings."""
     assert synchronised() == (ctypes.CDLL(None).ntp_gettime(ctypes.create_string_buffer(128)) != 5)
 
 
-def test_the_machine_tells_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_boot_time_is_read_from_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("BMS_BOOT_ID", raising=False)
     first, second = boot_timestamp(), boot_timestamp()
     assert first.boot == second.boot

@@ -16,7 +16,7 @@ from tests.patience import LONG_S
 from tests.serial_line import Line
 
 
-async def test_what_a_board_measures_reaches_both(line: Line, tmp_path: Path) -> None:
+async def test_samples_of_a_board_reach_influxdb_and_prometheus(line: Line, tmp_path: Path) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client is not installed: pip install prometheus-client")
     if INFLUXD is None:
         pytest.skip("influxd is not installed (apt-get install influxdb)")

@@ -42,7 +42,7 @@ async def run_at(hours: float, folder: Path, *rows: tuple[float, float, float], 
     return await asyncio.wait_for(running, LONG_S), sink.snapshots[-1]
 
 
-async def test_counters_outlive_restarts_and_what_nobody_saw_is_added_up(tmp_path: Path) -> None:
+async def test_counters_survive_restarts_and_gaps_are_added_up(tmp_path: Path) -> None:
     await run_at(0.0, tmp_path, (0.0, 0.1, 3.8), (1.0, 0.1, 3.8), (1.5, 0.1, 9.9), (61.0, 0.1, 3.8), (62.0, 0.1, 3.8))
     _, last = await run_at(1.0, tmp_path, (7.0, 0.1, 3.8), (8.0, 0.1, 3.8))
     health = last.health
@@ -57,7 +57,7 @@ async def test_counters_outlive_restarts_and_what_nobody_saw_is_added_up(tmp_pat
     assert (health.restarts, health.total.crashes) == (1, 0)
 
 
-async def test_what_has_flowed_outlives_restarts(tmp_path: Path) -> None:
+async def test_charge_and_energy_survive_restarts(tmp_path: Path) -> None:
     hour = [(float(s), 2.0, 3.8) for s in range(3601)]
     _, discharged = await run_at(0.0, tmp_path, *hour)
     _, charged = await run_at(2.0, tmp_path, *((s, -1.0, v) for s, _, v in hour))
@@ -73,7 +73,7 @@ async def test_what_has_flowed_outlives_restarts(tmp_path: Path) -> None:
     assert told.equivalent_cycles == pytest.approx(2.0 / CELL.cell.capacity_ah)
 
 
-async def test_what_has_flowed_is_told_once_it_is_on_disk_so_that_a_kill_sets_nothing_back(tmp_path: Path) -> None:
+async def test_charge_and_energy_are_published_once_saved_so_that_a_kill_does_not_decrease_them(tmp_path: Path) -> None:
     release = threading.Event()
 
     class SlowDisk(CheckpointFile):
@@ -93,7 +93,7 @@ async def test_what_has_flowed_is_told_once_it_is_on_disk_so_that_a_kill_sets_no
     assert file.load().ledger.total.charge_out_ah == pytest.approx(1.0)
 
 
-async def test_a_run_without_a_sample_changes_no_counter_and_not_the_age_of_the_state(tmp_path: Path) -> None:
+async def test_a_run_without_samples_changes_neither_counters_nor_the_age_of_the_state(tmp_path: Path) -> None:
     await run_at(0.0, tmp_path, (0.0, 0.1, 3.8))
     await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))
     found = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(2.0)).load()
@@ -118,7 +118,7 @@ async def killed(folder: Path, *, with_a_sample: bool) -> None:
         assert await asyncio.to_thread(written.wait, LONG_S)
 
 
-async def test_starts_after_a_run_that_left_no_word_are_counted_as_crashes(tmp_path: Path) -> None:
+async def test_a_start_after_an_unclean_end_counts_as_a_crash(tmp_path: Path) -> None:
     counted = []
     await ran(tmp_path, samples=1)
     for with_a_sample in (True, False):
@@ -129,7 +129,7 @@ async def test_starts_after_a_run_that_left_no_word_are_counted_as_crashes(tmp_p
     assert counted == [0, 1, 2, 2]
 
 
-async def test_a_checkpoint_that_is_older_than_configured_is_refused_and_without_that_none_is(tmp_path: Path) -> None:
+async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: Path) -> None:
     CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(a_used_pack().record, NEW)
     for hours, settings, reason in (
         (24 * 400.0, SETTINGS, ""),
@@ -144,14 +144,14 @@ COUNTED = RunCounters(
 )
 
 
-async def test_what_is_counted_goes_on_over_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
+async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0))
     file.save(a_used_pack().record, COUNTED)
     _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edited("state", longest_days=2.0))
     assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
 
 
-async def test_checkpoints_of_later_versions_are_each_kept_and_what_they_have_counted_goes_on(
+async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_continue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A version is tried, and left again, more often than files are kept; the first are those that have learned most."""
@@ -170,7 +170,7 @@ async def test_checkpoints_of_later_versions_are_each_kept_and_what_they_have_co
     assert (tmp_path / "pack.refused.npz").read_bytes() == b"an older one"
 
 
-async def test_a_checkpoint_of_a_later_version_is_taken_up_by_that_version_once_what_was_said_is_done(
+async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after_the_logged_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, learned = tmp_path / "a folder", a_used_pack()
@@ -198,9 +198,7 @@ async def test_a_checkpoint_of_a_later_version_is_taken_up_by_that_version_once_
     ],
     ids=str,
 )
-async def test_counters_that_cannot_be_are_not_believed_and_cost_nothing_else(
-    tmp_path: Path, wrong: dict[str, Any]
-) -> None:
+async def test_implausible_counters_are_reset_and_the_state_is_restored(tmp_path: Path, wrong: dict[str, Any]) -> None:
     learned = a_used_pack()
     total = COUNTED.total.model_copy(update=wrong)
     CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTED, total=total))
@@ -213,7 +211,7 @@ async def test_counters_that_cannot_be_are_not_believed_and_cost_nothing_else(
     assert 0.0 <= health.total.unseen_s < LONG_S
 
 
-async def test_a_state_folder_that_is_deleted_is_made_anew_for_its_owner_alone(tmp_path: Path) -> None:
+async def test_a_deleted_state_folder_is_recreated_with_access_for_the_owner_only(tmp_path: Path) -> None:
     folder = tmp_path / "state"
     async with often(CheckpointFile(folder, SETTINGS, CELL)) as (source, sink, _):
         for second in range(3):
@@ -229,7 +227,7 @@ async def test_a_state_folder_that_is_deleted_is_made_anew_for_its_owner_alone(t
     assert [path.stat().st_mode & 0o777 for path in folder.iterdir()] == [0o600]
 
 
-async def test_a_disk_that_hangs_stops_neither_the_estimate_nor_the_end(
+async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "DISK_HUNG_S", 0.01)
@@ -257,7 +255,7 @@ async def stopped_by_nothing(hung: CheckpointFile) -> None:
         await asyncio.wait_for(task, LONG_S)
 
 
-async def test_after_a_long_rest_the_soc_is_that_of_the_voltage_again(tmp_path: Path) -> None:
+async def test_after_a_long_gap_the_soc_follows_from_the_voltage(tmp_path: Path) -> None:
     """The service was off for a week, in which somebody has charged the pack."""
     estimator = new_estimator(SETTINGS, CELL)
     for second in range(600):
@@ -271,7 +269,7 @@ async def test_after_a_long_rest_the_soc_is_that_of_the_voltage_again(tmp_path: 
     assert abs(told.state["soc"][0] - fresh.state["soc"][0]) < 2.0 * told.record["filter"]["soc_std"][0]
 
 
-def test_gaps_are_measured_as_the_kernel_finds_them() -> None:
+def test_gap_lengths_agree_with_the_kernel() -> None:
     estimator, rng = new_estimator(SETTINGS, CELL), np.random.default_rng(5)
     gap_s = float(estimator.settings["gap_s"][0])
     steps = rng.choice([0.1, 1.0, 2.0 * gap_s, 100.0, -50.0], 400)

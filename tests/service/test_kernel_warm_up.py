@@ -5,7 +5,7 @@ import gc
 from bms_estimator.service.kernel_warm_up import load_kernels
 
 
-def test_the_garbage_collector_no_longer_looks_through_the_kernels() -> None:
+def test_the_garbage_collector_skips_the_kernels() -> None:
     load_kernels()
     assert gc.get_freeze_count() > 50_000
     assert len(gc.get_objects()) < gc.get_freeze_count()

@@ -87,7 +87,7 @@ async def test_voltage_current_and_power_are_means_of_the_publish_window() -> No
     assert window.frames_received == 100
 
 
-async def test_a_run_in_blocks_leaves_the_state_of_single_steps() -> None:
+async def test_blocks_and_single_steps_give_equal_states() -> None:
     rng = np.random.default_rng(3)
     rows = [(0.01 * i, float(rng.normal(0.1, 0.05)), float(rng.normal(3.8, 0.01))) for i in range(500)]
     async with running() as run:
@@ -100,7 +100,7 @@ async def test_a_run_in_blocks_leaves_the_state_of_single_steps() -> None:
     assert live.record.tobytes() == alone.record.tobytes()
 
 
-async def test_samples_that_cannot_be_used_are_dropped_counted_and_published() -> None:
+async def test_unusable_samples_are_dropped_and_counted() -> None:
     async with running() as run:
         run.source.give((0.0, 0.1, 3.8))
         run.source.give(
@@ -174,14 +174,14 @@ async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> N
     assert "outside the cell's range" in (health.sensor_message or "")
 
 
-async def test_the_rate_of_the_boards_clock_is_published_once_it_is_known() -> None:
+async def test_the_drift_of_the_board_s_clock_is_published_once_it_is_measured() -> None:
     async with running() as run:
         assert (await run.sink.until(lambda _: True)).health.clock_ppm is None
         run.source.clock_ppm = 3012.5
         await run.sink.until(lambda s: s.health.clock_ppm == 3012.5)
 
 
-async def test_the_source_says_why_nothing_comes() -> None:
+async def test_the_reason_for_missing_samples_is_published() -> None:
     async with running() as run:
         run.source.message = "waiting for /dev/ttyUSB0: it does not exist"
         said = await run.sink.until(lambda s: s.health.sensor_message == run.source.message)
@@ -226,7 +226,7 @@ async def test_requests_reach_the_running_estimator() -> None:
     assert state.state["soc"][0] == 0.8
 
 
-async def test_health_on_request_and_on_its_topic_tell_the_true_drops_and_what_was_asked() -> None:
+async def test_health_counts_dropped_messages_and_requests() -> None:
     async with running() as run:
         await run.sink.until(lambda _: True)
         run.delivery.drops = 7
@@ -240,7 +240,7 @@ async def test_health_on_request_and_on_its_topic_tell_the_true_drops_and_what_w
 
 
 @pytest.mark.parametrize("again", [{}, {"serial": "A1", "firmware": "1.1"}])
-async def test_a_board_that_says_nothing_for_a_while_is_still_the_one_that_is_known(again: dict[str, str]) -> None:
+async def test_the_properties_of_a_silent_board_stay_published(again: dict[str, str]) -> None:
     async with running() as run:
         run.source.board = {"serial": "A1", "firmware": "1.0"}
         run.source.give((0.0, 0.1, 3.8))
@@ -281,7 +281,7 @@ class Zeroed:
 AT_REST = [(0.03, 3.8)] * (round(WATCHED_S) + 2)
 
 
-async def test_the_present_current_is_taken_as_zero_when_the_pack_was_at_rest() -> None:
+async def test_current_zero_is_accepted_at_rest() -> None:
     zero = Zeroed()
     async with running(current_zero=zero, clock=zero.clock) as run:
         await zero.watch(run, AT_REST)
@@ -299,9 +299,7 @@ async def test_the_present_current_is_taken_as_zero_when_the_pack_was_at_rest() 
         ([*AT_REST, (0.03, 3.7), (0.03, 3.7)], "the voltage moved by 0.1 V"),
     ],
 )
-async def test_the_present_current_is_not_taken_as_zero_while_it_flows(
-    rows: list[tuple[float, float]], why: str
-) -> None:
+async def test_current_zero_is_rejected_while_current_flows(rows: list[tuple[float, float]], why: str) -> None:
     zero = Zeroed()
     async with running(current_zero=zero, clock=zero.clock) as run:
         await zero.watch(run, rows)
@@ -310,7 +308,7 @@ async def test_the_present_current_is_not_taken_as_zero_while_it_flows(
     assert zero.times == 0
 
 
-async def test_what_was_seen_before_the_board_was_silent_is_no_rest() -> None:
+async def test_rest_before_a_silence_does_not_count() -> None:
     zero = Zeroed()
     async with running(current_zero=zero, clock=zero.clock) as run:
         await zero.watch(run, AT_REST)
@@ -322,14 +320,14 @@ async def test_what_was_seen_before_the_board_was_silent_is_no_rest() -> None:
     assert zero.times == 0
 
 
-async def test_a_source_without_a_zero_says_so() -> None:
+async def test_current_zero_is_rejected_by_a_source_without_it() -> None:
     async with running() as run:
         await run.sink.until(lambda _: True)
         with pytest.raises(UserError, match="no zero"):
             await run.ask("current_zero")
 
 
-async def test_a_parameter_says_where_it_comes_from_and_a_negative_capacitance_why_it_is_missing() -> None:
+async def test_a_parameter_has_its_source_and_a_missing_capacitance_its_reason() -> None:
     known = {"pack": PackSettings(initial_soc=0.001), "identifier": IdentifierSettings(soc_std=0.005)}
     nearly_empty = SETTINGS.model_copy(update=known)
     async with running(nearly_empty) as run:
@@ -344,7 +342,7 @@ async def test_a_parameter_says_where_it_comes_from_and_a_negative_capacitance_w
     assert "is not above delta_1" in (missing.reason or "")
 
 
-async def test_systemd_hears_ready_watchdog_and_stopping(tmp_path: Path) -> None:
+async def test_systemd_is_notified_of_ready_watchdog_and_stopping(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.setblocking(False)
@@ -379,7 +377,7 @@ async def test_a_source_that_never_waits_does_not_starve_the_sinks() -> None:
     await asyncio.wait_for(running, LONG_S)
 
 
-async def test_a_fault_of_the_source_is_raised_not_swallowed() -> None:
+async def test_an_exception_of_the_source_is_raised() -> None:
     class Broken(ScriptedSource):
         async def __aiter__(self) -> AsyncIterator[Any]:
             raise ZeroDivisionError
@@ -389,7 +387,7 @@ async def test_a_fault_of_the_source_is_raised_not_swallowed() -> None:
         await run_estimation_loop(SETTINGS, CELL, source=Broken(), sinks=[], stop=asyncio.Event())
 
 
-async def test_how_long_something_blocked_the_loop_is_published() -> None:
+async def test_the_lag_of_the_event_loop_is_published() -> None:
     async with running() as run:
         await run.sink.until(lambda _: True)
         time.sleep(0.4)  # noqa: ASYNC251 - blocks the loop, as a slow disk or terminal would

@@ -74,7 +74,9 @@ async def serving(told: Settings, tap: CaptureRecorder | None = None) -> AsyncIt
         await asyncio.wait_for(service, LONG_S)
 
 
-async def test_what_a_node_publishes_is_estimated_through_all_that_happens(broker: Broker, tmp_path: Path) -> None:
+async def test_readings_over_mqtt_are_estimated_through_disconnections_and_restarts(
+    broker: Broker, tmp_path: Path
+) -> None:
     await publish(broker, "40.00", "99.0")  # of yesterday: the broker keeps it
     told, path = settings(broker), tmp_path / "heard.raw"
     with CaptureRecorder(path, header_of(told.sensor, told.source)) as recording:
@@ -120,7 +122,7 @@ async def garbled(broker: Broker, listener: Listener) -> None:
     assert not health["sensor_online"]
 
 
-async def test_a_publisher_that_must_be_asked_is_asked(broker: Broker) -> None:
+async def test_a_publisher_that_needs_requests_is_polled(broker: Broker) -> None:
     told = settings(broker, profile="venus", prefix="c0619ab", instance="1", ask_s=0.1)
 
     async def answer() -> None:
@@ -144,7 +146,7 @@ async def test_a_publisher_that_must_be_asked_is_asked(broker: Broker) -> None:
             await end(device)
 
 
-async def test_the_next_broker_is_tried_and_the_one_that_is_not_there_is_named(broker: Broker) -> None:
+async def test_the_next_broker_is_tried_and_the_unreachable_one_is_named(broker: Broker) -> None:
     dead = f"mqtt://127.0.0.1:{free_port()}"
     source = open_line_source(settings(broker, url=[dead, broker.url]))
     assert source

@@ -17,7 +17,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from tests.patience import LONG_S
 
 
-async def test_the_log_says_what_of_the_settings_cannot_be():
+async def test_implausible_settings_are_logged():
     settings = Settings(pack=PackSettings(series=14), sensor=SensorSettings(port="/dev/none"))
     stop = asyncio.Event()
     stop.set()
@@ -42,7 +42,7 @@ async def test_the_log_says_what_of_the_settings_cannot_be():
         ),
     ],
 )
-async def test_one_of_several_packs_that_cannot_be_served_is_named(
+async def test_the_error_names_the_pack_that_cannot_be_served(
     names: tuple[str, str], ports: tuple[str, str], mqtt: dict[str, str], said: str, state_home: Path
 ) -> None:
     cell, packs = load_cell("chen_mora"), []
@@ -53,7 +53,7 @@ async def test_one_of_several_packs_that_cannot_be_served_is_named(
         await asyncio.wait_for(run_pack_services(packs), LONG_S)
 
 
-async def test_packs_without_a_serial_line_need_no_port_of_their_own(state_home: Path) -> None:
+async def test_packs_without_a_serial_line_may_share_the_port_setting(state_home: Path) -> None:
     source = {"kind": "mqtt", "profile": "opendtu", "url": "mqtt://localhost"}
     sources = {"a": source, "b": source | {"password_file": "/none"}}
     tables = [{"pack": {"name": name}, "source": table} for name, table in sources.items()]
@@ -62,7 +62,9 @@ async def test_packs_without_a_serial_line_need_no_port_of_their_own(state_home:
         await asyncio.wait_for(run_pack_services(packs), LONG_S)
 
 
-def test_a_user_without_a_home_is_served_and_told_that_the_state_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_home_folder_the_service_runs_and_logs_that_state_is_not_saved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setenv("HOME", "~")
     with capture_logs() as lines:

@@ -120,7 +120,7 @@ async def feed(line: Line) -> None:
         await asyncio.sleep(0.02)
 
 
-async def test_a_killed_service_is_offline_by_its_will_and_one_that_is_asked_says_so_itself(
+async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_by_its_own_message(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     line.plug()
@@ -181,7 +181,7 @@ def unread_pipe() -> Iterator[int]:
         os.close(write)
 
 
-async def test_a_service_that_is_asked_to_end_saves_first_though_its_broker_stands_still(
+async def test_a_stopping_service_saves_first_although_its_broker_hangs(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     line.plug()
@@ -200,7 +200,7 @@ async def test_a_service_that_is_asked_to_end_saves_first_though_its_broker_stan
         assert saved["state"]["observer"]["samples"][0] >= told["frames_received"]
 
 
-async def test_a_disk_that_never_answers_and_a_log_that_nobody_reads_stop_neither_the_estimate_nor_the_end(
+async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shutdown(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
     """As where the log is on that disk, too."""
@@ -229,7 +229,7 @@ async def test_hangup_ends_the_service_cleanly(
         assert await asyncio.wait_for(process.wait(), LONG_S) == 0
 
 
-async def test_service_that_has_not_started_ends_cleanly_on_a_signal(
+async def test_a_service_that_is_still_starting_ends_cleanly_on_a_signal(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
     program = [sys.executable, "-c", STARTING]
@@ -240,7 +240,7 @@ async def test_service_that_has_not_started_ends_cleanly_on_a_signal(
     assert json.loads(log)["event"] == "asked to end before samples were taken"
 
 
-async def test_a_disk_without_room_for_a_folder_is_no_error_that_a_service_is_given_up_for(
+async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_restarts(
     tmp_path: Path, line: Line, broker: Broker, disk_without_files: Path
 ) -> None:
     folder = disk_without_files / "state"
@@ -251,7 +251,7 @@ async def test_a_disk_without_room_for_a_folder_is_no_error_that_a_service_is_gi
     assert said == f"error: state.folder = {folder}: No space left on device\n"
 
 
-async def test_two_packs_are_served_by_one_process_each_with_its_own_board_topics_log_and_checkpoint(
+async def test_two_packs_in_one_process_have_their_own_board_topics_log_and_checkpoint(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     other = Line(tmp_path / "other board")

@@ -60,7 +60,7 @@ def systemd(tmp_path: Path):
     systemd.close()
 
 
-async def test_a_source_that_hangs_is_not_covered_by_the_loop_that_turns(systemd: Systemd) -> None:
+async def test_a_hanging_source_stops_the_watchdog_notifications(systemd: Systemd) -> None:
     health = SourceHealth(0.0, 0.0, 0)
     source, sink = ScriptedSource(), Collector()
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
@@ -79,7 +79,9 @@ async def test_a_source_that_hangs_is_not_covered_by_the_loop_that_turns(systemd
     await asyncio.wait_for(task, LONG_S)
 
 
-async def test_the_task_of_a_board_tells_whether_it_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+async def test_the_idle_time_of_a_source_s_task_grows_while_it_hangs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     now_s, opened = 0.0, asyncio.Event()
 
     async def hang(_: SerialPort) -> str:
@@ -101,7 +103,7 @@ async def test_the_task_of_a_board_tells_whether_it_hangs(monkeypatch: pytest.Mo
         assert board.pulse().task_idle_s == 100.0
 
 
-async def test_systemctl_status_shows_the_soc_and_why_samples_do_not_come(systemd: Systemd) -> None:
+async def test_systemctl_status_shows_the_soc_or_the_reason_for_missing_samples(systemd: Systemd) -> None:
     source, sink = ScriptedSource(), Collector()
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
     task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges))
@@ -116,7 +118,7 @@ async def test_systemctl_status_shows_the_soc_and_why_samples_do_not_come(system
     await asyncio.wait_for(task, LONG_S)
 
 
-async def test_health_tells_how_long_bytes_wait_and_how_many_reads() -> None:
+async def test_health_contains_latency_and_waiting_reads() -> None:
     source, sink = ScriptedSource(), Collector()
     late_s = [0.3]
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
@@ -133,7 +135,7 @@ async def test_health_tells_how_long_bytes_wait_and_how_many_reads() -> None:
     assert (told.latency_p50_s, told.latency_p99_s) == (0.3, 0.3)
 
 
-def test_percentiles_of_the_latency_are_right_to_a_fifth() -> None:
+def test_latency_percentiles_are_accurate_to_a_fifth() -> None:
     latency = Latency()
     assert latency.take() is None
     for late_s in [0.002] * 97 + [0.05, 0.05, 0.7]:
@@ -147,7 +149,7 @@ def test_percentiles_of_the_latency_are_right_to_a_fifth() -> None:
     assert latency.take() == pytest.approx((1e-5, 284.0, 1e6), rel=0.5)
 
 
-def test_health_tells_of_a_recording(tmp_path: Path) -> None:
+def test_health_contains_the_state_of_a_recording(tmp_path: Path) -> None:
     assert recording_health(None) is None
     with CaptureRecorder(tmp_path / "raw", header_of(SensorSettings())) as recording:
         recording.write(0.0, b"12345")
