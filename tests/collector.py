@@ -1,4 +1,4 @@
-"""A sink that stores its snapshots."""
+"""Sink for tests, which stores its snapshots."""
 
 import asyncio
 from collections.abc import Callable
@@ -9,15 +9,15 @@ from tests.patience import LONG_S
 
 
 class Collector:
-    """Keeps snapshots."""
+    """Sink that stores its snapshots."""
 
     def __init__(self) -> None:
         self.snapshots: list[Snapshot] = []
-        self._news = asyncio.Event()
+        self._received = asyncio.Event()
 
     def publish(self, snapshot: Snapshot) -> None:
         self.snapshots.append(snapshot)
-        self._news.set()
+        self._received.set()
 
     async def __aenter__(self) -> Self:
         return self
@@ -25,14 +25,14 @@ class Collector:
     async def __aexit__(self, *_: object) -> None:
         pass
 
-    async def until(self, wanted: Callable[[Snapshot], bool], skip: int = 0) -> Snapshot:
-        """The first snapshot that is wanted, of those after the first ``skip``."""
+    async def until(self, accepts: Callable[[Snapshot], bool], skip: int = 0) -> Snapshot:
+        """Wait for a snapshot that ``accepts`` accepts, and return it; the first ``skip`` snapshots are ignored."""
         seen = skip
         async with asyncio.timeout(LONG_S):
             while True:
-                self._news.clear()
+                self._received.clear()
                 for snapshot in self.snapshots[seen:]:
-                    if wanted(snapshot):
+                    if accepts(snapshot):
                         return snapshot
                 seen = max(seen, len(self.snapshots))
-                await self._news.wait()
+                await self._received.wait()

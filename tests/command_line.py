@@ -1,4 +1,4 @@
-"""The command line: as a program, and within the test's own process."""
+"""Command line of the project, as a program and in the process of the test."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int | str, str, str]:
-    """Exit code, stdout, stderr of the command line."""
+    """Run the command line in this process. Return exit code, stdout and stderr."""
     with pytest.raises(SystemExit) as ended:
         main([str(argument) for argument in arguments])
     out, err = capsys.readouterr()

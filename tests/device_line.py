@@ -1,4 +1,4 @@
-"""A simulated device that speaks on its line while a test does other things."""
+"""Simulated device that runs in a thread while a test uses its line."""
 
 import asyncio
 import threading
@@ -10,22 +10,22 @@ from tests.patience import LONG_S
 
 
 @contextmanager
-def on_a_line(device: SimulatedMeter) -> Iterator[str]:
-    """Path of the line of a device that speaks, in a thread of its own."""
+def running_device(device: SimulatedMeter) -> Iterator[str]:
+    """Run a device in a thread; yield the path of its line."""
 
-    async def speak() -> None:
+    async def run_until_stopped() -> None:
         nonlocal loop, stop
         loop, stop = asyncio.get_running_loop(), asyncio.Event()
-        speaking = asyncio.create_task(device.run())
+        running = asyncio.create_task(device.run())
         ready.set()
         await stop.wait()
-        speaking.cancel()
-        await asyncio.gather(speaking, return_exceptions=True)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
 
     loop, stop, ready = asyncio.new_event_loop(), asyncio.Event(), threading.Event()
     loop.close()
     with device:
-        thread = threading.Thread(target=lambda: asyncio.run(speak()))
+        thread = threading.Thread(target=lambda: asyncio.run(run_until_stopped()))
         thread.start()
         assert ready.wait(LONG_S)
         try:

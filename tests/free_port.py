@@ -5,20 +5,22 @@ import os
 import socket
 
 FIRST, END = 20_000, 32_768
-"""Below those that the kernel gives to connections (``net.ipv4.ip_local_port_range``): one of these could be taken by a
-connection between being found free and being listened on, or while a server that was killed is started again."""
+"""Range of ports. It lies below the ports of outgoing connections (``net.ipv4.ip_local_port_range``), one of which could
+take a port before its server listens or while its server is restarted."""
 
 
 def _part() -> range:
-    """Ports of this process: another worker of the same run would take those of a server that is killed and started again."""
+    """Return the ports of this worker. Other workers have other ports, so that they cannot take that of a restarted server."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % workers  # after a crash they are numbered on
+    worker = (
+        int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % workers
+    )  # the number grows after a crash of a worker
     size = (END - FIRST) // workers
     return range(FIRST + worker * size, FIRST + (worker + 1) * size)
 
 
 _ports = _part()
-_numbers = itertools.count(101 * os.getpid())  # several runs on one machine: each begins elsewhere
+_numbers = itertools.count(101 * os.getpid())  # each run on a machine begins with another port
 
 
 def free_port() -> int:

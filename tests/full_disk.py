@@ -1,4 +1,4 @@
-"""A real file system without room."""
+"""Real file system without free space."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 
 @pytest.fixture
 def full_disk(tmp_path: Path) -> Iterator[Path]:
-    """Folder of a file system in which no byte can be written; empty files and folders can."""
+    """Mount a full file system and return its folder. Only empty files and folders can be created in it."""
     if os.geteuid() != 0:
         pytest.skip("only root can mount a file system")
     disk = tmp_path / "disk"
@@ -26,7 +26,7 @@ def full_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def disk_without_files(full_disk: Path) -> Path:
-    """Mount a full disk as ``full_disk``, on which no folder can be created either."""
+    """Mount a full file system on which not even a folder can be created."""
     inodes = os.statvfs(full_disk).f_files - os.statvfs(full_disk).f_ffree
     subprocess.run(["mount", "-o", f"remount,nr_inodes={inodes}", full_disk], check=True)
     return full_disk

@@ -1,4 +1,4 @@
-"""A real InfluxDB 1 on free ports of the loopback."""
+"""Real InfluxDB 1 on free ports on loopback."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ INFLUXD = shutil.which("influxd", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/
 
 
 class InfluxDB:
-    """The server with one database; can be stopped and restarted on its port with its data."""
+    """InfluxDB server with one database. A restart uses the same port and data."""
 
     def __init__(self, folder: Path) -> None:
         self.url = f"http://127.0.0.1:{free_port()}"
@@ -58,7 +58,7 @@ log-enabled = false
             self._process = None
 
     def ask(self, query: str) -> list[dict[str, Any]]:
-        """Rows of an InfluxQL query, each by its columns."""
+        """Run an InfluxQL query. Return its rows as dictionaries."""
         data = urllib.parse.urlencode({"q": query, "db": "bms", "epoch": "ms"}).encode()
         with urllib.request.urlopen(f"{self.url}/query", data, timeout=LONG_S) as response:
             [result] = json.load(response)["results"]
@@ -70,7 +70,7 @@ log-enabled = false
         ]
 
     def write(self, lines: list[str]) -> None:
-        """Lines with times in milliseconds."""
+        """Write lines of the line protocol with times in milliseconds."""
         body = "\n".join(lines).encode()
         with urllib.request.urlopen(f"{self.url}/write?db=bms&precision=ms", body, timeout=LONG_S) as response:
             assert response.status == 204

@@ -1,4 +1,4 @@
-"""A real Mosquitto on a free port on loopback, and a listener that stores its messages."""
+"""Real Mosquitto on a free port on loopback, and a subscriber that stores all messages."""
 
 import asyncio
 import getpass
@@ -22,7 +22,7 @@ MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/
 
 
 class Broker:
-    """Mosquitto; can be stopped and restarted on its port without its retained messages."""
+    """Mosquitto server. A restart uses the same port and loses the retained messages."""
 
     def __init__(self, folder: Path, extra: str = "allow_anonymous true") -> None:
         self.port = free_port()
@@ -50,7 +50,7 @@ class Broker:
         raise AssertionError("mosquitto did not start")
 
     def freeze(self) -> None:
-        """It answers nothing, though the kernel still accepts its connections."""
+        """Suspend the server, so that it answers nothing while the kernel still accepts connections."""
         assert self._process
         self._process.send_signal(signal.SIGSTOP)
 
@@ -59,7 +59,7 @@ class Broker:
         self._process.send_signal(signal.SIGCONT)
 
     def stop(self) -> None:
-        """Ask it to end until it has: right after its port is open it forgets a signal (it sets what the signal cleared)."""
+        """Terminate the server. The signal is repeated, because Mosquitto loses one that arrives right after it opened its port."""
         deadline = time.monotonic() + LONG_S
         while self._process is not None:
             self._process.terminate()
@@ -84,7 +84,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 class Listener:
-    """Subscribes to everything; keeps the messages in order.
+    """Subscriber of all topics that stores the messages in order.
 
     Attributes:
         messages: (topic, payload, retain flag as delivered).
@@ -94,7 +94,7 @@ class Listener:
         self._client = aiomqtt.Client("127.0.0.1", broker.port, timeout=LONG_S, **options)
         self._topic = topic
         self.messages: list[tuple[str, bytes, bool]] = []
-        self._news = asyncio.Event()
+        self._received = asyncio.Event()
 
     async def __aenter__(self) -> Self:
         await self._client.__aenter__()
@@ -111,7 +111,7 @@ class Listener:
         async for message in self._client.messages:
             payload = message.payload if isinstance(message.payload, bytes) else b""
             self.messages.append((message.topic.value, payload, bool(message.retain)))
-            self._news.set()
+            self._received.set()
 
     async def publish(self, topic: str, payload: bytes | str = b"", **options: Any) -> None:
         await self._client.publish(topic, payload, **options)
@@ -119,27 +119,27 @@ class Listener:
     def all(self, topic: str) -> list[bytes]:
         return [payload for name, payload, _ in self.messages if name == topic]
 
-    async def wait(self, topic: str, wanted: Callable[[bytes], bool] = lambda _: True, skip: int = 0) -> bytes:
-        """The first message on ``topic`` that is wanted, of those after the first ``skip`` of all messages."""
+    async def wait(self, topic: str, accepts: Callable[[bytes], bool] = lambda _: True, skip: int = 0) -> bytes:
+        """Wait for a payload on ``topic`` that ``accepts`` accepts, and return it; the first ``skip`` messages are ignored."""
         deadline = time.monotonic() + LONG_S
         while time.monotonic() < deadline:
-            self._news.clear()
+            self._received.clear()
             for name, payload, _ in self.messages[skip:]:
-                if name == topic and wanted(payload):
+                if name == topic and accepts(payload):
                     return payload
             try:
                 async with asyncio.timeout(max(deadline - time.monotonic(), 0.0)):
-                    await self._news.wait()
+                    await self._received.wait()
             except TimeoutError:
                 break
         seen = {name: payload[:300] for name, payload, _ in self.messages}
-        raise AssertionError(f"{topic} did not bring what was wanted; last on each topic: {seen}")
+        raise AssertionError(f"{topic} received no accepted message; last on each topic: {seen}")
 
-    async def wait_json(self, topic: str, wanted: Callable[[Any], bool] = lambda _: True, skip: int = 0) -> Any:
+    async def wait_json(self, topic: str, accepts: Callable[[Any], bool] = lambda _: True, skip: int = 0) -> Any:
         """Decode the result of ``wait``; a NaN in the payload is a failure."""
 
         def nan(token: str) -> None:
             raise AssertionError(f"{topic} holds {token}")
 
-        decoded = await self.wait(topic, lambda p: bool(p) and wanted(json.loads(p, parse_constant=nan)), skip)
+        decoded = await self.wait(topic, lambda p: bool(p) and accepts(json.loads(p, parse_constant=nan)), skip)
         return json.loads(decoded)

@@ -1,4 +1,4 @@
-"""The program on a pseudo-terminal of any size, whose screen is read or left alone."""
+"""The command line on a pseudo-terminal of any size."""
 
 import fcntl
 import os
@@ -15,14 +15,14 @@ from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
 HOME, ALTERNATE, BACK, CURSOR = "\x1b[H", "\x1b[?1049h", "\x1b[?1049l", "\x1b[?25h"
-"""Control sequences: begin of a screen, its taking and giving back, the cursor shown again."""
+"""Control sequences: cursor to the top left, enter and leave the alternate screen, show the cursor."""
 
 
 class PseudoTerminal:
     """``bms-estimator ARGUMENTS`` with a terminal as standard output and standard error.
 
     Attributes:
-        output: All that was read so far.
+        output: Output read so far.
         process: The program.
     """
 
@@ -35,7 +35,7 @@ class PseudoTerminal:
     def __enter__(self) -> Self:
         self.settings = termios.tcgetattr(self._slave)
         command = [PROGRAM, *self._arguments]
-        # its size is the terminal's, whatever the shell says that started the tests
+        # these variables of the shell that started the tests would override the size of the terminal
         env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
         self.process = subprocess.Popen(
             command, stdin=self._slave, stdout=self._slave, stderr=self._slave, env=env | {"TERM": "xterm-256color"}
@@ -55,24 +55,24 @@ class PseudoTerminal:
         os.write(self._master, keys)
 
     def read(self) -> None:
-        """Take what has come, or wait a little for it."""
+        """Read the available output, or wait up to 0.1 s for it."""
         if select.select([self._master], [], [], 0.1)[0]:
             self.output += os.read(self._master, 1 << 16).decode(errors="replace")
 
     def until(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + LONG_S
         while not condition():
-            assert time.monotonic() < deadline, f"the terminal never showed it: {self.screen()}"
+            assert time.monotonic() < deadline, f"the expected output never appeared: {self.screen()}"
             self.read()
 
     def ended(self) -> bool:
         return self.process.poll() is not None
 
     def screen(self) -> list[str]:
-        """Lines of the last whole screen, without colours; empty before one has come."""
+        """Return the lines of the last complete screen without colours; empty before the first one."""
         screens = self.output.split(HOME)
         return re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", screens[-2]).split("\r\n") if len(screens) > 2 else []
 
     def is_as_before(self) -> bool:
-        """Whether the program has left the terminal as it found it."""
+        """Return True if the program has restored the settings of the terminal."""
         return termios.tcgetattr(self._slave) == self.settings

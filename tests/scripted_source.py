@@ -1,4 +1,4 @@
-"""A source that yields what a test puts into it."""
+"""Source of samples for tests, which yields the given blocks."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -10,7 +10,7 @@ from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 
 
 class ScriptedSource:
-    """Blocks from a queue; ``finish`` ends it."""
+    """Source that yields blocks from a queue until ``finish``."""
 
     def __init__(self) -> None:
         self.counters: dict[str, int] = {"frames_received": 0, "frames_lost": 0, "crc_errors": 0, "reconnects": 0}
@@ -32,7 +32,7 @@ class ScriptedSource:
             yield block
 
     def give(self, *rows: tuple[float, float, float] | tuple[float, float, float, float, int]) -> None:
-        """Rows of (time_s, current_a, voltage_v[, temperature_c, status])."""
+        """Add a block with rows of (time_s, current_a, voltage_v[, temperature_c, status])."""
         padded = [row if len(row) == 5 else (*row, np.nan, 0) for row in rows]
         self._queue.put_nowait(np.array(padded, dtype=SAMPLE))
 

@@ -1,4 +1,4 @@
-"""A serial line for tests: a PTY under a stable name that can be unplugged and plugged in again."""
+"""Serial line for tests: a pseudo-terminal with a fixed path that can be unplugged and plugged in again."""
 
 import os
 import tty
@@ -10,14 +10,14 @@ from serial.tools.list_ports_common import ListPortInfo
 
 
 def usb_port(device: str, vid: int = 0x1A86, pid: int = 0x7523, product: str = "USB Serial") -> ListPortInfo:
-    """A port as pyserial lists it; without more a CH340's."""
+    """Return a USB port as pyserial lists it; by default that of a CH340."""
     port = ListPortInfo(device)
     port.vid, port.pid, port.product, port.description = vid, pid, product, product
     return port
 
 
 class Line:
-    """The board's end of the line."""
+    """The board's end of a serial line."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -38,8 +38,8 @@ class Line:
     def write(self, data: bytes) -> None:
         os.write(self._master, data)
 
-    def heard(self) -> bytes:
-        """What the host has sent."""
+    def received(self) -> bytes:
+        """Return the bytes that the host has sent since the last call."""
         os.set_blocking(self._master, False)
         try:
             return os.read(self._master, 1 << 16)

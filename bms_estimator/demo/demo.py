@@ -1,4 +1,4 @@
-"""Demo: broker, board and the real service in one process. The estimator starts with a wrong SOC and finds the true one."""
+"""Demo: broker, simulated board and the real service. The estimator starts with a wrong SOC and converges to the true one."""
 
 import asyncio
 import sys
@@ -26,14 +26,14 @@ from bms_estimator.sinks.terminal.sink import TerminalSink
 
 CELL = "chen_mora"
 LOAD_A = 0.5
-"""Steps up to twice the capacity per hour: SOC falls by more than a percent in a minute [A]."""
-TRUE_SOC, TOLD_SOC = 0.9, 0.7
-"""True SOC at the start, and the SOC that the estimator is given. It assumes a std of 0.2."""
+"""Mean of the random load [A]. Its steps reach 2 C, so that the SOC falls by more than a percent in a minute."""
+TRUE_SOC, INITIAL_SOC = 0.9, 0.7
+"""True SOC at the start, and the wrong initial SOC of the estimator, which assumes a std of 0.2."""
 RESOLUTION_V = 5e-3
-"""Resolution of a mean of many noisy conversions [V]: a fifth of the converter's step."""
+"""Resolution of the board's voltage [V]. It is a fifth of the converter's step, because the board averages noisy conversions."""
 PUBLISH_RATE_HZ = 4.0
 LAMBDA = 1e4
-"""Lambda of the gain (3.10): makes visible within minutes what takes k hours with the usual 1."""
+"""Lambda of the gain (3.10). With the default of 1 the growth of k would become visible only after hours."""
 
 
 async def run_demo(
@@ -46,15 +46,15 @@ async def run_demo(
     log: Iterable[str],
     opened: Callable[[str], object],
 ) -> str:
-    """Run until a signal or the time's end.
+    """Run the demo until a signal, or for ``seconds``.
 
     Args:
-        rate_hz: Samples per second of the board's time.
-        speed: The board's seconds per second.
-        port: Port of the broker; None: 1883, or a free one.
-        page_port: Port of the live page; None: 8765, or a free one.
-        seconds: Duration; None: until a signal.
-        log: Log lines for the live view.
+        rate_hz: Sample rate on the board's clock [Hz].
+        speed: Speed of the board's clock relative to real time.
+        port: Port of the broker; None: 1883, or any free one.
+        page_port: Port of the live page; None: 8765, or any free one.
+        seconds: Duration [s]; None: until a signal.
+        log: Log lines that the terminal view shows.
         opened: Called with the address of the live page once it is served.
 
     Returns:
@@ -63,7 +63,7 @@ async def run_demo(
     stop = stop_on_signal()
     cell = load_cell(CELL)
     truth = TrueSoc(SimulatedPack(cell, random_steps(LOAD_A), soc=TRUE_SOC))
-    totals = Totals(TOLD_SOC - TRUE_SOC, truth.soc)
+    result = DemoResult(INITIAL_SOC - TRUE_SOC, truth.soc)
     async with DemoBroker(port) as broker, _running_board(truth, rate_hz, speed) as board:
         page = f"{LOOPBACK}:{choose_port(page_port, parse_listen(DEFAULT_LISTEN).port)}"
         hint = f"live page: http://{page}/; in a second terminal: {broker.look_command}"
@@ -75,8 +75,8 @@ async def run_demo(
         view = TerminalSink(log=log, hint=hint, true_soc=truth.soc)
         pages = Pages(opened)
         # no state folder: start from the beginning each time
-        await run_pack_service(settings, cell, sinks=[view, totals], tap=truth, stop=stop, pages=pages)
-    return totals.summary()
+        await run_pack_service(settings, cell, sinks=[view, result], tap=truth, stop=stop, pages=pages)
+    return result.summary()
 
 
 @asynccontextmanager
@@ -93,7 +93,7 @@ async def _running_board(truth: TrueSoc, rate_hz: int, speed: float) -> AsyncIte
 
 def _settings(path: str, url: str, page: str, rate_hz: int) -> Settings:
     return Settings(
-        pack=PackSettings(name="demo", cell=CELL, initial_soc=TOLD_SOC),
+        pack=PackSettings(name="demo", cell=CELL, initial_soc=INITIAL_SOC),
         sensor=SensorSettings(port=path, sample_rate_hz=rate_hz, voltage_resolution_v=RESOLUTION_V),
         observer=ObserverSettings.model_validate({"lambda": LAMBDA}),
         publish=PublishSettings(rate_hz=PUBLISH_RATE_HZ),
@@ -102,12 +102,12 @@ def _settings(path: str, url: str, page: str, rate_hz: int) -> Settings:
     )
 
 
-class Totals:
-    """A sink that remembers the last estimate, and how far it was from the truth.
+class DemoResult:
+    """Sink that stores the last estimate and the true SOC at that time.
 
     Args:
-        first_error: Error of the SOC that the estimator starts with, 0..1.
-        true_soc: The pack's SOC 0..1 at the last sample.
+        first_error: Error of the initial SOC, 0..1.
+        true_soc: Returns the true SOC at the last sample, 0..1.
     """
 
     def __init__(self, first_error: float, true_soc: Callable[[], float]) -> None:
@@ -124,15 +124,15 @@ class Totals:
         """Nothing to close."""
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Take a snapshot."""
+        """Store the estimate of a snapshot."""
         if snapshot.estimate is not None:
             self._last, self._last_true_soc = snapshot.estimate, self._true_soc()
 
     def summary(self) -> str:
-        """Return the run in one line."""
+        """Return a summary of the run in one line."""
         e, elapsed_s = self._last, time.monotonic() - self._started_s
         if e is None or e.soc is None or e.soc_std is None:
-            return f"{elapsed_s:.1f} s, no sample came"
+            return f"{elapsed_s:.1f} s, no sample arrived"
         error, band = e.soc - self._last_true_soc, BAND_STDS * e.soc_std
         inside = "inside" if abs(error) <= band else "outside"
         return (

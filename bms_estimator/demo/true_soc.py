@@ -1,4 +1,4 @@
-"""True SOC of a simulated pack at the sample that was decoded last."""
+"""True SOC of a simulated pack at the last received sample."""
 
 from collections import deque
 
@@ -14,14 +14,14 @@ from bms_estimator.simulation.simulated_pack import SimulatedPack
 from bms_estimator.simulation.virtual_adc import Reading
 
 TAIL_BYTES = 256
-"""The last bytes contain a complete sample frame among others."""
+"""Number of stored bytes; enough to contain a complete sample frame."""
 
 
 class TrueSoc:
-    """A pack's signal for a board, and a tap on the board's line: the clock in a frame gives the time of the sample.
+    """Signal of a simulated pack for a board, and a tap on the board's line that reads the board's clock in each frame.
 
     Args:
-        pack: Read at times that may run ahead of the board's, as a simulator reads from a pipe.
+        pack: Simulated pack. The board may read it ahead of time, so past SOCs are stored until their sample arrives.
     """
 
     missed_reads = 0
@@ -29,18 +29,18 @@ class TrueSoc:
 
     def __init__(self, pack: SimulatedPack) -> None:
         self._pack = pack
-        self._ahead: deque[tuple[float, float]] = deque([(0.0, pack.soc)])
+        self._soc_history: deque[tuple[float, float]] = deque([(0.0, pack.soc)])
         self._tail = b""
         self._board_us = 0
 
     def __call__(self, time_s: float) -> Reading:
         """Return voltage and current at the pack's terminals at ``time_s`` [s]."""
         reading = self._pack(time_s)
-        self._ahead.append((time_s, self._pack.soc))
+        self._soc_history.append((time_s, self._pack.soc))
         return reading
 
     def write(self, _arrival_s: float, data: bytes) -> None:
-        """Take a read of the line."""
+        """Take bytes of the board's line."""
         self._tail = (self._tail + data)[-TAIL_BYTES:]
 
     def soc(self) -> float:
@@ -49,9 +49,9 @@ class TrueSoc:
             if (board_us := _board_us(frame)) is not None:
                 self._board_us += (board_us - self._board_us) % MODULUS
                 break
-        while len(self._ahead) > 1 and self._ahead[1][0] <= 1e-6 * self._board_us:
-            self._ahead.popleft()
-        return self._ahead[0][1]
+        while len(self._soc_history) > 1 and self._soc_history[1][0] <= 1e-6 * self._board_us:
+            self._soc_history.popleft()
+        return self._soc_history[0][1]
 
 
 def _board_us(frame: bytes) -> int | None:

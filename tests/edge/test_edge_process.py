@@ -40,7 +40,7 @@ class Board:
 
     async def speak(self) -> None:
         with contextlib.suppress(OSError):
-            self._line.heard()  # a line that nobody has opened is not to hold anybody up
+            self._line.received()  # a line that nobody has opened is not to hold anybody up
         while True:
             with contextlib.suppress(BlockingIOError):
                 self._line.write(b"%.4f,0.10,25.0\r\n" % (3.0 + 1e-4 * next(self._number)))

@@ -94,7 +94,7 @@ class Packs:
 
     def _print(self) -> None:
         with contextlib.suppress(OSError):  # nobody has opened it yet
-            self._line.heard()  # leaves its end such that a full line holds nobody up
+            self._line.received()  # leaves its end such that a full line holds nobody up
         while not self._ended.wait(PRINTED_S):
             with contextlib.suppress(OSError):  # it is full, or nobody has opened it
                 if not self.silent.is_set():

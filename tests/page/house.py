@@ -136,6 +136,6 @@ folder = "{folder}"
         while True:
             time_s = asyncio.get_running_loop().time() - begin_s
             with contextlib.suppress(BlockingIOError, OSError):
-                self._line.heard()
+                self._line.received()
                 self._line.write(json.dumps(self._board(time_s)).encode() + b"\r\n")
             await asyncio.sleep(1.0 / self._rate_hz)

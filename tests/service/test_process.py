@@ -113,7 +113,7 @@ async def ended(process: Process) -> list[Any]:
 async def feed(line: Line) -> None:
     """A board that prints text at 50 Hz, whether somebody reads it or not."""
     with contextlib.suppress(OSError):  # nobody has opened it yet
-        line.heard()  # leaves its end such that a full line holds nobody up
+        line.received()  # leaves its end such that a full line holds nobody up
     while True:
         with contextlib.suppress(BlockingIOError):
             line.write(b"3.80,0.10,25.0\r\n")

@@ -12,7 +12,7 @@ from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.factory import KINDS
 from tests.command_line import run
-from tests.device_line import on_a_line
+from tests.device_line import running_device
 from tests.patience import LONG_S
 
 
@@ -72,7 +72,7 @@ def long_probe(monkeypatch):
 
 def test_init_finds_out_what_is_there_and_sets_it(pack, capsys, long_probe):
     device = SimulatedBms("jk", lambda _: Reading(1.0, 26.4, 21.0), cells=8)
-    with on_a_line(device) as path:
+    with running_device(device) as path:
         code, out, err = run(capsys, "config", "init", pack, "--probe", "--port", path)
     assert (code, err) == (0, "")
     assert out.startswith(f"{path}: JK-BMS, 8 cells, software SIMULATED; protocol jk, 115200 baud\n{pack}: written")

@@ -51,10 +51,10 @@ async def test_nothing_is_sent_to_a_device_that_speaks_something_else(line: Line
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
     async with taken(source, []):
         await until(lambda: source.message and "silent" in source.message)
-        assert line.heard() == b""
+        assert line.received() == b""
         line.write(100 * ASH_RESET)
         await until(lambda: source.message and "no valid frame" in source.message)
-        assert line.heard() == b""
+        assert line.received() == b""
 
 
 async def test_a_board_that_is_heard_is_asked_for_its_hello(line: Line) -> None:
@@ -67,7 +67,7 @@ async def test_a_board_that_is_heard_is_asked_for_its_hello(line: Line) -> None:
 
         def asked() -> bool:
             nonlocal heard
-            heard += line.heard()
+            heard += line.received()
             return heard.startswith(hello_command())
 
         await until(asked)

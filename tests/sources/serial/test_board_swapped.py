@@ -112,12 +112,12 @@ async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(lin
             await until(lambda: source.message and "no frame yet" in source.message)
             line.write(ours.hello() + b"".join(ours.frames(10)))
             await until(lambda: source._door.serial)
-            heard = line.heard()
+            heard = line.received()
             line.write(b"".join(other.frames(10)))
 
             def asked() -> bool:
                 nonlocal heard
-                heard += line.heard()
+                heard += line.received()
                 return hello_command() in heard
 
             await until(asked)

@@ -14,7 +14,7 @@ from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial import device_detection, port_list
 from bms_estimator.sources.serial.device_detection import DetectedDevice
-from tests.device_line import on_a_line
+from tests.device_line import running_device
 from tests.patience import LONG_S
 
 
@@ -34,7 +34,7 @@ def bms(name: str) -> SimulatedBms:
 @pytest.mark.parametrize("name", [name for name in BMS_ANSWERS if name != "jk-pb"])
 def test_a_bms_is_named_with_its_cells(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
-    with on_a_line(bms(name)) as path:
+    with running_device(bms(name)) as path:
         found = device_detection.probe(path, 115_200)
     assert isinstance(found, DetectedDevice)
     assert (found.protocol, found.baud, found.cells) == (name, 115_200, 8)
@@ -45,7 +45,7 @@ def test_a_bms_is_named_with_its_cells(name: str, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("name", METERS)
 def test_a_meter_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
-    with on_a_line(METERS[name](steady, 1.0)) as path:
+    with running_device(METERS[name](steady, 1.0)) as path:
         found = device_detection.probe(path, 115_200)
     assert isinstance(found, DetectedDevice)
     assert found.protocol == name
@@ -54,7 +54,7 @@ def test_a_meter_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_it_is_found_at_its_own_baud_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)  # for a board, which is not there
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
-    with on_a_line(bms("jk")) as path:
+    with running_device(bms("jk")) as path:
         found = device_detection.probe(path)
     assert isinstance(found, DetectedDevice)
     assert (found.protocol, found.baud) == ("jk", 115_200)
@@ -65,7 +65,7 @@ def test_the_newer_jk_that_is_only_asked_by_what_others_take_for_a_write_is_not(
 ) -> None:
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", 0.1)
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)
-    with on_a_line(bms("jk-pb")) as path:
+    with running_device(bms("jk-pb")) as path:
         assert device_detection.probe(path) == "silent"
 
 
