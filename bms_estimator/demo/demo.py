@@ -21,8 +21,8 @@ from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings, parse_list
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.sinks.terminal.panels import BAND_STDS
 from bms_estimator.sinks.terminal.sink import TerminalSink
+from bms_estimator.sinks.terminal.view_state import BAND_STDS
 
 CELL = "chen_mora"
 LOAD_A = 0.5

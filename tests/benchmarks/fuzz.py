@@ -52,9 +52,9 @@ from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
-from bms_estimator.sinks.terminal import text_line
-from bms_estimator.sinks.terminal.panels import Screen
-from bms_estimator.sinks.terminal.scene import ScreenState
+from bms_estimator.sinks.terminal.screen import build_screen
+from bms_estimator.sinks.terminal.text_line import text_line
+from bms_estimator.sinks.terminal.view_state import PackView, ViewState
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.raw_capture import MAGIC
 from bms_estimator.sources.captures.replay import load_capture
@@ -207,12 +207,12 @@ def _published(_: Path) -> Read:
     def read(data: bytes) -> None:
         published = TopicCache("bms")
         for topic in topics:
-            heard = published.take(f"bms/pack/{topic}", data, 0.0)
-            told = text_line.line(heard) if heard else None
-            assert told is None or told.isprintable(), told
+            message = published.take(f"bms/pack/{topic}", data, 0.0)
+            line = text_line(message) if message else None
+            assert line is None or line.isprintable(), line
         if data:
-            scene = ScreenState("pack", published.devices["pack"].topics, 0.0, 0.0)
-            drawn = "".join(segment.text for segment in console.render(Screen(scene)))
+            view = ViewState(0.0, [PackView("pack", published.devices["pack"].topics, 0.0)])
+            drawn = "".join(segment.text for segment in console.render(build_screen(view, *console.size)))
             assert all(each.isprintable() or each == "\n" for each in drawn), drawn
 
     return read

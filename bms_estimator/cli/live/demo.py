@@ -13,7 +13,7 @@ from bms_estimator.cli.options.page_options import open_browser
 from bms_estimator.demo.demo import run_demo
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
-from bms_estimator.sinks.terminal.panels import LOG_LINES
+from bms_estimator.sinks.terminal.screen import LOG_LINES
 
 
 def demo(

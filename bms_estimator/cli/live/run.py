@@ -23,7 +23,7 @@ from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.service.multi_pack_service import run_pack_services
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sinks.terminal.panels import LOG_LINES
+from bms_estimator.sinks.terminal.screen import LOG_LINES
 from bms_estimator.sinks.terminal.sink import TerminalSink
 from bms_estimator.sources.captures.raw_capture import header_of
 from bms_estimator.sources.captures.recorder import CaptureRecorder

@@ -1,4 +1,4 @@
-"""``bms-estimator top``: all packs of a broker at a glance."""
+"""``bms-estimator top``: a table of all packs of a broker."""
 
 import asyncio
 import sys
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.live.key_presses import keys
+from bms_estimator.cli.live.quit_key import quit_key
 from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.subscriber import Subscriber
@@ -18,12 +18,11 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks.terminal.live_view import LiveView
-from bms_estimator.sinks.terminal.panels import LOG_LINES
-from bms_estimator.sinks.terminal.scene import BrokerOutage
+from bms_estimator.sinks.terminal.screen import LOG_LINES
+from bms_estimator.sinks.terminal.view_state import BrokerOutage
 
-TICK_S = 1.0
-"""Redraw interval without messages [s]: the view shows the time since the last one."""
-STEPS = {"next": 1, "previous": -1}
+REDRAW_S = 1.0
+"""Redraw interval without messages [s]: a pack becomes stale although nothing arrives."""
 
 
 def top(
@@ -35,9 +34,9 @@ def top(
         typer.Option(help="broker, mqtt://host:port; default: that of PACK, or localhost", show_default=False),
     ] = None,
 ) -> None:
-    """Show all packs of a broker, one of them in detail.
+    """Show all packs of a broker in a table.
 
-    On a terminal Tab and the arrow keys select a pack, and q quits. Elsewhere each state is a line, until Ctrl-C.
+    On a terminal q quits. If standard output is no terminal, each state is a line, until Ctrl-C.
     """
     settings = load_settings(pack) if pack else Settings()
     if mqtt or not pack:
@@ -47,44 +46,36 @@ def top(
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)
     with flush_logs():
-        asyncio.run(_watch(settings.mqtt, log, first=settings.pack.name if pack else ""))
+        asyncio.run(_watch(settings.mqtt, log))
 
 
-async def _watch(settings: MqttSettings, log: deque[str], first: str) -> None:
-    """Show the view until a key, a signal, or the end of the reader."""
-    stop = stop_on_signal()
+async def _watch(settings: MqttSettings, log: deque[str]) -> None:
+    """Show the view until q is pressed, a signal arrives, or the reader of standard output is gone."""
+    stop, changed = stop_on_signal(), asyncio.Event()
 
-    def hear(heard: DeviceMessage) -> None:
-        view.on_message(heard)
-        fresh.set()
+    def on_message(message: DeviceMessage) -> None:
+        view.on_message(message)
+        changed.set()
 
-    def lost() -> BrokerOutage | None:
+    def outage() -> BrokerOutage | None:
         since_s = subscriber.lost_since
         return None if since_s is None else BrokerOutage(since_s, subscriber.trouble)
 
-    def press(meaning: str) -> None:
-        if meaning == "quit":
-            stop.set()
-        else:
-            view.select(STEPS[meaning])
-            fresh.set()
-
-    fresh = asyncio.Event()
-    subscriber = Subscriber(settings, hear, fresh.set)
-    where = f"{settings.base_topic}/# at {', '.join(settings.urls)}"
-    hint = f"{where}; Tab: next pack, q: end" if sys.stdin and sys.stdin.isatty() else where
-    view = LiveView(subscriber.devices, log=log, hint=hint, lost=lost, first=first)
+    subscriber = Subscriber(settings, on_message, changed.set)
+    address = f"{settings.base_topic}/# at {', '.join(settings.urls)}"
+    hint = f"{address}; q: quit" if sys.stdin and sys.stdin.isatty() else address
+    view = LiveView(subscriber.devices, log=log, hint=hint, outage=outage)
     async with view, subscriber:
-        with keys(press):
-            await _show_until(stop, fresh, view)
+        with quit_key(stop.set):
+            await _show_until(stop, changed, view)
 
 
-async def _show_until(stop: asyncio.Event, fresh: asyncio.Event, view: LiveView) -> None:
+async def _show_until(stop: asyncio.Event, changed: asyncio.Event, view: LiveView) -> None:
     """Draw new messages and status changes until ``stop``."""
     stopped = asyncio.create_task(stop.wait())
     while not stopped.done():
         view.show()
-        heard = asyncio.create_task(fresh.wait())
-        await asyncio.wait([stopped, heard], timeout=TICK_S, return_when=asyncio.FIRST_COMPLETED)
-        heard.cancel()
-        fresh.clear()
+        change = asyncio.create_task(changed.wait())
+        await asyncio.wait([stopped, change], timeout=REDRAW_S, return_when=asyncio.FIRST_COMPLETED)
+        change.cancel()
+        changed.clear()

@@ -1,29 +1,35 @@
 """Fields of a payload, each with the requested type: other versions or publishers may send anything. Pure."""
 
-from collections.abc import Iterator
-
 LARGEST = 1e12
-"""No number of a battery is larger; longer text would only fill a screen."""
+"""Largest accepted absolute value of a number: no quantity of a battery exceeds it, and longer text would fill a screen."""
 MAX_TEXT = 400
-"""Texts are shown so far [characters]."""
+"""Maximum length of a text; the rest is cut [characters]."""
 
 
 class JsonFields:
-    """The fields of a JSON object; of anything else none.
+    """Fields of a JSON object. A payload of another type has no fields.
 
     Args:
-        payload: As ``published.parsed`` has it.
+        payload: Parsed JSON, or text.
     """
 
     def __init__(self, payload: object) -> None:
-        self._of = payload if isinstance(payload, dict) else {}
+        self._values = payload if isinstance(payload, dict) else {}
 
     def __bool__(self) -> bool:
-        return bool(self._of)
+        return bool(self._values)
 
     def number(self, name: str) -> float | None:
         """Return a number; None if missing."""
-        return _number(self._of.get(name))
+        value = self._values.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST:
+            return None
+        return float(value)
+
+    def number_text(self, name: str, format_spec: str, factor: float = 1.0) -> str:
+        """Return a number times ``factor`` as text; ``-`` if missing."""
+        value = self.number(name)
+        return "-" if value is None else f"{value * factor:{format_spec}}"
 
     def count(self, name: str) -> int:
         """Return an integer; 0 if missing."""
@@ -31,42 +37,17 @@ class JsonFields:
 
     def text(self, name: str) -> str:
         """Return a text without terminal control characters; empty if missing."""
-        return _text(self._of.get(name))
+        return _printable(self._values.get(name))
+
+    def texts(self, name: str) -> list[str]:
+        """Return a list of texts without terminal control characters; empty if missing."""
+        values = self._values.get(name)
+        return [_printable(value) for value in values if isinstance(value, str)] if isinstance(values, list) else []
 
     def flag(self, name: str) -> bool:
         """Return True if the field is true."""
-        return self._of.get(name) is True
-
-    def is_null(self, name: str) -> bool:
-        """Return True if the field exists and is null."""
-        return name in self._of and self._of[name] is None
-
-    def fields(self, name: str) -> "JsonFields":
-        """Return an object."""
-        return JsonFields(self._of.get(name))
-
-    def texts(self, name: str) -> list[str]:
-        """Return a list of texts."""
-        return [_text(item) for item in self._list(name) if isinstance(item, str)]
-
-    def numbers(self, name: str) -> list[float | None]:
-        """Return a list of numbers, some of which may be missing."""
-        return [_number(item) for item in self._list(name)]
-
-    def names(self) -> Iterator[str]:
-        """Names of all fields."""
-        return (_text(name) for name in self._of)
-
-    def _list(self, name: str) -> list[object]:
-        found = self._of.get(name)
-        return found if isinstance(found, list) else []
+        return self._values.get(name) is True
 
 
-def _number(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST:
-        return None
-    return float(value)
-
-
-def _text(value: object) -> str:
+def _printable(value: object) -> str:
     return "".join(c for c in value[:MAX_TEXT] if c.isprintable()) if isinstance(value, str) else ""

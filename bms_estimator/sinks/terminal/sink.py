@@ -1,4 +1,4 @@
-"""The live view of the pack that this process serves, without a broker."""
+"""Live view of the pack that this process serves, without a broker."""
 
 from collections.abc import Callable, Iterable
 from typing import Self
@@ -15,11 +15,11 @@ BASE_TOPIC = "bms"
 
 
 class TerminalSink:
-    """Shows snapshots as a subscriber would see them. ``publish`` returns at once, however long stdout is blocked.
+    """Sink that shows snapshots as a subscriber would see them. ``publish`` returns at once, also if stdout is blocked.
 
     Args:
-        log: Log lines to show below, the last ones.
-        hint: A line that stays at the foot of the screen.
+        log: Log lines, the last of which are shown.
+        hint: Last line of the screen.
         true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
         clock: The clocks.
     """
@@ -35,17 +35,17 @@ class TerminalSink:
         self._clock = clock or Clock()
         self._published = TopicCache(BASE_TOPIC)
         self._view = LiveView(self._published.devices, log=log, hint=hint, true_soc=true_soc, wall=self._clock.wall)
-        self._messages: MessageBuilder | None = None
+        self._builder: MessageBuilder | None = None
         self._before: Snapshot | None = None
         self._sent = PublishedState()
 
     async def __aenter__(self) -> Self:
-        """Take the screen."""
+        """Start the view."""
         await self._view.__aenter__()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Give the screen back."""
+        """Close the view."""
         await self._view.__aexit__(None, None, None)
 
     def publish(self, snapshot: Snapshot) -> None:
@@ -54,19 +54,19 @@ class TerminalSink:
         Raises:
             OSError: Standard output could not be written.
         """
-        for message in self._messages_of(snapshot):
-            heard = self._published.take(message.topic, message.payload, self._clock.wall())
-            if heard is not None:
-                self._view.on_message(heard)
+        for message in self._messages(snapshot):
+            received = self._published.take(message.topic, message.payload, self._clock.wall())
+            if received is not None:
+                self._view.on_message(received)
         self._view.show()
 
-    def _messages_of(self, snapshot: Snapshot) -> list[Message]:
-        """Return the messages that a broker would get."""
-        greeting: list[Message] = []
-        if self._messages is None:
-            self._messages = MessageBuilder(BASE_TOPIC, snapshot.info.device)
-            greeting = self._messages.birth_messages()
-        kept = self._messages.must_deliver(self._before, snapshot)
-        due, self._sent = self._messages.live_messages(self._sent, snapshot, self._clock.monotonic())
+    def _messages(self, snapshot: Snapshot) -> list[Message]:
+        """Return the messages that a broker would receive."""
+        birth: list[Message] = []
+        if self._builder is None:
+            self._builder = MessageBuilder(BASE_TOPIC, snapshot.info.device)
+            birth = self._builder.birth_messages()
+        must_deliver = self._builder.must_deliver(self._before, snapshot)
+        live, self._sent = self._builder.live_messages(self._sent, snapshot, self._clock.monotonic())
         self._before = snapshot
-        return [*greeting, *kept, *due]
+        return [*birth, *must_deliver, *live]

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.live.key_presses import meanings
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.command_line import PROGRAM, run
@@ -45,18 +44,14 @@ async def test_two_packs_of_a_broker_that_goes(broker: Broker, client: Listener)
     with PseudoTerminal("top", "--mqtt", broker.url, columns=100, rows=40) as terminal:
         await asyncio.to_thread(shows, "no pack has published anything yet")
         await publish(client, "attic", 51.234)
-        await asyncio.to_thread(shows, " attic ", "51.234 V")
+        await asyncio.to_thread(shows, "attic ", "51.234")
         await publish(client, "barn", 13.579)
-        await asyncio.to_thread(shows, "▸ attic", "barn", "13.58 V")
-        terminal.press(b"\t")
-        await asyncio.to_thread(shows, "▸ barn", "13.579 V")
-        terminal.press(b"\x1b[A")
-        await asyncio.to_thread(shows, "▸ attic", "51.234 V")
+        await asyncio.to_thread(shows, "attic ", "51.234", "barn ", "13.579")
         await client.publish("bms/attic/sensor/availability", b"offline", qos=1)
-        await asyncio.to_thread(shows, "stale since")
+        await asyncio.to_thread(shows, "attic: stale since")
         broker.stop()
-        await asyncio.to_thread(shows, "no broker since", "51.234 V")
-        terminal.press(b"q")
+        await asyncio.to_thread(shows, "no broker since", "51.234")
+        terminal.press(b"x\t\x1b[Bq")  # keys other than q do nothing
         await asyncio.to_thread(terminal.until, terminal.ended)
         assert terminal.process.returncode == 0
         assert terminal.is_as_before()
@@ -94,8 +89,3 @@ def test_what_cannot_be_watched_is_said(tmp_path: Path, capsys: pytest.CaptureFi
     code, _, err = run(capsys, "top", "--mqtt", "http://house")
     assert code == 2
     assert err.startswith("error: --mqtt http://house: must be mqtt://host:port")
-
-
-def test_keys_are_known_in_both_modes_of_a_terminal_and_others_mean_nothing() -> None:
-    assert list(meanings(b"\t\x1b[B\x1bOB\x1b[Z\x1bOAq")) == ["next"] * 3 + ["previous"] * 2 + ["quit"]
-    assert list(meanings(b"xyz\x1b[5~\xff\x1b\x1b[")) == []

@@ -1,0 +1,43 @@
+"""The key q of a terminal, which quits without Enter."""
+
+import asyncio
+import contextlib
+import os
+import sys
+import termios
+import tty
+from collections.abc import Callable, Iterator
+
+QUIT_KEY = b"q"
+READ_BYTES = 1024
+
+
+@contextlib.contextmanager
+def quit_key(quit_program: Callable[[], object]) -> Iterator[None]:
+    """Read key presses within the context. Does nothing if standard input is no terminal.
+
+    Args:
+        quit_program: Called when q is pressed.
+    """
+    if not (sys.stdin and sys.stdin.isatty()):
+        yield
+        return
+    terminal = sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+    loop = asyncio.get_running_loop()
+
+    def read() -> None:
+        pressed = os.read(terminal, READ_BYTES)
+        if not pressed:  # the terminal is gone
+            loop.remove_reader(terminal)
+        if QUIT_KEY in pressed:
+            quit_program()
+
+    tty.setcbreak(terminal)  # Ctrl-C still raises SIGINT
+    loop.add_reader(terminal, read)
+    try:
+        yield
+    finally:
+        loop.remove_reader(terminal)
+        with contextlib.suppress(termios.error):  # the terminal is gone
+            termios.tcsetattr(terminal, termios.TCSANOW, before)  # do not wait for output: the terminal may be blocked

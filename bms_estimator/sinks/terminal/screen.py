@@ -1,0 +1,94 @@
+"""Screen of the terminal view: a table of packs, alarms and faults, the last log lines and a hint. Pure."""
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from bms_estimator.sinks.terminal.json_fields import JsonFields
+from bms_estimator.sinks.terminal.view_state import PackView, ViewState, clock_text, soc_text
+
+MIN_TABLE_CELLS = 80
+"""Minimum width of the table [cells]. A narrower terminal crops the right columns."""
+OTHER_LINES = 9
+"""Lines of the screen without packs and messages: headings, broker outage, numbers of omitted lines, log and hint."""
+LOG_LINES = 2
+"""Number of log lines on the screen."""
+MAX_MESSAGES = 5
+"""Maximum number of alarms and faults that are listed."""
+URGENT_STYLE = "bold red"
+"""Style of critical alarms and of faults, which are listed first."""
+
+
+def build_screen(view: ViewState, width: int, height: int) -> RenderableType:
+    """Return the screen for a terminal of ``width`` cells and ``height`` lines. Packs with alarms come first."""
+    packs = sorted(view.packs, key=lambda pack: not pack.alarms())
+    messages = [message for pack in packs for message in _messages(pack, view)]
+    messages.sort(key=lambda message: message.style != URGENT_STYLE)
+    free = max(height - OTHER_LINES - min(len(messages), MAX_MESSAGES), 1)
+    lines: list[RenderableType] = []
+    if view.outage is not None:
+        reason = f": {view.outage.reason}" if view.outage.reason else ""
+        lines.append(Text(f"no broker since {clock_text(view.outage.since_s)}{reason}", style=URGENT_STYLE))
+    lines.append(_pack_table(view, packs[:free], width) if packs else "no pack has published anything yet")
+    if len(packs) > free:
+        lines.append(f"packs not shown: {len(packs) - free}")
+    lines += messages[:MAX_MESSAGES]
+    if len(messages) > MAX_MESSAGES:
+        lines.append(Text(f"alarms and faults not shown: {len(messages) - MAX_MESSAGES}", style=URGENT_STYLE))
+    for entry in view.log[-LOG_LINES:]:
+        line = Text.from_ansi(entry)
+        line.no_wrap, line.overflow = True, "ellipsis"
+        lines.append(line)
+    return Group(*lines, Text(view.hint, style="cyan"))
+
+
+def _pack_table(view: ViewState, packs: Sequence[PackView], width: int) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0)
+    table.width = MIN_TABLE_CELLS if width < MIN_TABLE_CELLS else None
+    table.add_column("Pack", overflow="fold")
+    table.add_column("SOC %\n± 2 std", no_wrap=True, style="bold")
+    if view.true_soc is not None:
+        table.add_column("True\nSOC %", no_wrap=True, style="magenta")
+    table.add_column(f"State at\n{clock_text(view.now_s)}", no_wrap=True)
+    for heading in ("Voltage\nV", "Current\nA", "Power\nW", "Remaining\nAh", "Stability\nmargin"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for pack in packs:
+        state, status = pack.fields("state"), "no broker" if view.outage else pack.status(view.now_s)[0]
+        table.add_row(
+            Text(pack.device),
+            soc_text(state),
+            *([] if view.true_soc is None else [f"{100.0 * view.true_soc:.2f}"]),
+            Text(status, style="bold green" if status == "live" else URGENT_STYLE),
+            state.number_text("voltage_v", ".3f"),
+            state.number_text("current_a", "+.3f"),
+            state.number_text("power_w", "+.2f"),
+            state.number_text("remaining_capacity_ah", ".3f"),
+            "NO LOCK" if state and not state.flag("lock") else state.number_text("stability_margin", ".4f"),
+            style="" if status == "live" else "dim",
+        )
+    return table
+
+
+def _messages(pack: PackView, view: ViewState) -> list[Text]:
+    """Return a line for each alarm of a pack, the reason why its values are stale, and each input diagnostic."""
+    health, (status, since) = pack.fields("health"), pack.status(view.now_s)
+    messages = [
+        Text(
+            f"{pack.device}: {_alarm_text(alarm)}",
+            style=URGENT_STYLE if alarm.text("severity") == "critical" else "yellow",
+        )
+        for alarm in pack.alarms()
+    ]
+    reason = health.text("sensor_message")
+    if reason or (status != "live" and view.outage is None):
+        messages.append(Text(f"{pack.device}: {status}{since}{reason and ': '}{reason}", style=URGENT_STYLE))
+    return messages + [Text(f"{pack.device}: suspected: {each}", style="yellow") for each in health.texts("suspects")]
+
+
+def _alarm_text(alarm: JsonFields) -> str:
+    if not alarm.flag("active"):
+        return f"{alarm.text('name')} cannot be raised: {alarm.text('unwatched_reason')}"
+    return f"{alarm.text('severity')} since {alarm.text('since')}: {alarm.text('text')}"

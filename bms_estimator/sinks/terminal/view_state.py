@@ -1,0 +1,85 @@
+"""State of the terminal view: last publications of all packs, the broker's outage, and the log. Pure."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
+from bms_estimator.sinks.terminal.json_fields import JsonFields
+
+MAX_SILENT_S = 10.0
+"""Interval of a service's health messages [s]. A service that is silent for longer counts as gone."""
+ALARM_PREFIX = "alarm/"
+"""Prefix of alarm topics."""
+BAND_STDS = 2.0
+"""Half width of the band around the SOC [std]. The band contains the true SOC 19 times out of 20."""
+
+
+class BrokerOutage(NamedTuple):
+    """Outage of the broker."""
+
+    since_s: float
+    """Start of the outage, seconds since 1970."""
+    reason: str | None
+
+
+class PackView(NamedTuple):
+    """Last publications of one pack."""
+
+    device: str
+    """Name of the device."""
+    topics: Mapping[str, Any]
+    """Payloads by topic below the device's."""
+    received_s: float
+    """Time of the last message, seconds since 1970."""
+
+    def fields(self, topic: str) -> JsonFields:
+        """Return the fields of a topic's last payload."""
+        return JsonFields(self.topics.get(topic))
+
+    def alarms(self) -> list[JsonFields]:
+        """Return raised alarms and, while samples arrive, those that cannot be monitored."""
+        online = self.fields("health").flag("sensor_online")
+        alarms = [self.fields(topic) for topic in self.topics if topic.startswith(ALARM_PREFIX)]
+        return [alarm for alarm in alarms if alarm.flag("active") or (online and alarm.text("unwatched_reason"))]
+
+    def status(self, now_s: float) -> tuple[str, str]:
+        """Return ``live``, ``stale``, ``silent`` or ``offline`` and, unless live, `` since 12:00:00Z``."""
+        if self.topics.get(AVAILABILITY) == "offline":
+            return "offline", _since(self.fields("health").text("publish_time"))
+        if now_s - self.received_s > MAX_SILENT_S:
+            return "silent", _since(iso_utc(self.received_s))
+        if self.topics.get(SENSOR_AVAILABILITY) == "offline":
+            return "stale", _since(self.fields("state").text("time"))
+        return "live", ""
+
+
+class ViewState(NamedTuple):
+    """Content of the terminal view at one moment."""
+
+    now_s: float
+    """Present time, seconds since 1970."""
+    packs: Sequence[PackView] = ()
+    outage: BrokerOutage | None = None
+    """None while the broker is connected, or if none is needed."""
+    log: Sequence[str] = ()
+    """Log lines, oldest first; ANSI colours are allowed."""
+    hint: str = ""
+    """Last line of the screen."""
+    true_soc: float | None = None
+    """True SOC 0..1 of a simulated pack at the last sample."""
+
+
+def soc_text(state: JsonFields) -> str:
+    """Return the SOC of a topic ``state`` with its band, ``89.50 ± 1.20`` [%]; without the band if that is unknown."""
+    soc, std = state.number_text("soc_percent", ".2f"), state.number("soc_std")
+    return soc if std is None else f"{soc} ± {100.0 * BAND_STDS * std:.2f}"
+
+
+def clock_text(epoch_s: float) -> str:
+    """Return the time of day in UTC, ``12:00:00Z``."""
+    return f"{iso_utc(epoch_s)[11:19]}Z"
+
+
+def _since(iso: str) -> str:
+    return f" since {iso[11:19]}Z" if iso else ""
