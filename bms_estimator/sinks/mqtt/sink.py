@@ -238,4 +238,4 @@ class OutboxSender(QueueSender):
         """Keep messages until the broker has them; returns at once."""
         for message in messages:
             self._filled.put(message)
-        self._count()
+        self._update_stats()

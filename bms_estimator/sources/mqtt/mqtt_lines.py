@@ -126,7 +126,7 @@ class MqttReports(LineProducer):
             message = Message(self._settings.filled(topic), payload.encode(), 0, retain=False)
             refusal = await connection.publish(message)
             if refusal is not None:
-                raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.why}")
+                raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.reason}")
 
     def _log_conflict(self) -> None:
         """Log the first message of a second publisher, and its end."""
