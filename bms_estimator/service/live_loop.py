@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile, RunCounters
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
@@ -200,12 +200,12 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clo
     outcome = found.reason
     if not outcome:
         wrong = restore_state(estimator, found.state, found.unseen_s)
-        outcome = f"{REFUSED}{wrong}" if wrong else f"restored{_soc_text(estimator)}"
-    if refused := outcome.startswith(REFUSED):
+        outcome = f"{REJECTED}{wrong}" if wrong else f"restored{_soc_text(estimator)}"
+    if refused := outcome.startswith(REJECTED):
         outcome = f"{outcome}; {checkpoint.quarantine()}"
     say = log.warning if refused else log.info
     say("checkpoint", file=str(checkpoint.path), outcome=outcome)
-    return found.ledger, outcome
+    return found.counters, outcome
 
 
 def _restore_alarms(publisher: Publisher, kept: str) -> None:

@@ -22,7 +22,7 @@ pytest.importorskip("prometheus_client", reason="prometheus-client is not instal
 from prometheus_client.parser import text_string_to_metric_families
 
 from bms_estimator.sinks.exports.prometheus import PrometheusSink
-from bms_estimator.sinks.exports.prometheus_metrics import COUNTERS, KINDS, LEFT_OUT, OWN_NAMES, RATIOS, named
+from bms_estimator.sinks.exports.prometheus_metrics import COUNTERS, KINDS, LEFT_OUT, OWN_NAMES, RATIOS, name_and_factor
 
 PROMTOOL = shutil.which("promtool")
 
@@ -102,11 +102,11 @@ def test_the_tables_name_fields_that_there_are() -> None:
 
 
 def test_a_field_s_unit_becomes_that_of_prometheus() -> None:
-    assert named("remaining_energy_wh") == ("bms_remaining_energy_joules", 3600.0)
-    assert named("rss_mib") == ("bms_rss_bytes", 1048576.0)
-    assert named("innovation_v") == ("bms_innovation_volts", 1.0)
-    assert named("nussbaum_gain") == ("bms_nussbaum_gain", 1.0)
-    assert named("adaptation_gain_hz") == ("bms_adaptation_gain_hertz", 1.0)
+    assert name_and_factor("remaining_energy_wh") == ("bms_remaining_energy_joules", 3600.0)
+    assert name_and_factor("rss_mib") == ("bms_rss_bytes", 1048576.0)
+    assert name_and_factor("innovation_v") == ("bms_innovation_volts", 1.0)
+    assert name_and_factor("nussbaum_gain") == ("bms_nussbaum_gain", 1.0)
+    assert name_and_factor("adaptation_gain_hz") == ("bms_adaptation_gain_hertz", 1.0)
 
 
 @pytest.mark.parametrize(
