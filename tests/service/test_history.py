@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, LATER, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_LATER_FILES, CheckpointFile, RunCounters
 from bms_estimator.model.payloads import Totals
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.service import checkpoint_writer
@@ -166,16 +166,16 @@ async def test_checkpoints_of_later_versions_are_each_kept_and_what_they_have_co
     """A version is tried, and left again, more often than files are kept; the first are those that have learned most."""
     file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
-    for attempt in range(LATER + 1):
+    for attempt in range(MAX_LATER_FILES + 1):
         counted = dataclasses.replace(COUNTED, restarts=6 + attempt)
         save_as(FORMAT + 1, file, learned_estimator(), monkeypatch, counted)
         inodes.append(file.path.stat().st_ino)
         health = (await run_samples(tmp_path, samples=1)).health
-        kept = min(attempt + 1, LATER)
+        kept = min(attempt + 1, MAX_LATER_FILES)
         assert f"reads {FORMAT}; set aside as pack.later-{kept}.npz; once the version" in health.checkpoint
         assert (health.restarts, health.total.crashes, health.total.unseen_s) == (7 + attempt, 2, 30.0)
-    kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, LATER + 1)]
-    assert kept_inodes == [*inodes[: LATER - 1], inodes[LATER]]
+    kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, MAX_LATER_FILES + 1)]
+    assert kept_inodes == [*inodes[: MAX_LATER_FILES - 1], inodes[MAX_LATER_FILES]]
     assert (tmp_path / "pack.refused.npz").read_bytes() == b"an older one"
 
 
