@@ -1,7 +1,7 @@
-"""Checkpoints: the estimator's state on disk, restored only if it is valid and belongs to the same pack.
+"""Checkpoint files: the estimator's state on disk, restored only if it is valid and belongs to the same pack.
 
-Each meaning of a state (``pack_identity``) has its own file with named fields. Edited settings and versions with
-other fields therefore lose nothing.
+Each ``pack_identity`` has its own file with named fields. Edited settings and versions with other fields therefore lose
+nothing.
 """
 
 import io
@@ -31,20 +31,21 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import new_totals
 
 FORMAT = 7
-"""Version of the file's layout. Raise it when a field changes its meaning, and migrate files of the version before."""
+"""Version of the file's layout. Raise it when a field changes its meaning, and migrate files of the previous version."""
 DAY_S = 86400.0
-MAX_FILE = 1 << 20
-"""Maximum size of a checkpoint file [bytes]; usual ones have about 100 kB."""
-KEPT = 8
-"""Number of checkpoint files of one pack; older ones are deleted."""
-REFUSED = "refused: "
+"""Length of a day [s]."""
+MAX_FILE_BYTES = 1 << 20
+"""Maximum size of a checkpoint file [bytes]; usual files have about 100 kB."""
+MAX_FILES = 8
+"""Maximum number of checkpoint files of one pack; older ones are deleted."""
+REJECTED = "refused: "
 """Prefix of the reason for rejecting a file."""
-LATER = 4
-"""Number of stored files of later formats, for a return to their version."""
-_OF_LEDGER = "restarts", "total", "clean", "alarms"
-"""Field names of the counters in the file."""
-MOST = 1e15
-"""Maximum plausible count: 30,000 years at 1,000 samples a second."""
+MAX_LATER_FILES = 4
+"""Maximum number of quarantined files of later formats, for a return to their version."""
+_COUNTER_FIELDS = "restarts", "total", "clean", "alarms"
+"""Field names of the run counters in the file."""
+MAX_COUNT = 1e15
+"""Maximum plausible counter: 30,000 years at 1,000 samples a second."""
 
 log = structlog.get_logger(__name__)
 
@@ -54,10 +55,10 @@ class RunCounters:
     """Counters of the runs that wrote a checkpoint.
 
     Attributes:
-        restarts: Starts that found a checkpoint.
-        total: Totals over restarts.
-        clean: The last of them has ended by itself; False while it runs.
-        alarms: Alarms over restarts, as ``AlarmEvaluator.kept``.
+        restarts: Number of starts that found a checkpoint.
+        total: Totals over all runs.
+        clean: True if the last run ended without a crash or kill; False while it runs.
+        alarms: State of the alarms, as ``AlarmEvaluator.kept``.
     """
 
     restarts: int
@@ -71,23 +72,23 @@ class CheckpointContent:
     """Content of a checkpoint file."""
 
     state: Mapping[str, NDArray[Any]]
-    """Fields of ESTIMATOR_STATE by their names, as ``fields`` gives them; empty when it was refused."""
+    """Fields of ESTIMATOR_STATE by their names, as from ``fields``; empty if the file was rejected."""
     unseen_s: float
-    """Time since it was saved [s]; infinite if unknown."""
-    ledger: RunCounters
-    """Counters with this start added; zero if the file was of another pack, or could not be read."""
+    """Time since the file was saved [s]; infinite if unknown."""
+    counters: RunCounters
+    """Counters including this start; zero if the file belongs to another pack or cannot be read."""
     reason: str
-    """Reason for the rejection; empty when it may be."""
+    """Reason for the rejection; empty if the file is valid."""
 
 
 class CheckpointFile:
     """One pack's checkpoint, ``<pack.name>-<identity>.npz``.
 
     Args:
-        folder: Location; must exist.
+        folder: Folder of the file.
         settings: The pack's settings.
-        cell: The pack as one object.
-        now: The present moment.
+        cell: Model of the whole pack.
+        now: Clock that also identifies the boot.
     """
 
     def __init__(
@@ -96,48 +97,49 @@ class CheckpointFile:
         self._name, self._now = settings.pack.name, now
         self._identity, self._observer = pack_identity(settings, cell), observer_identity(settings, cell)
         self._longest_days = settings.state.longest_days
-        self._content: dict[str, Any] = {}  # of the file, as far as it is no ledger
-        self._later = False  # the file is of a later format
+        self._content: dict[str, Any] = {}  # fields of the file other than the run counters
+        self._is_later = False  # the file has a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
         self.disk_free_mib: float | None = None
-        """Free space of the file's disk at the last write [MiB]."""
+        """Free space on the disk at the last write [MiB]."""
         self.thread = DiskThread("checkpoint")
-        """Thread for ``save`` and ``update_counters``: an abandoned call still ends before the next one begins."""
+        """Thread for ``save`` and ``update_counters``. A call that timed out still finishes before the next one."""
         self.saved: tuple[int, float] | None = None
-        """Samples and SOC of the state that was saved last; None: none was by this run."""
+        """Number of samples and SOC of the last saved state; None before the first save of this run."""
 
-    def save(self, state: NDArray[np.void], ledger: RunCounters) -> None:
-        """Write atomically: after a power cut there is the old file or the new one. A missing folder is created.
+    def save(self, state: NDArray[np.void], counters: RunCounters) -> None:
+        """Write the file atomically: after a power cut either the old or the new one exists.
+
+        A missing folder is created.
 
         Args:
             state: Shape (1,), dtype ESTIMATOR_STATE.
-            ledger: Counters of this and earlier runs.
+            counters: Counters of this and earlier runs.
 
         Raises:
             OSError: The file cannot be written.
         """
         content = {"identity": self._identity, "observer": self._observer, "state": state, **asdict(self._now())}
-        self._write(content, ledger)
+        self._write(content, counters)
 
-    def update_counters(self, ledger: RunCounters) -> None:
-        """Update the counters of the runs in the file, if there is one; the state keeps its age.
+    def update_counters(self, counters: RunCounters) -> None:
+        """Update the run counters in the file, if there is one, without changing the state and its save time.
 
         Raises:
             OSError: The file cannot be written.
         """
         if self._content:
-            self._write(self._content, ledger)
+            self._write(self._content, counters)
 
-    def _write(self, content: dict[str, Any], ledger: RunCounters) -> None:
+    def _write(self, content: dict[str, Any], counters: RunCounters) -> None:
         packed = io.BytesIO()
-        total = ledger.total.model_dump_json()
-        told: dict[str, Any] = {
-            "restarts": ledger.restarts,
-            "total": total,
-            "clean": ledger.clean,
-            "alarms": ledger.alarms,
+        counter_fields: dict[str, Any] = {
+            "restarts": counters.restarts,
+            "total": counters.total.model_dump_json(),
+            "clean": counters.clean,
+            "alarms": counters.alarms,
         }
-        np.savez(packed, format=FORMAT, **told, **content)
+        np.savez(packed, format=FORMAT, **counter_fields, **content)
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         disk = os.statvfs(self.path.parent)
         self.disk_free_mib = disk.f_bavail * disk.f_frsize / 2**20
@@ -146,105 +148,114 @@ class CheckpointFile:
         self._remove_oldest()
 
     def load(self) -> CheckpointContent:
-        """Read the file. An error becomes the result's reason, not an exception."""
+        """Read the file. An error is returned as the result's ``reason``."""
         new = RunCounters(0, new_totals(self._now().wall_s))
         try:
-            with np.load(io.BytesIO(read_private(self.path, MAX_FILE)), allow_pickle=False) as file:
-                return self._checked(file)
+            with np.load(io.BytesIO(read_private(self.path, MAX_FILE_BYTES)), allow_pickle=False) as file:
+                return self._validate(file)
         except FileNotFoundError:
             return CheckpointContent({}, 0.0, new, "none found")
-        except _RefusedError as error:
-            return CheckpointContent({}, 0.0, error.ledger or new, f"{REFUSED}{error}")
+        except _RejectedError as error:
+            return CheckpointContent({}, 0.0, error.counters or new, f"{REJECTED}{error}")
         except UnsafeFileError as error:
-            return CheckpointContent({}, 0.0, new, f"{REFUSED}{error}")
+            return CheckpointContent({}, 0.0, new, f"{REJECTED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return CheckpointContent({}, 0.0, new, f"{REFUSED}damaged, perhaps by a power cut ({type(error).__name__})")
+            return CheckpointContent(
+                {}, 0.0, new, f"{REJECTED}damaged, perhaps by a power cut ({type(error).__name__})"
+            )
 
     def quarantine(self) -> str:
-        """Move a rejected file out of the way of the next save. Returns a description for people.
+        """Rename a rejected file, so that the next save does not overwrite it. Return a description for people.
 
-        A file of a later format is valid and replaces none, so that each version finds its own file after a
-        downgrade. It is not restored automatically: this version's later files are newer, though it may have learned
-        less.
+        A file of a later format is valid. It gets a name of its own, so that the later version can use it after a
+        re-upgrade. The user must restore it, because files that this version writes meanwhile are newer, although they
+        may contain less learning.
         """
-        aside = self.path.with_name(f"{self._name}.refused.npz")
-        if self._later:
-            places = [self.path.with_name(f"{self._name}.later-{n}.npz") for n in range(1, LATER + 1)]
-            aside = next((place for place in places if not place.exists()), places[-1])
+        quarantined = self.path.with_name(f"{self._name}.refused.npz")
+        if self._is_later:
+            paths = [self.path.with_name(f"{self._name}.later-{n}.npz") for n in range(1, MAX_LATER_FILES + 1)]
+            quarantined = next((path for path in paths if not path.exists()), paths[-1])
         self._content = {}
         try:
-            self.path.replace(aside)
+            self.path.replace(quarantined)
         except OSError as error:
             return f"it cannot be set aside: {error}"
-        back = shlex.join(["mv", str(aside.resolve()), str(self.path.resolve())])
-        later = (
-            f"; once the version that wrote it is installed again, stop the service and `{back}`" if self._later else ""
+        if not self._is_later:
+            return f"set aside as {quarantined.name}"
+        command = shlex.join(["mv", str(quarantined.resolve()), str(self.path.resolve())])
+        return (
+            f"set aside as {quarantined.name}; once the version that wrote it is installed again, "
+            f"stop the service and `{command}`"
         )
-        return f"set aside as {aside.name}{later}"
 
-    def _checked(self, found: Mapping[str, NDArray[Any]]) -> CheckpointContent:
-        now_s, version = self._now().wall_s, int(found["format"])
-        ours = str(found.get("identity", "")) == self._identity
-        self._later = version > FORMAT
+    def _validate(self, content: Mapping[str, NDArray[Any]]) -> CheckpointContent:
+        """Return the content of a file.
+
+        Raises:
+            _RejectedError: The file has another format or identity, or is too old.
+        """
+        now_s, version = self._now().wall_s, int(content["format"])
+        is_ours = str(content.get("identity", "")) == self._identity
+        self._is_later = version > FORMAT
         if version != FORMAT:
-            ledger = _ledger(found, now_s) if ours and self._later else None
-            raise _RefusedError(f"format {version}, this version reads {FORMAT}", ledger)
-        if not ours:
-            raise _RefusedError("it belongs to another pack or cell")
-        file = dict(found)
+            counters = _next_counters(content, now_s) if is_ours and self._is_later else None
+            raise _RejectedError(f"format {version}, this version reads {FORMAT}", counters)
+        if not is_ours:
+            raise _RejectedError("it belongs to another pack or cell")
+        file = dict(content)
         state = dict(fields(file["state"]))
         saved = BootTimestamp(
             float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"])
         )
-        unseen_s, ledger = self._now().since(saved), _ledger(file, now_s)
+        unseen_s, counters = self._now().since(saved), _next_counters(file, now_s)
         if self._longest_days is not None and self._longest_days * DAY_S < unseen_s < math.inf:
             days = f"{unseen_s / DAY_S:.1f} days old"
-            raise _RefusedError(f"it is {days}, state.longest_days is {self._longest_days:g}", ledger)
-        self._content = {name: v for name, v in file.items() if name not in ("format", *_OF_LEDGER)}
+            raise _RejectedError(f"it is {days}, state.longest_days is {self._longest_days:g}", counters)
+        self._content = {name: v for name, v in file.items() if name not in ("format", *_COUNTER_FIELDS)}
         self._content |= {"identity": self._identity}
         if str(file["observer"]) != self._observer:
             state = without_observer(state)
-        return CheckpointContent(state, unseen_s, ledger, "")
+        return CheckpointContent(state, unseen_s, counters, "")
 
     def _remove_oldest(self) -> None:
-        """Remove the oldest files of the pack: trying settings leaves one file for each."""
+        """Remove the oldest files of the pack, because each tried cell leaves one."""
         ours = re.compile(rf"{re.escape(self._name)}-[0-9a-f]{{8}}\.npz")
         others = [path for path in self.path.parent.iterdir() if ours.fullmatch(path.name) and path != self.path]
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
-        for path in others[KEPT - 1 :]:
+        for path in others[MAX_FILES - 1 :]:
             path.unlink(missing_ok=True)
 
 
-class _RefusedError(Exception):
-    """Reason for rejecting a checkpoint, and counters that continue anyway."""
+class _RejectedError(Exception):
+    """Reason for rejecting a checkpoint, with the counters that remain valid."""
 
-    def __init__(self, reason: str, ledger: RunCounters | None = None) -> None:
+    def __init__(self, reason: str, counters: RunCounters | None = None) -> None:
         super().__init__(reason)
-        self.ledger = ledger
+        self.counters = counters
 
 
-def _ledger(file: Mapping[str, NDArray[Any]], now_s: float) -> RunCounters:
-    """Return a file's run counters with this start added. Invalid counters restart from zero at ``now_s``."""
+def _next_counters(file: Mapping[str, NDArray[Any]], now_s: float) -> RunCounters:
+    """Return a file's run counters including this start. Invalid counters restart from zero at ``now_s``."""
     try:
-        return _believable(file)
+        return _read_counters(file)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-        log.warning("the checkpoint's counters cannot be: counting begins anew", reason=str(error))
+        log.warning("the checkpoint's counters are invalid and restart from zero", reason=str(error))
         return RunCounters(1, new_totals(now_s))
 
 
-def _believable(file: Mapping[str, NDArray[Any]]) -> RunCounters:
-    """Read the run counters of a file; a counter that the file lacks is 0.
+def _read_counters(file: Mapping[str, NDArray[Any]]) -> RunCounters:
+    """Read the run counters of a file and add this start; a missing counter is 0.
 
     Raises:
-        ArithmeticError, LookupError, TypeError, ValueError: It is damaged, or no counter can be so.
+        ArithmeticError, LookupError, TypeError, ValueError: A counter is damaged or implausible.
     """
-    told = json.loads(str(file["total"]))
-    total = Totals.model_validate({name: told[name] for name in Totals.model_fields if name in told})
+    stored = json.loads(str(file["total"]))
+    total = Totals.model_validate({name: stored[name] for name in Totals.model_fields if name in stored})
     datetime.fromisoformat(total.since)
     restarts, crashes = int(file["restarts"]) + 1, total.crashes + (not file["clean"])
-    counted = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
-    counted |= ChargeEnergy.of(total)._asdict()
-    wrong = [f"{name} = {value}" for name, value in counted.items() if not 0 <= value <= MOST]
-    if wrong:
-        raise ValueError(", ".join(wrong))
+    values = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
+    values |= ChargeEnergy.of(total)._asdict()
+    implausible = [f"{name} = {value}" for name, value in values.items() if not 0 <= value <= MAX_COUNT]
+    if implausible:
+        raise ValueError(", ".join(implausible))
     return RunCounters(restarts, total.model_copy(update={"crashes": crashes}), alarms=str(file.get("alarms", "")))

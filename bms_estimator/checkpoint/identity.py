@@ -1,4 +1,4 @@
-"""Identity of a checkpoint: pack and settings of its state."""
+"""Identities of a checkpoint: hashes of the pack and of the settings that its state depends on."""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -13,14 +13,12 @@ from bms_estimator.settings.pack import Settings
 
 
 def pack_identity(settings: Settings, cell: PackModel) -> str:
-    """Hash of what gives the state its meaning: cells in series, capacity, open-circuit voltage, sign of the current.
+    """Return the hash of all numbers on which the meaning of a state depends.
 
-    Of a fuel cell: all its parameters and the sign.
-
-    Plain numbers and not the sections of the settings: a new description, tuning value or setting does not change the
-    meaning.
+    These are the cells in series, the capacity, the open-circuit voltage and the sign of the current; for a fuel cell,
+    all its parameters and the sign. A changed description, tuning value or other setting does not change the hash.
     """
-    if isinstance(cell, FuelCellModel):  # theta is over the file's values
+    if isinstance(cell, FuelCellModel):  # the learned theta is relative to the parameters of the cell file
         return hashlib.sha256(repr((*cell.a, settings.sensor.current_sign)).encode()).hexdigest()
     ocv = cell.ocv
     curve = ocv.a if isinstance(ocv, ChenMoraOcv) else (*ocv.soc, *ocv.ocv_v)
@@ -29,13 +27,16 @@ def pack_identity(settings: Settings, cell: PackModel) -> str:
 
 
 def observer_identity(settings: Settings, cell: PackModel) -> str:
-    """Return the hash of all that the observer's parameters and gain depend on; under other settings they restart within seconds."""
+    """Return the hash of all that the observer's parameters and gain depend on.
+
+    With another hash the observer's own state is discarded; it converges again within seconds.
+    """
     parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
-    """Each field of a structured array, as a view, under its name; those of its parts as ``part.field``."""
+    """Yield name and view of each field of a structured array, recursively as ``part.field``."""
     for name in record.dtype.names or ():
         if record[name].dtype.names:
             yield from fields(record[name], f"{part}{name}.")
@@ -44,7 +45,7 @@ def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDAr
 
 
 def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return the fields of a state that stay valid under other observer settings: all but the observer's own."""
+    """Return the fields of a state that stay valid with another observer identity."""
     kept = "observer.soc", "observer.soc_coulomb", "observer.started"
     dropped = "observer.", "learning.", "series_resistance."
     return {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}

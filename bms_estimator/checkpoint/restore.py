@@ -20,49 +20,50 @@ _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith(
 OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
 EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
-"""Number of last axes of a field that run along the filter's states; a version appends new states at the end."""
-SAME_SOC = 0.03
-"""Largest difference between the SOC of filter and observer; beyond it the filter was switched off."""
+"""Number of trailing axes of a field that run along the filter's states; a later version appends states at the end."""
+MAX_SOC_DIFFERENCE = 0.03
+"""Maximum difference between the SOC of filter and observer. A larger one shows that the filter was switched off."""
 
 
 def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
-    """Go on from a checkpoint's state, saved ``unseen_s`` ago, on the board's new clock. The counters count from this start.
+    """Restore a new estimator from a checkpoint's state, with counters that start from zero.
 
-    A field that the checkpoint does not have, or has in another shape, is what a first sample makes it, and so are states
-    that the filter has more; a field that only the checkpoint has is left.
+    Fields that the checkpoint lacks, or has in another shape, and additional filter states get their values from a
+    first sample. Additional fields of the checkpoint are ignored.
 
     Args:
-        estimator: A new one; as it was when the state cannot be used.
-        saved: Fields by their names.
+        estimator: New estimator; unchanged if the state is invalid.
+        saved: Fields of the checkpoint by their names.
         unseen_s: Length of the unmeasured gap [s]; infinite if unknown.
 
     Returns:
-        Why the state cannot be used; empty when it is.
+        Reason for which the state is invalid; empty if the estimator was restored.
     """
     new = estimator.record.copy()
     estimator.step(0.0, 0.0, estimator.cell.cell.nominal_voltage_v)
-    begun = estimator.record.copy()
-    was_on = bool(saved.get("filter.started", np.zeros(1))[0])
+    after_first_sample = estimator.record.copy()
+    filter_was_on = bool(saved.get("filter.started", np.zeros(1))[0])
     copy_known_fields(
         estimator.record,
         {
             name: v
             for name, v in saved.items()
-            if was_on or name.startswith(("observer.", "learning.", "series_resistance."))
+            if filter_was_on or name.startswith(("observer.", "learning.", "series_resistance."))
         },
     )
-    wrong = _invalid_state_reason(estimator, begun)
-    if wrong:
+    reason = _invalid_state_reason(estimator, after_first_sample)
+    if reason:
         estimator.record[...] = new
-        return wrong
+        return reason
     f = estimator.record["filter"]
-    if estimator.identifying and (not was_on or abs(f["soc"][0] - estimator.state["soc"][0]) > SAME_SOC):
-        unseen_s = math.inf
-    if "filter.mean_a" not in saved:  # a version without the load statistics
+    soc_difference = abs(f["soc"][0] - estimator.state["soc"][0])
+    if estimator.identifying and (not filter_was_on or soc_difference > MAX_SOC_DIFFERENCE):
+        unseen_s = math.inf  # the filter's state is outdated
+    if "filter.mean_a" not in saved:  # saved by a version without load statistics
         f["mean_a"] = f["current_a"]
-    if was_on and saved.get("filter.mean", np.zeros(0)).shape[-1] < STATES:
-        _open_curve(estimator)
-    _open_new_states(estimator)
+    if filter_was_on and saved.get("filter.mean", np.zeros(0)).shape[-1] < STATES:
+        _reset_ocv_states(estimator)
+    _reset_switched_states(estimator)
     estimator.resume(unseen_s)
     for name in OBSERVER_COUNTERS:
         estimator.state[name] = 0
@@ -72,24 +73,24 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
 
 
 def copy_known_fields(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
-    """Take from ``saved``, fields by their names, what ``record`` has in the same shape, or in one that has grown."""
+    """Copy those saved fields, by name, whose shape ``record`` has too, or has with additional filter states."""
     for name, field in fields(record):
-        known = saved.get(name)
-        if known is None or known.ndim != field.ndim:
+        value = saved.get(name)
+        if value is None or value.ndim != field.ndim:
             continue
-        if known.shape == field.shape:
-            field[...] = known
-        elif name in EXTENDABLE_FIELDS and _is_shorter(known.shape, field.shape, EXTENDABLE_FIELDS[name]):
-            field[tuple(map(slice, known.shape))] = known
+        if value.shape == field.shape:
+            field[...] = value
+        elif name in EXTENDABLE_FIELDS and _is_shorter(value.shape, field.shape, EXTENDABLE_FIELDS[name]):
+            field[tuple(map(slice, value.shape))] = value
 
 
-def _is_shorter(known: tuple[int, ...], field: tuple[int, ...], axes: int) -> bool:
+def _is_shorter(saved: tuple[int, ...], field: tuple[int, ...], axes: int) -> bool:
     """Return True if the shapes differ only in the last ``axes``, along which the saved array is shorter."""
-    return known[:-axes] == field[:-axes] and max(known[-axes:]) <= field[-1]
+    return saved[:-axes] == field[:-axes] and max(saved[-axes:]) <= field[-1]
 
 
-def _open_curve(estimator: Estimator) -> None:
-    """Reset the error of the OCV if an earlier version did not have it as a state."""
+def _reset_ocv_states(estimator: Estimator) -> None:
+    """Initialize the OCV correction, which an earlier version did not have as states."""
     f, c = estimator.record[0]["filter"], estimator.record[0]["checks"]
     count = int(f["count"])
     for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
@@ -97,8 +98,8 @@ def _open_curve(estimator: Estimator) -> None:
     store_last_good_state(c, f)
 
 
-def _open_new_states(estimator: Estimator) -> None:
-    """Offset and capacity start as configured if they were not states of the filter before, or are not now."""
+def _reset_switched_states(estimator: Estimator) -> None:
+    """Initialize current offset and capacity as configured if a setting has made them a state or a constant."""
     f, p = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
     best = f["best"]
     for j, variance in ((OFFSET, offset_variance(p)), (LN_Q, p["capacity_std"] ** 2)):
@@ -107,20 +108,23 @@ def _open_new_states(estimator: Estimator) -> None:
             f["covariance"][best, j, j] = variance
 
 
-def _invalid_state_reason(estimator: Estimator, begun: NDArray[np.void]) -> str:
-    """Why a state cannot be used; empty when it can. What a first sample leaves without a value, ``begun``, needs none."""
+def _invalid_state_reason(estimator: Estimator, first_state: NDArray[np.void]) -> str:
+    """Return the reason for which a state is invalid; empty if it is valid.
+
+    Values that are not finite after a first sample, in ``first_state``, are not checked.
+    """
     record, cell = estimator.record, estimator.cell.cell
-    for (name, field), (_, first) in zip(fields(record), fields(begun), strict=True):
-        part, _, what = name.partition(".")
-        known = np.isfinite(first)
+    for (name, field), (_, first) in zip(fields(record), fields(first_state), strict=True):
+        part, _, quantity = name.partition(".")
+        checked = np.isfinite(first)
         if (
             part in ("observer", "learning", "series_resistance", "filter", "checks", "map")
-            and not np.isfinite(field[known]).all()
+            and not np.isfinite(field[checked]).all()
         ):
-            return f"{what} of the {part} is not finite"
+            return f"{quantity} of the {part} is not finite"
     s = record[0]["observer"]
     if not s["started"]:
-        return "no sample was taken"
+        return "it contains no sample"
     ranges = {
         "soc": (0.0, 1.0),
         "v_ts": (-cell.voltage_max_v, cell.voltage_max_v),
@@ -128,15 +132,15 @@ def _invalid_state_reason(estimator: Estimator, begun: NDArray[np.void]) -> str:
         "k": (0.0, np.inf),
     }
     for name, (low, high) in ranges.items():
-        if not low <= s[name] <= high and np.isfinite(begun[0]["observer"][name]):
+        if not low <= s[name] <= high and np.isfinite(first_state[0]["observer"][name]):
             return f"{name} = {s[name]} is outside {low}..{high}"
-    if not (s["a"][begun[0]["observer"]["a"] > 0.0] > 0.0).all():
+    if not (s["a"][first_state[0]["observer"]["a"] > 0.0] > 0.0).all():
         return "a parameter a1..a15 is not positive"
-    return _insane_filter(record[0]["filter"]) if estimator.identifying else ""
+    return _invalid_filter_reason(record[0]["filter"]) if estimator.identifying else ""
 
 
-def _insane_filter(f: np.void) -> str:
-    """Return why the filter's state is invalid; empty if it is valid."""
+def _invalid_filter_reason(f: np.void) -> str:
+    """Return the reason for which the filter's state is invalid; empty if it is valid."""
     count, best = int(f["count"]), int(f["best"])
     if not 0 <= best < count <= HYPOTHESES:
         return f"{count} hypotheses, the best of them {best}"

@@ -1,1 +1,1 @@
-"""The fleet's end on the device: samples to blocks, block store, NATS subjects."""
+"""Sender of raw samples to a fleet's server, on the device: blocks, block store, NATS subjects."""

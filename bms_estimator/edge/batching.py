@@ -1,4 +1,4 @@
-"""Samples gathered into blocks. Pure."""
+"""Division of samples into blocks. Pure."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ MAX_SAMPLES = 7_000
 
 
 class ReadyBlock(NamedTuple):
-    """Samples of a block, and the arrival time of the last one."""
+    """Samples of a completed block, with the arrival time of the last one."""
 
     arrival_s: float
     """Wall clock [s since 1970]."""
@@ -19,11 +19,11 @@ class ReadyBlock(NamedTuple):
 
 
 class Batcher:
-    """Divides samples into blocks of one duration.
+    """Divides samples into blocks of equal duration.
 
     Args:
-        block_s: A block's first sample and that of the next one are at least so far apart [s].
-        most: Samples of a block.
+        block_s: Minimum time from the first sample of a block to that of the next one [s].
+        most: Maximum number of samples in a block.
     """
 
     def __init__(self, block_s: float, most: int = MAX_SAMPLES) -> None:
@@ -36,8 +36,8 @@ class Batcher:
         return self._count
 
     def add(self, samples: SampleBlock, arrival_s: float) -> list[ReadyBlock]:
-        """Take samples, in order of their times. Returns the blocks that they have ended."""
-        ended = []
+        """Add samples in order of their times. Return the blocks that they complete."""
+        completed = []
         while samples.size:
             if not self._count:
                 self._end_s = float(samples["time_s"][0]) + self._block_s
@@ -47,11 +47,11 @@ class Batcher:
             self._count += part.size
             self._arrival_s = arrival_s if part.size else self._arrival_s
             if samples.size or self._count == self._most:
-                ended += self.cut()
-        return ended
+                completed += self.cut()
+        return completed
 
     def cut(self) -> list[ReadyBlock]:
-        """End the block that is open; none where it has no samples."""
+        """Complete the open block. Return an empty list if it has no samples."""
         if not self._count:
             return []
         block = ReadyBlock(self._arrival_s, np.concatenate(self._parts))

@@ -1,4 +1,4 @@
-"""A block on its way from an edge: a header, and a pack's samples of about a minute, packed without loss.
+"""Binary format of a block: a header and a pack's samples of about a minute, compressed without loss.
 
 Layout, little-endian::
 
@@ -6,14 +6,15 @@ Layout, little-endian::
     4  version u1  1
     5  -       u1  0
     6  count   u2  samples, 1..65535
-    8  store   u8  when the edge's store was made [ns since 1970]: a later store takes the place of the one before
-    16 number  u8  of this block, from 1, one more for each block of a store
-    24 oldest  u8  the oldest number that the edge can still send: what is before it and has not come never will
+    8  store   u8  creation time of the edge's store [ns since 1970]; a later store replaces an earlier one
+    16 number  u8  number of this block in its store, from 1
+    24 oldest  u8  oldest number that the edge can still send; missing blocks before it will never arrive
     32 arrival f8  wall clock at the arrival of the last sample [s since 1970]
     40 body        zlib of the columns time_s, current_a, voltage_v, temperature_c (f8), status (u4)
 
-``time_s`` is the edge's clock: seconds since its store was made, never decreasing within one. Its bits are written as
-differences of 64-bit integers, which are nearly all the same at an even pace.
+``time_s`` is the edge's clock: seconds since the creation of its store, never decreasing within a store. Its bits are
+written as differences of 64-bit integers. At a constant sample period nearly all differences are equal, which
+compresses well.
 """
 
 import math
@@ -28,7 +29,7 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 _HEADER = struct.Struct("<4sBxHQQQd")
 _OLDEST = 24
-"""Offset of the field in the header."""
+"""Offset of the field ``oldest`` in the header [bytes]."""
 _MAGIC, _VERSION = b"BMSB", 1
 MAX_SAMPLES = 65_535
 """Maximum number of samples of a block."""
@@ -44,12 +45,12 @@ class BlockError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Block of samples that an edge sends at once.
+    """Block of samples, sent in one message.
 
     Attributes:
-        store: When the edge's store was made [ns since 1970].
-        number: Number of this block, from 1.
-        oldest: The oldest number that the edge can still send; at most ``number``.
+        store: Creation time of the edge's store [ns since 1970].
+        number: Number of this block in its store, from 1.
+        oldest: Oldest number that the edge can still send; at most ``number``.
         arrival_s: Wall clock at the arrival of the last sample [s since 1970].
         samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MAX_SAMPLES`` of them.
     """
@@ -65,7 +66,7 @@ def encode(block: Block) -> bytes:
     """Encode a block.
 
     Raises:
-        ValueError: It holds no sample, or more than ``MAX_SAMPLES``.
+        ValueError: The block holds no sample, or more than ``MAX_SAMPLES``.
     """
     if not 1 <= block.samples.size <= MAX_SAMPLES:
         raise ValueError(f"{block.samples.size} samples in a block: must be 1 to {MAX_SAMPLES}")
@@ -86,15 +87,15 @@ def decode(data: bytes) -> Block:
     """Decode a block.
 
     Raises:
-        BlockError: It is not a block, or damaged.
+        BlockError: The bytes are not a block, or damaged.
     """
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
-        raise BlockError(f"{len(data)} bytes that do not begin as a block does")
+        raise BlockError(f"{len(data)} bytes without the header of a block")
     _, version, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
     if version != _VERSION:
         raise BlockError(f"version {version}; this program reads version {_VERSION}")
     if not (1 <= oldest <= number < MAX_NUMBER and 0 < store < MAX_NUMBER and math.isfinite(arrival_s)):
-        raise BlockError(f"store {store}, number {number}, oldest {oldest}, arrival {arrival_s}: cannot be")
+        raise BlockError(f"implausible header: store {store}, number {number}, oldest {oldest}, arrival {arrival_s}")
     return Block(store, number, oldest, arrival_s, _samples(data[_HEADER.size :], count))
 
 
@@ -114,7 +115,7 @@ def _samples(body: bytes, count: int) -> SampleBlock:
     except zlib.error as error:
         raise BlockError(str(error)) from None
     if len(raw) != size or count == 0 or not unpacker.eof or unpacker.unused_data:
-        raise BlockError(f"its body is not that of {count} samples")
+        raise BlockError(f"the body does not hold {count} samples")
     samples = np.zeros(count, dtype=SAMPLE)
     offset = 0
     for name, dtype in _COLUMNS:

@@ -1,7 +1,7 @@
-"""The edge: a pack's raw samples on their way to a fleet's server, by MQTT, in blocks.
+"""Sender of a pack's raw samples to a fleet's server, by MQTT, in blocks.
 
-``take`` gathers; ``BlockStore`` keeps blocks until a worker has confirmed them; this module sends them and receives
-the confirmations. How a broker is reached is the same as for estimates.
+``BlockSender`` collects samples in blocks, sends the blocks and receives the workers' confirmations. ``BlockStore``
+stores blocks until a worker has confirmed them. Connecting and reconnecting are those of package ``mqtt``.
 """
 
 import asyncio
@@ -37,10 +37,10 @@ from bms_estimator.store.database import RETRY_S, Database
 
 MIB = 1 << 20
 OVERDUE = 1.5
-"""Age at which a block is sent though no sample has completed it, in block lengths."""
+"""Age at which an incomplete block is sent, in block lengths."""
 HANDOVER_S = 2.0
-"""Time that unsent blocks may take at the end [s]."""
-PARTING_S = 1.0
+"""Time limit for sending the remaining blocks at shutdown [s]."""
+DISCONNECT_TIMEOUT_S = 1.0
 """Timeout of a disconnect from the server [s]."""
 
 log = structlog.get_logger(__name__)
@@ -53,17 +53,17 @@ class BlockSender:
         settings: Destination and storage of the blocks.
         pack: Name of the pack.
         folder: Folder of the blocks, in ``<pack>.edge.sqlite``.
-        connect: Makes a connection; over TCP when left out.
-        clock: Clock; its wall time dates samples.
-        steady: A clock that never steps and continues during suspend [s].
+        connect: Opens a connection; default: over TCP.
+        clock: Clock whose wall time dates samples.
+        steady: Clock that never steps and continues during suspend [s].
         most_samples: Maximum number of samples of a block.
-        first_delay_s: Delay before a lost broker, or a temporary rejection, is retried [s].
+        first_delay_s: Delay after a lost connection or a temporary rejection [s].
         retry_s: Delay before a failed disk is retried [s].
-        handover_s: Time for sending the remaining blocks at the end [s].
+        handover_s: Time limit for sending the remaining blocks at shutdown [s].
 
     Attributes:
-        delivery: What became of the blocks.
-        unread: Messages on the workers' topic that could not be read.
+        delivery: Delivery statistics of the blocks.
+        unread: Number of invalid messages on the workers' topic.
 
     Raises:
         UserError: A URL or a file of ``settings`` cannot be used.
@@ -84,42 +84,41 @@ class BlockSender:
         handover_s: float = HANDOVER_S,
     ) -> None:
         self._clock, self._steady, self._handover_s = clock or Clock(), steady, handover_s
-        self._block_s, self._gathering = settings.block_s, Batcher(settings.block_s, most_samples)
+        self._block_s, self._batcher = settings.block_s, Batcher(settings.block_s, most_samples)
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
-        self._hear_topic = _topic(subjects.awaits(pack))
+        self._request_topic = _topic(subjects.awaits(pack))
         most_bytes = int(settings.store_mib * MIB)
         self.store = BlockStore(self._database, _topic(subjects.raw(pack)), most_bytes, wall=self._clock.wall)
         self.delivery, self.unread = DeliveryStats(), 0
-        self._refusals = DeniedTopics(self.delivery, lambda: None, first_delay_s)
-        self._sending = QueueSender(self.store, self.delivery, self._refusals, first_delay_s)
+        self._denied = DeniedTopics(self.delivery, lambda: None, first_delay_s)
+        self._sender = QueueSender(self.store, self.delivery, self._denied, first_delay_s)
         for warning in check_edge(settings):
-            log.warning("a secret that is none", reason=warning)
+            log.warning("secret is readable by other users", reason=warning)
         mqtt = _mqtt(settings)
-        hello = ConnectOptions(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._lose)
+        options = ConnectOptions(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._count_unread)
         self._link = ReconnectLoop(
-            brokers(mqtt), hello, connect or BrokerConnector(mqtt), self._serve, self.delivery, first_delay_s
+            brokers(mqtt), options, connect or BrokerConnector(mqtt), self._serve, self.delivery, first_delay_s
         )
-        self._times: SampleClock | None = None
-        self._overdue: asyncio.TimerHandle | None = None
+        self._sample_clock: SampleClock | None = None
+        self._overdue_timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
         self._stack = contextlib.AsyncExitStack()
 
     def take(self, samples: SampleBlock) -> None:
-        """Take samples that have just arrived, with times by the source's clock; returns at once."""
-        if self._times is None:
-            raise RuntimeError("an edge takes samples within its context")
+        """Add samples that have just arrived, with times of the source's clock, without waiting."""
+        if self._sample_clock is None:
+            raise RuntimeError("the sender accepts samples only within its context")
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
         wall_s = self._clock.wall()
-        self._times.go_on_from(
-            self.store.last_s
-        )  # a store may be later than our clock, where workers have had a later one
+        # a new store may begin later than our clock, if a worker had blocks of a later store
+        self._sample_clock.advance_to(self.store.last_s)
         placed = samples.copy()
-        placed["time_s"] = self._times.place(samples["time_s"], wall_s, self._steady())
-        ended = self._gathering.add(placed, wall_s)
-        for block in ended:
+        placed["time_s"] = self._sample_clock.place(samples["time_s"], wall_s, self._steady())
+        completed = self._batcher.add(placed, wall_s)
+        for block in completed:
             self.store.put(block)
-        if ended or self._overdue is None:
+        if completed or self._overdue_timer is None:
             self._watch_open_block()
 
     def health(self) -> EdgeHealth:
@@ -133,19 +132,19 @@ class BlockSender:
         )
 
     async def __aenter__(self) -> Self:
-        """Start reaching for the server."""
+        """Open the store and start connecting to the server."""
         await self._stack.enter_async_context(self._database)
         await self._stack.enter_async_context(self.store)
-        self._times = SampleClock(self.store.last_s)
+        self._sample_clock = SampleClock(self.store.last_s)
         self._task = asyncio.create_task(self._link.run(), name="edge")
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Send the block that is open, too; the next run sends the rest."""
+        """Complete the open block, and send within ``handover_s``; the next run sends the rest."""
         self._end_block()
         if self._task is not None:
             self._link.closing.set()
-            done, _ = await asyncio.wait([self._task], timeout=self._handover_s + PARTING_S)
+            done, _ = await asyncio.wait([self._task], timeout=self._handover_s + DISCONNECT_TIMEOUT_S)
             if not done:
                 self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -153,38 +152,38 @@ class BlockSender:
         await self._stack.aclose()
 
     def _watch_open_block(self) -> None:
-        """See to it that the open block, if there is one, does not wait for a source that is silent."""
-        if self._overdue is not None:
-            self._overdue.cancel()
+        """Restart the timer that completes the open block if the source falls silent."""
+        if self._overdue_timer is not None:
+            self._overdue_timer.cancel()
         due_s = OVERDUE * self._block_s
-        open_ = len(self._gathering) > 0
-        self._overdue = asyncio.get_running_loop().call_later(due_s, self._end_block) if open_ else None
+        has_samples = len(self._batcher) > 0
+        self._overdue_timer = asyncio.get_running_loop().call_later(due_s, self._end_block) if has_samples else None
 
     def _end_block(self) -> None:
-        for block in self._gathering.cut():
+        for block in self._batcher.cut():
             self.store.put(block)
         self._watch_open_block()
 
     async def _serve(self, connection: Connection) -> None:
         """Send and receive until the connection is lost or the edge closes."""
-        self._refusals.begin()
+        self._denied.begin()
         try:
-            refused = await connection.subscribe(None, [self._hear_topic])
-            for topic, why in refused.items():
-                self._refusals.deny(topic, f"not allowed to read it: {why}")
+            rejected = await connection.subscribe(None, [self._request_topic])
+            for topic, reason in rejected.items():
+                self._denied.deny(topic, f"not allowed to read it: {reason}")
             async with asyncio.TaskGroup() as tasks:
                 others = [
                     tasks.create_task(self._receive(connection)),
-                    tasks.create_task(self._sending.send(connection)),
+                    tasks.create_task(self._sender.send(connection)),
                 ]
                 await self._link.closing.wait()
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(self._handover_s):
-                        await self._sending.wait_until_empty()
+                        await self._sender.wait_until_empty()
                 for task in others:
                     task.cancel()
         finally:
-            self._refusals.end()
+            self._denied.end()
 
     async def _receive(self, connection: Connection) -> None:
         while True:
@@ -192,14 +191,14 @@ class BlockSender:
             try:
                 awaits = subjects.BlockRequest.model_validate_json(message.payload)
             except ValidationError:
-                self._lose("unreadable", message.topic)
+                self._count_unread("unreadable", message.topic)
             else:
                 self.store.on_request(awaits)
 
-    def _lose(self, kind: str, topic: str) -> None:
-        """Count a message that is not a worker's answer."""
+    def _count_unread(self, kind: str, topic: str) -> None:
+        """Count an invalid message on the workers' topic, and log the first one."""
         if not self.unread:
-            log.warning("what came from a worker cannot be read", reason=kind, topic=topic[:100])
+            log.warning("invalid message on the workers' topic", reason=kind, topic=topic[:100])
         self.unread += 1
 
 
@@ -223,6 +222,6 @@ def check_edge(settings: EdgeSettings) -> list[str]:
 
 
 def _mqtt(settings: EdgeSettings) -> MqttSettings:
-    """Return the connection options that all servers share."""
-    doors = ("url", "username", "password_file", "ca_file", "cert_file", "key_file")
-    return MqttSettings(**{name: getattr(settings, name) for name in doors})
+    """Return the connection settings of a server as MQTT settings."""
+    names = ("url", "username", "password_file", "ca_file", "cert_file", "key_file")
+    return MqttSettings(**{name: getattr(settings, name) for name in names})

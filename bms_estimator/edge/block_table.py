@@ -1,4 +1,4 @@
-"""Block table of an edge, with each operation in one transaction."""
+"""Tables of an edge's blocks, and the transactions on them."""
 
 import sqlite3
 from collections.abc import Sequence
@@ -11,10 +11,11 @@ from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import MAX_NUMBER, Block, BlockError, decode, encode
 
 NS = 1_000_000_000
+"""Nanoseconds in a second."""
 LATEST_S = MAX_NUMBER // NS - 1
-"""No store is made later [s since 1970]: the year 2262."""
+"""Latest creation time of a store, in the year 2262 [s since 1970]."""
 DROP_ROWS = 64
-"""Blocks that are looked at together where room must be made."""
+"""Number of rows read at a time when blocks are dropped."""
 EDGE_TABLES = (
     """
     CREATE TABLE store (
@@ -32,20 +33,20 @@ EDGE_TABLES = (
 
 
 class StoreState(NamedTuple):
-    """A store and its content."""
+    """Row of table ``store``."""
 
     made_s: int
     """Creation time [s since 1970]: whole seconds, so that sample times relative to it are exact."""
     next: int
     """Number of the next block."""
     last_s: float
-    """Time of its last sample, since it was made [s]; 0 without any."""
+    """Time of the last sample since the creation of the store [s]; 0 without samples."""
     bytes: int
-    """Size of the blocks [bytes]."""
+    """Total size of the blocks [bytes]."""
     run: str
-    """Identifier of the process that put the last block."""
+    """Identifier of the process that inserted the last block."""
     taken: int
-    """Number of blocks that it had put."""
+    """Number of blocks that this process has inserted."""
 
 
 class StoreResult(NamedTuple):
@@ -53,37 +54,37 @@ class StoreResult(NamedTuple):
 
     kept: StoreState
     oldest: int
-    """Number of the oldest block; ``kept.next`` without a store."""
+    """Number of the oldest block; ``kept.next`` without blocks."""
     dropped: int
-    """Blocks that had to make room."""
+    """Number of blocks dropped because the store was full."""
 
 
 @dataclass(frozen=True)
 class StoreTransaction:
-    """Insert blocks, delete confirmed ones, make room; may be done twice.
+    """Idempotent transaction that inserts blocks, deletes confirmed ones and drops the oldest beyond the size limit.
 
     Raises:
-        sqlite3.Error: As the disk has it.
+        sqlite3.Error: The database cannot be read or written.
     """
 
     run: str
-    """Identifier of this process: blocks that it has put are not put again."""
+    """Identifier of this process, by which blocks that were already inserted are skipped."""
     put: Sequence[tuple[int, ReadyBlock]]
     """Blocks and their running numbers in this process, from 1; their times are seconds since 1970."""
     safe: int
-    """Blocks below this number are forgotten."""
+    """Number below which blocks are deleted, because workers have confirmed them."""
     known_s: int
-    """Creation time of the store of this process [s since 1970]; 0: none yet. An earlier store is not valid."""
+    """Creation time of the store in memory [s since 1970]; 0 without one. An earlier store on disk is replaced."""
     after_s: int
-    """A store that was not created after this time is not valid, and a new one is begun [s since 1970]."""
+    """Time after which the store must have been created [s since 1970]; otherwise it is replaced."""
     most_bytes: int
     now_s: float
     """Wall clock [s since 1970]."""
     count: bool
-    """True to count the bytes again."""
+    """True to recount the bytes."""
 
     def __call__(self, connection: sqlite3.Connection) -> StoreResult:
-        """Do it."""
+        """Run the transaction."""
         kept = _stored_state(connection)
         if kept is None or kept.made_s < self.known_s or kept.made_s <= self.after_s:
             kept = self._begin(connection)
@@ -91,10 +92,10 @@ class StoreTransaction:
             removed = _bytes(connection, f"WHERE number < {self.safe:d}")
             connection.execute("DELETE FROM block WHERE number < ?", (self.safe,))
             kept = kept._replace(bytes=_bytes(connection) if self.count else kept.bytes - removed)
-        done = kept.taken if kept.run == self.run else 0
-        for index, gathered in self.put:
-            if index > done:
-                kept = _put(connection, kept, gathered)._replace(run=self.run, taken=index)
+        inserted = kept.taken if kept.run == self.run else 0
+        for index, ready in self.put:
+            if index > inserted:
+                kept = _insert(connection, kept, ready)._replace(run=self.run, taken=index)
         kept, dropped = _make_room(connection, kept, self.most_bytes)
         connection.execute("DELETE FROM store")
         connection.execute("INSERT INTO store VALUES (?, ?, ?, ?, ?, ?)", kept)
@@ -109,19 +110,19 @@ class StoreTransaction:
 
 
 class Page(NamedTuple):
-    """Blocks that follow each other, as they are read."""
+    """Consecutive blocks read from disk."""
 
     first: int
-    """Number of the first one that can be read; earlier requests cannot."""
+    """Number of the first readable block."""
     blocks: list[tuple[int, bytes]]
 
 
 @dataclass(frozen=True)
-class Read:
-    """Read blocks in order.
+class PageRead:
+    """Transaction that reads consecutive blocks.
 
     Raises:
-        sqlite3.Error: As the disk has it.
+        sqlite3.Error: The database cannot be read.
     """
 
     made_s: int
@@ -130,14 +131,15 @@ class Read:
     end: int
     """Number after the last block."""
     most: int
+    """Maximum number of blocks."""
 
     def __call__(self, connection: sqlite3.Connection) -> Page:
-        """Do it."""
-        asked = "SELECT number, data FROM block WHERE number >= ? AND number < ? ORDER BY number LIMIT ?"
+        """Run the transaction."""
+        query = "SELECT number, data FROM block WHERE number >= ? AND number < ? ORDER BY number LIMIT ?"
         blocks = list[tuple[int, bytes]]()
         first = self.end
-        for number, data in connection.execute(asked, (self.first, self.end, self.most)).fetchall():
-            if not _sound(self.made_s, number, data):
+        for number, data in connection.execute(query, (self.first, self.end, self.most)).fetchall():
+            if not _is_valid(self.made_s, number, data):
                 if blocks:
                     break
                 first = number + 1
@@ -157,17 +159,17 @@ def _stored_state(connection: sqlite3.Connection) -> StoreState | None:
     return kept if 0 < kept.made_s <= LATEST_S and 0 < kept.next < MAX_NUMBER else None
 
 
-def _put(connection: sqlite3.Connection, kept: StoreState, gathered: ReadyBlock) -> StoreState:
-    samples = gathered.samples.copy()
+def _insert(connection: sqlite3.Connection, kept: StoreState, ready: ReadyBlock) -> StoreState:
+    samples = ready.samples.copy()
     samples["time_s"] = np.maximum(samples["time_s"] - kept.made_s, kept.last_s)
-    data = encode(Block(kept.made_s * NS, kept.next, kept.next, gathered.arrival_s, samples))
+    data = encode(Block(kept.made_s * NS, kept.next, kept.next, ready.arrival_s, samples))
     connection.execute("INSERT OR REPLACE INTO block VALUES (?, ?)", (kept.next, data))
     last_s = float(samples["time_s"][-1])
     return kept._replace(next=kept.next + 1, last_s=last_s, bytes=kept.bytes + len(data))
 
 
 def _make_room(connection: sqlite3.Connection, kept: StoreState, most_bytes: int) -> tuple[StoreState, int]:
-    """Drop the oldest, but never the newest."""
+    """Drop the oldest blocks beyond the size limit, but never the newest one."""
     dropped = 0
     oldest = "SELECT number, length(data) FROM block WHERE number < ? ORDER BY number LIMIT ?"
     while kept.bytes > most_bytes and (rows := connection.execute(oldest, (kept.next - 1, DROP_ROWS)).fetchall()):
@@ -185,8 +187,8 @@ def _bytes(connection: sqlite3.Connection, where: str = "") -> int:
     return int(size)
 
 
-def _sound(made_s: int, number: int, data: Any) -> bool:
-    """Return True if a row is a block as it was put."""
+def _is_valid(made_s: int, number: int, data: Any) -> bool:
+    """Return True if a row holds the undamaged block of its number."""
     if not isinstance(data, bytes):
         return False
     try:

@@ -1,4 +1,4 @@
-"""The time of samples on their way to a fleet: a source's clock mapped onto one that never steps back. Pure."""
+"""Timestamps of samples for a fleet: a source's clock mapped to one that never steps back. Pure."""
 
 import math
 
@@ -8,101 +8,103 @@ from numpy.typing import NDArray
 Times = NDArray[np.float64]
 
 BAND_S = 1.0
-"""Maximum difference between a source's clock and the host's that is not corrected [s]: transport delays vary, too."""
+"""Maximum difference between the source's clock and the host's that is not corrected [s]: transport delays vary too."""
 STEP_S = 10.0
-"""Difference of a source's clock beyond which it was set; the skipped time is a gap [s]."""
+"""Difference beyond which a clock counts as set and not as drifting; the skipped time becomes a gap [s]."""
 SLEW = 0.01
-"""Relative rate at which an offset of a source's clock below that is corrected: no resonator is as wrong."""
+"""Relative rate at which a difference between ``BAND_S`` and ``STEP_S`` is corrected. No resonator drifts as fast."""
 WINDOW_S = 600.0
-"""Window of the smallest delay [s]: samples are late and never early, so the smallest delay shows a clock's lag."""
+"""Window over which the smallest delay is taken [s]. Samples arrive late and never early, so the smallest delay is the
+lag of the source's clock."""
 GRID = 2.0**20
 """Offsets are multiples of 1/GRID, so that a constant period stays constant, which compresses best."""
 
 
 class SampleClock:
-    """Seconds since 1970 that never decrease, even if the wall clock does.
+    """Clock in seconds since 1970 that never decreases, even if the wall clock does.
 
-    Between samples counts the source's clock. The host gives its start by the wall clock, and its corrections by the
-    monotonic clock. A wall clock that is set ahead is followed, as on a machine that starts without the time; the
-    step is a gap. One that is set back is not.
+    The source's clock gives the intervals between samples. The host's wall clock gives the start, and the host's
+    steady clock gives the corrections. The clock follows a wall clock that is set ahead, as on a machine that boots
+    without the time; the step becomes a gap. The clock ignores a wall clock that is set back.
 
     Args:
-        last_s: Time of the last sample that was placed, in an earlier run, too [s since 1970]; none: minus infinity.
+        last_s: Time of the last sample of an earlier run [s since 1970]; minus infinity without one.
 
     Attributes:
-        steps: Number of times that a clock was set, or the source restarted.
+        steps: Number of times that a clock was set or the source restarted.
     """
 
     def __init__(self, last_s: float = -math.inf) -> None:
         self.steps = 0
         self._last_s = last_s
-        self._lead_s = math.nan  # our clock less the host's steady one
-        self._told_s = math.nan  # the source's clock at the last sample
-        self._offset_s = 0.0  # our clock less the source's
-        self._slew_s = 0.0  # slow increase of the offset
-        self._least_late_s, self._window_s = math.inf, 0.0  # of the present window, and when it began
+        self._lead_s = math.nan  # this clock minus the host's steady clock
+        self._source_s = math.nan  # the source's clock at the last sample
+        self._offset_s = 0.0  # this clock minus the source's
+        self._slew_s = 0.0  # remaining correction of the offset, applied at the rate SLEW
+        self._min_delay_s, self._window_s = math.inf, 0.0  # smallest delay in the window, and start of the window
 
-    def go_on_from(self, time_s: float) -> None:
-        """Place nothing before a time later than all placed samples, and the next sample there [s since 1970]."""
+    def advance_to(self, time_s: float) -> None:
+        """Place the next sample at ``time_s`` if that is later than all placed samples [s since 1970]."""
         if time_s > self._last_s:
-            self._last_s, self._lead_s, self._told_s = time_s, math.nan, math.nan
+            self._last_s, self._lead_s, self._source_s = time_s, math.nan, math.nan
 
-    def place(self, told_s: Times, wall_s: float, steady_s: float) -> Times:
+    def place(self, source_s: Times, wall_s: float, steady_s: float) -> Times:
         """Return timestamps of samples that have just arrived [s since 1970].
 
         Args:
-            told_s: Times on the source's clock [s], shape (n,); a non-finite time counts as that of the previous sample.
+            source_s: Times of the source's clock [s], shape (n,). A non-finite time is replaced by the previous one.
             wall_s: Wall clock now [s since 1970].
-            steady_s: A clock that never steps and continues during suspend [s].
+            steady_s: Clock that never steps and continues during suspend [s].
         """
         now_s = self._now(wall_s, steady_s)
-        told_s = _finite(told_s, self._told_s)
-        runs = np.split(told_s, np.flatnonzero(np.diff(told_s) < 0.0) + 1)
-        return np.concatenate([self._place(run, now_s) for run in runs if run.size] or [told_s])
+        source_s = _finite(source_s, self._source_s)
+        runs = np.split(source_s, np.flatnonzero(np.diff(source_s) < 0.0) + 1)
+        return np.concatenate([self._place(run, now_s) for run in runs if run.size] or [source_s])
 
     def _now(self, wall_s: float, steady_s: float) -> float:
-        """Our clock now [s]."""
+        """Return this clock's present time [s since 1970]."""
         if math.isnan(self._lead_s):
             self._lead_s = max(wall_s, self._last_s) - steady_s
         elif wall_s - steady_s > self._lead_s + STEP_S:
             self._lead_s = wall_s - steady_s
-            self._told_s = math.nan
+            self._source_s = math.nan
         return steady_s + self._lead_s
 
-    def _place(self, told_s: Times, now_s: float) -> Times:
-        """Return timestamps of samples during which the source's clock does not step back."""
-        late_s = now_s - (float(told_s[-1]) + self._offset_s)
-        if not told_s[0] >= self._told_s or late_s < -STEP_S:  # of a first one, too
-            self._map_anew(told_s, now_s)
+    def _place(self, source_s: Times, now_s: float) -> Times:
+        """Return timestamps of samples between which the source's clock does not step back."""
+        delay_s = now_s - (float(source_s[-1]) + self._offset_s)
+        # the first comparison is also false for the first samples, when _source_s is NaN
+        if not source_s[0] >= self._source_s or delay_s < -STEP_S:
+            self._reset_mapping(source_s, now_s)
         else:
-            self._watch(late_s, now_s)
-        placed = told_s + self._offset_s
-        span_s = float(told_s[-1]) - self._told_s
+            self._update_drift(delay_s, now_s)
+        placed = source_s + self._offset_s
+        span_s = float(source_s[-1]) - self._source_s
         if self._slew_s and span_s > 0.0:
             shift_s = min(max(self._slew_s, -SLEW * span_s), SLEW * span_s)
-            placed += shift_s * (told_s - self._told_s) / span_s
+            placed += shift_s * (source_s - self._source_s) / span_s
             self._offset_s += shift_s
             self._slew_s -= shift_s
         placed = np.maximum(placed, self._last_s)
-        self._told_s, self._last_s = float(told_s[-1]), float(placed[-1])
+        self._source_s, self._last_s = float(source_s[-1]), float(placed[-1])
         return placed
 
-    def _map_anew(self, told_s: Times, now_s: float) -> None:
+    def _reset_mapping(self, source_s: Times, now_s: float) -> None:
         """Map the last sample to now, unless the first one would then precede an earlier sample."""
-        offset_s = max(now_s - float(told_s[-1]), self._last_s - float(told_s[0]))
+        offset_s = max(now_s - float(source_s[-1]), self._last_s - float(source_s[0]))
         self._offset_s, self._slew_s = math.ceil(offset_s * GRID) / GRID, 0.0
-        self._told_s = float(told_s[0])
-        self._least_late_s, self._window_s = math.inf, now_s
+        self._source_s = float(source_s[0])
+        self._min_delay_s, self._window_s = math.inf, now_s
         self.steps += 1
 
-    def _watch(self, late_s: float, now_s: float) -> None:
-        """Find out whether the source's clock runs ahead, or falls behind."""
-        if late_s < -BAND_S:
-            self._slew_s = late_s
-        self._least_late_s = min(self._least_late_s, late_s)
+    def _update_drift(self, delay_s: float, now_s: float) -> None:
+        """Schedule a correction if the source's clock runs ahead or falls behind."""
+        if delay_s < -BAND_S:
+            self._slew_s = delay_s
+        self._min_delay_s = min(self._min_delay_s, delay_s)
         if now_s - self._window_s < WINDOW_S:
             return
-        behind_s, self._least_late_s, self._window_s = self._least_late_s, math.inf, now_s
+        behind_s, self._min_delay_s, self._window_s = self._min_delay_s, math.inf, now_s
         if behind_s > STEP_S:
             self._offset_s += math.floor(behind_s * GRID) / GRID
             self._slew_s = 0.0
@@ -111,11 +113,11 @@ class SampleClock:
             self._slew_s = behind_s
 
 
-def _finite(told_s: Times, before_s: float) -> Times:
-    """Each that is not finite as the one before it."""
-    if np.isfinite(told_s).all():
-        return told_s
-    filled = told_s.copy()
-    for i in np.flatnonzero(~np.isfinite(told_s)):
+def _finite(source_s: Times, before_s: float) -> Times:
+    """Replace each non-finite time by the one before it."""
+    if np.isfinite(source_s).all():
+        return source_s
+    filled = source_s.copy()
+    for i in np.flatnonzero(~np.isfinite(source_s)):
         filled[i] = filled[i - 1] if i else before_s if math.isfinite(before_s) else 0.0
     return filled

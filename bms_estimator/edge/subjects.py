@@ -1,13 +1,13 @@
-"""Names on the server, within the account of one tenant. An MQTT topic is the subject with / for the dots.
+"""NATS subjects within the account of one tenant. The MQTT topic of a subject has slashes for the dots.
 
 ===========================  ================================================================================
-``raw.<pack>``               an edge's blocks, ``block``; the stream ``RAW`` takes them and stores them as ...
-``p.<partition>.raw.<pack>`` ... this; published to it, a message reaches no stream
-``edge.<pack>.awaits``       to the edge: which block a worker awaits next, ``BlockRequest``
-``bms.<pack>.<topic>``       estimates, as ``run`` publishes them
-``hours.<pack>``             what a worker sums up each hour, kept by the stream ``HOURS``
-``fleet.worker.<id>``        each second, from each worker: that it lives, what it holds, how far it lags
-``fleet.unknown.<pack>``     once, from a worker: it holds blocks of a pack that the table does not know, and why
+``raw.<pack>``               blocks of an edge (module ``block``), received by the stream ``RAW``
+``p.<partition>.raw.<pack>`` blocks in the stream ``RAW``; a message published to this subject reaches no stream
+``edge.<pack>.awaits``       ``BlockRequest`` to the edge: the block that a worker awaits next
+``bms.<pack>.<topic>``       estimates, published as by ``run``
+``hours.<pack>``             one-hour summaries by a worker, stored in the stream ``HOURS``
+``fleet.worker.<id>``        heartbeat of a worker each second, with its partitions and its lag
+``fleet.unknown.<pack>``     report of a worker, once, that it has blocks of an unregistered pack, with the reason
 ===========================  ================================================================================
 """
 
@@ -17,9 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 RAW_STREAM, HOURS_STREAM = "RAW", "HOURS"
 PACKS_BUCKET, CELLS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "cells", "checkpoints", "states"
-"""Key-value: settings by pack; cell files by name; the last checkpoint by partition. Objects: what checkpoints hold."""
+"""Key-value buckets: settings by pack, cell files by name, last checkpoint by partition. Object bucket: content of the
+checkpoints."""
 PARTITIONS = 64
-"""Default number of partitions; it is set when the streams are made and never changes."""
+"""Default number of partitions, which is fixed when the streams are created."""
 
 
 def raw(pack: str) -> str:
@@ -33,7 +34,7 @@ def kept(partition: int, pack: str = "*") -> str:
 
 
 def mapping(partitions: int) -> tuple[str, str]:
-    """Source and destination of the transform by which ``RAW`` puts each pack into its partition."""
+    """Return source and destination of the subject transform of ``RAW`` that assigns packs to partitions."""
     return "raw.*", f"p.{{{{partition({partitions},1)}}}}.raw.{{{{wildcard(1)}}}}"
 
 
@@ -71,11 +72,11 @@ def partition_of(pack: str, partitions: int) -> int:
 
 
 class BlockRequest(BaseModel):
-    """Message to an edge: all blocks of ``store`` before ``number`` are safe and may be deleted."""
+    """Message to an edge that all blocks of ``store`` before ``number`` are stored safely and may be deleted."""
 
     model_config = ConfigDict(frozen=True)
 
     store: Annotated[int, Field(ge=0, lt=2**63)]
     number: Annotated[int, Field(ge=1, le=2**63)]
     resend: bool
-    """A later block arrived first: send this one and all after it again."""
+    """True if a later block arrived first, so that this one and all after it must be sent again."""

@@ -13,7 +13,7 @@ PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 
 class Broker(NamedTuple):
-    """One broker's address."""
+    """Address of a broker."""
 
     url: str
     host: str
@@ -25,14 +25,14 @@ def brokers(settings: MqttSettings) -> list[Broker]:
     """Return the brokers in the order of attempts.
 
     Raises:
-        UserError: A URL cannot be used, or a certificate is given where it cannot be shown.
+        UserError: A URL cannot be used, or a certificate or key is configured that no connection would use.
     """
-    found = [_broker(url) for url in settings.urls]
-    if settings.cert_file and not any(broker.tls for broker in found):
+    addresses = [_broker(url) for url in settings.urls]
+    if settings.cert_file and not any(broker.tls for broker in addresses):
         raise UserError(f"mqtt.cert_file = {settings.cert_file}: of no use without TLS: mqtt.url must be mqtts://...")
     if settings.key_file and not settings.cert_file:
         raise UserError(f"mqtt.key_file = {settings.key_file}: of no use without mqtt.cert_file")
-    return found
+    return addresses
 
 
 def password(settings: MqttSettings) -> str | None:
@@ -47,23 +47,23 @@ def password(settings: MqttSettings) -> str | None:
         return credential(settings.password_file).read_text(encoding="utf-8").rstrip("\r\n")
     except OSError as error:
         raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:  # whose text contains the bytes
+    except UnicodeDecodeError:  # its text would show bytes of the password
         raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: not UTF-8 text") from None
 
 
 def tls_context(settings: MqttSettings) -> ssl.SSLContext:
-    """Whom to trust and what to show, reloaded, because certificates are replaced while the service runs.
+    """Create a TLS context from the certificate files, which may have been replaced since the last connection.
 
     Raises:
         UserError: A file cannot be read, or is invalid.
     """
     try:
         context = ssl.create_default_context(cafile=settings.ca_file)
-    except OSError as error:  # ssl.SSLError is one
+    except OSError as error:  # includes ssl.SSLError
         raise UserError(f"mqtt.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     if settings.cert_file is not None:
-        _show(context, settings, settings.cert_file)
+        _load_client_certificate(context, settings, settings.cert_file)
     return context
 
 
@@ -94,28 +94,29 @@ def _broker(address: str) -> Broker:
     try:
         url = urlsplit(address)
         host, port = url.hostname, url.port or PORTS[url.scheme]
-        (host or "").encode("idna")  # as the resolver will
-    except ValueError as error:  # UnicodeError is one
+        (host or "").encode("idna")  # the resolver encodes the name this way and would fail later
+    except ValueError as error:  # includes UnicodeError
         raise UserError(f"mqtt.url = {address}: {error}") from None
     if not host:
         raise UserError(f"mqtt.url = {address}: must be mqtt://host:port")
     return Broker(address, host, port, url.scheme == "mqtts")
 
 
-def _show(context: ssl.SSLContext, settings: MqttSettings, cert_file: Path) -> None:
-    """Show a certificate of our own; without a key file the key is in the same file.
+def _load_client_certificate(context: ssl.SSLContext, settings: MqttSettings, cert_file: Path) -> None:
+    """Load the client certificate and its key. Without a key file, the certificate file contains the key.
 
     Raises:
-        UserError: A file cannot be read, or the two do not belong together.
+        UserError: A file cannot be read, or the key does not match the certificate.
     """
     key_file = settings.key_file or cert_file
-    for name, path in (("cert_file", cert_file), ("key_file", key_file)):  # the error of both does not name the file
+    # load_cert_chain does not name the file that it cannot read
+    for name, path in (("cert_file", cert_file), ("key_file", key_file)):
         try:
             credential(path).read_bytes()
         except OSError as error:
             raise UserError(f"mqtt.{name} = {path}: cannot be read: {error.strerror}") from None
     try:
-        # a password, or OpenSSL would ask the terminal for one
+        # without a password callback, OpenSSL would prompt on the terminal
         context.load_cert_chain(credential(cert_file), credential(key_file), password=_refuse_password)
     except ssl.SSLError as error:
         if error.reason == "KEY_VALUES_MISMATCH":
@@ -126,7 +127,7 @@ def _show(context: ssl.SSLContext, settings: MqttSettings, cert_file: Path) -> N
 
 
 def _refuse_password() -> str:
-    """Refuse an encrypted key, whose password cannot be entered.
+    """Reject an encrypted key, because a service cannot prompt for its password.
 
     Raises:
         UserError: Always.

@@ -1,4 +1,4 @@
-"""The real connection: aiomqtt and paho, with their errors in plain words."""
+"""Implementation of ``Connection`` by aiomqtt and paho, with readable errors."""
 
 import asyncio
 import contextlib
@@ -20,18 +20,18 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, PublishRejection, ReceivedMessage
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.reason_codes import UNSUPPORTED_VERSION, is_final, words
+from bms_estimator.mqtt.reason_codes import UNSUPPORTED_VERSION, describe_reason, is_final
 from bms_estimator.mqtt.receive_queue import ReceiveQueue
 
-PARTING_S = 1.0
-"""A connection that broke cannot be ended in good order [s]."""
+DISCONNECT_TIMEOUT_S = 1.0
+"""Timeout of DISCONNECT [s]: a broken connection cannot be closed properly."""
 NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-"""Small messages go at once."""
-HEAD_BYTES = 16
-"""Maximum overhead of a published message beside topic and payload [bytes]."""
-SOCKET_BROKE = "failed to receive on socket: "
+"""Socket option that sends small messages immediately, without Nagle's algorithm."""
+MAX_OVERHEAD_BYTES = 16
+"""Maximum overhead of a PUBLISH packet besides topic and payload [bytes]."""
+SOCKET_ERROR_PREFIX = "failed to receive on socket: "
 """Beginning of paho's log line about a socket error."""
-TLS_ALERT = "[SSL: "
+TLS_ERROR_PREFIX = "[SSL: "
 """Beginning of the text of a TLS error that has a name, such as an alert sent by the broker."""
 
 log = structlog.get_logger(__name__)
@@ -41,9 +41,9 @@ class _ToLog(logging.Handler):
     """Forward log lines of paho and aiomqtt; skip the cause of a broken socket, which the reconnect loop reports."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        said = record.getMessage()
-        if not said.startswith(SOCKET_BROKE):
-            log.warning("mqtt client", said=said)
+        text = record.getMessage()
+        if not text.startswith(SOCKET_ERROR_PREFIX):
+            log.warning("mqtt client", text=text)
 
 
 _logger = logging.getLogger(__name__)
@@ -55,65 +55,68 @@ _logger.addHandler(_ToLog())
 class Timeouts(NamedTuple):
     """Timeouts of a connection."""
 
-    connected_s: float = 10.0
+    connect_s: float = 10.0
     """Timeout of name resolution, TCP, TLS and the broker's CONNACK together [s]."""
     keepalive_s: int = 10
-    """MQTT keepalive interval [s]. The broker has as long again to answer a ping. It publishes the will of a silently
-    lost client after 1.5 intervals."""
-    acknowledged_s: float = 15.0
-    """A broker that lives but takes longer for a message is lost; NATS takes 10 s to find a new leader [s]."""
+    """MQTT keepalive interval [s]. A ping is sent after one interval and must be answered within another one. The
+    broker publishes the will of a silently lost client after 1.5 intervals."""
+    acknowledge_s: float = 15.0
+    """Timeout of PUBACK [s]. It exceeds the 10 s in which a NATS cluster elects a new leader."""
 
 
-PATIENCE = Timeouts()
+DEFAULT_TIMEOUTS = Timeouts()
 
 
 class ClosedError(aiomqtt.MqttError):
-    """The broker has closed the connection in place of an answer to CONNECT."""
+    """The broker closed the connection instead of answering CONNECT."""
 
 
 class Client(aiomqtt.Client):
-    """A connection of one version of MQTT.
+    """Connection by one MQTT version.
 
     Args:
-        arguments: Address, name, password and TLS for aiomqtt.
+        arguments: Arguments of aiomqtt for address, user name, password and TLS.
         protocol: MQTT version.
-        hello: Connect options.
-        patience: When it is taken as lost.
+        options: Connect options.
+        timeouts: Timeouts after which the connection counts as lost.
     """
 
     def __init__(
-        self, arguments: dict[str, Any], protocol: ProtocolVersion, hello: ConnectOptions, patience: Timeouts
+        self, arguments: dict[str, Any], protocol: ProtocolVersion, options: ConnectOptions, timeouts: Timeouts
     ) -> None:
         limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
-        limit.MaximumPacketSize = hello.most_bytes
+        limit.MaximumPacketSize = options.max_bytes
         self._is_5 = protocol is ProtocolVersion.V5
         super().__init__(
             **arguments,
             protocol=protocol,
             properties=limit if self._is_5 else None,
-            identifier=hello.identifier,
-            will=aiomqtt.Will(*hello.will) if hello.will else None,
-            keepalive=patience.keepalive_s,
-            max_queued_incoming_messages=hello.most_waiting,
-            queue_type=partial(ReceiveQueue, hello.on_message_lost, hello.most_bytes),  # type: ignore[arg-type]  # it is only called
+            identifier=options.identifier,
+            will=aiomqtt.Will(*options.will) if options.will else None,
+            keepalive=timeouts.keepalive_s,
+            max_queued_incoming_messages=options.max_waiting,
+            queue_type=partial(ReceiveQueue, options.on_message_lost, options.max_bytes),  # type: ignore[arg-type]  # aiomqtt only calls it
             socket_options=[NO_DELAY],
             logger=_logger,
         )
-        self._acknowledged_s = patience.acknowledged_s
+        self._acknowledge_s = timeouts.acknowledge_s
         self._client.on_log = self._on_log
         self.protocol = "MQTT 5" if self._is_5 else "MQTT 3.1.1"
         self._answers: dict[int, asyncio.Future[PublishRejection | None]] = {}
         self._in_flight = asyncio.Semaphore(self._client.max_inflight_messages)
-        self._most_bytes: int | None = None
+        self._max_bytes: int | None = None
         self._abandoned = False
         self._why = "the connection broke"
 
     async def publish(self, message: Message) -> PublishRejection | None:  # type: ignore[override]
         """Publish as ``Connection`` specifies."""
-        if self._most_bytes is not None and HEAD_BYTES + len(message.topic) + len(message.payload) > self._most_bytes:
-            # it would end the connection
+        if (
+            self._max_bytes is not None
+            and MAX_OVERHEAD_BYTES + len(message.topic) + len(message.payload) > self._max_bytes
+        ):
+            # sending it would make the broker close the connection
             return PublishRejection(
-                f"longer than the {self._most_bytes} bytes that the broker takes", is_retryable=False
+                f"longer than the {self._max_bytes} bytes that the broker takes", is_retryable=False
             )
         async with self._in_flight:
             info = self._client.publish(*message)
@@ -122,12 +125,11 @@ class Client(aiomqtt.Client):
             answer: asyncio.Future[PublishRejection | None] = asyncio.get_running_loop().create_future()
             self._answers[info.mid] = answer
             try:
-                await asyncio.wait([answer], timeout=self._acknowledged_s)
-                if (
-                    not answer.done()
-                ):  # it may have arrived in time: both events occurred while the process was suspended
+                await asyncio.wait([answer], timeout=self._acknowledge_s)
+                # after a suspend both may be due: the answer that arrived in time counts
+                if not answer.done():
                     raise BrokerConnectionError(
-                        f"the broker has not acknowledged a message for {self._acknowledged_s:g} s"
+                        f"the broker has not acknowledged a message for {self._acknowledge_s:g} s"
                     )
                 return answer.result()
             finally:
@@ -145,7 +147,7 @@ class Client(aiomqtt.Client):
         except aiomqtt.MqttError as error:
             raise BrokerConnectionError(f"no subscription: {error}") from None
         return {
-            topic: words(answer)
+            topic: describe_reason(answer)
             for topic, answer in zip(topics, answers, strict=False)
             if isinstance(answer, ReasonCode) and answer.is_failure
         }
@@ -165,15 +167,15 @@ class Client(aiomqtt.Client):
 
     def drop_connection(self) -> None:
         """Close the connection without DISCONNECT, so that the broker publishes the will."""
-        line: Any = self._client.socket()  # of a protocol of paho's, which leaves out what all sockets have
-        if line is not None:
+        sock: Any = self._client.socket()  # paho's socket protocol does not declare shutdown()
+        if sock is not None:
             with contextlib.suppress(OSError):
-                line.shutdown(socket.SHUT_RDWR)
+                sock.shutdown(socket.SHUT_RDWR)
 
     async def end_session(self) -> None:
-        """End the connection, in good order where that is possible."""
+        """Close the connection, with DISCONNECT if possible."""
         with contextlib.suppress(TimeoutError, aiomqtt.MqttError):
-            async with asyncio.timeout(PARTING_S):
+            async with asyncio.timeout(DISCONNECT_TIMEOUT_S):
                 await self.__aexit__(None, None, None)
         if self._disconnected.done() and not self._disconnected.cancelled():
             self._disconnected.exception()  # otherwise asyncio logs that the exception was never retrieved
@@ -184,10 +186,10 @@ class Client(aiomqtt.Client):
         if self._abandoned:
             client.disconnect()
             return
-        most = getattr(properties, "ReceiveMaximum", None)
-        if most is not None and most < client.max_inflight_messages:
-            self._in_flight = asyncio.Semaphore(most)
-        self._most_bytes = getattr(properties, "MaximumPacketSize", None)
+        receive_maximum = getattr(properties, "ReceiveMaximum", None)
+        if receive_maximum is not None and receive_maximum < client.max_inflight_messages:
+            self._in_flight = asyncio.Semaphore(receive_maximum)
+        self._max_bytes = getattr(properties, "MaximumPacketSize", None)
         super()._on_connect(client, userdata, flags, reason_code, properties)
 
     def _on_disconnect(
@@ -199,23 +201,23 @@ class Client(aiomqtt.Client):
         properties: Properties | None = None,
     ) -> None:
         if flags.is_disconnect_packet_from_server:
-            self._why = words(reason_code)
+            self._why = describe_reason(reason_code)
         elif reason_code == "Keep alive timeout":
-            self._why = "the broker gave no sign of life"
+            self._why = "the broker did not answer a ping"
         if self._abandoned:
             return
         if not self._connected.done():
             self._connected.set_exception(ClosedError(self._why))
-        if self._connected.cancelled():  # no caller waits any more; the base class would read its exception
+        if self._connected.cancelled():  # no caller waits, and the base class would raise CancelledError here
             return
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
 
-    def _on_log(self, client: Any, userdata: Any, level: int, said: str) -> None:  # noqa: ARG002
-        if said.startswith(SOCKET_BROKE):
-            self._why = said.removeprefix(SOCKET_BROKE)
+    def _on_log(self, client: Any, userdata: Any, level: int, text: str) -> None:  # noqa: ARG002
+        if text.startswith(SOCKET_ERROR_PREFIX):
+            self._why = text.removeprefix(SOCKET_ERROR_PREFIX)
 
     def _on_socket_open(self, client: Any, userdata: Any, sock: Any) -> None:
-        """Handle a new socket as the base class does; shut an abandoned one, because its loop may be about to end."""
+        """Handle a new socket as the base class does. Shut an abandoned one, because the event loop may be closing."""
         if self._abandoned:
             with contextlib.suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
@@ -223,7 +225,7 @@ class Client(aiomqtt.Client):
             super()._on_socket_open(client, userdata, sock)
 
     def _on_socket_register_write(self, client: Any, userdata: Any, sock: socket.socket) -> None:  # noqa: ARG002
-        """Register the socket as the base class does, unless it was closed meanwhile or its number was reused."""
+        """Register the socket as the base class does, unless it was closed meanwhile and its descriptor reused."""
 
         def watch() -> None:
             if sock.fileno() >= 0:
@@ -235,20 +237,22 @@ class Client(aiomqtt.Client):
         answer = self._answers.get(mid)
         if answer is not None and not answer.done():
             answer.set_result(
-                PublishRejection(words(reason_code), not is_final(reason_code)) if reason_code.is_failure else None
+                PublishRejection(describe_reason(reason_code), not is_final(reason_code))
+                if reason_code.is_failure
+                else None
             )
 
 
 @contextlib.asynccontextmanager
-async def connected(
-    arguments: dict[str, Any], protocol: ProtocolVersion, hello: ConnectOptions, patience: Timeouts
+async def open_client(
+    arguments: dict[str, Any], protocol: ProtocolVersion, options: ConnectOptions, timeouts: Timeouts
 ) -> AsyncIterator[Client]:
-    """Connect while the context lasts; leaving it by an exception makes the broker publish the will.
+    """Connect for the duration of the context. Leaving it by an exception makes the broker publish the will.
 
     Raises:
         aiomqtt.MqttError: The broker cannot be reached, or refuses.
     """
-    client = Client(arguments, protocol, hello, patience)
+    client = Client(arguments, protocol, options, timeouts)
     try:
         await client.__aenter__()
     except BaseException:
@@ -263,10 +267,10 @@ async def connected(
         await client.end_session()
 
 
-def refusal(error: aiomqtt.MqttError) -> str:
-    """Why there is no connection."""
+def failure_reason(error: aiomqtt.MqttError) -> str:
+    """Return the reason for which a connection failed."""
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
-        return words(error.rc)
+        return describe_reason(error.rc)
     return str(error)
 
 
@@ -274,4 +278,4 @@ def should_retry_with_v311(error: aiomqtt.MqttError) -> bool:
     """Return True if a rejection of MQTT 5 may come from a broker with MQTT 3.1.1 only."""
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
         return error.rc.value == UNSUPPORTED_VERSION
-    return isinstance(error, ClosedError) and not str(error).startswith(TLS_ALERT)
+    return isinstance(error, ClosedError) and not str(error).startswith(TLS_ERROR_PREFIX)

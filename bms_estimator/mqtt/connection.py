@@ -25,9 +25,9 @@ class ReceivedMessage(NamedTuple):
 
 
 class PublishRejection(NamedTuple):
-    """The broker's no to a message."""
+    """Rejection of a message by the broker."""
 
-    why: str
+    reason: str
     is_retryable: bool
     """True if the message may be accepted later."""
 
@@ -36,38 +36,39 @@ class ConnectOptions(NamedTuple):
     """Options of each connection of a client."""
 
     identifier: str
-    """Client identifier, equal for all connections, so that the broker ends an older one first and publishes its will
-    before."""
+    """Client identifier, equal for all connections. The broker therefore closes an older connection and publishes its
+    will before it accepts a new one."""
     will: Message | None
     """Last will; None for a reader."""
     on_message_lost: Callable[[str, str], None]
     """Callback with kind (``too_long``, ``overflow``) and topic of each discarded message."""
-    most_waiting: int = MAX_WAITING
-    """Messages that wait to be read; more are lost."""
-    most_bytes: int = MAX_BYTES
-    """Maximum size of a received message [bytes]. An MQTT 5 broker withholds longer ones; else they are dropped here."""
+    max_waiting: int = MAX_WAITING
+    """Maximum number of received messages that wait to be read; further ones are lost."""
+    max_bytes: int = MAX_BYTES
+    """Maximum size of a received message [bytes]. An MQTT 5 broker withholds longer ones; those of an older broker are
+    discarded on arrival."""
 
 
 class Connection(Protocol):
-    """A connection while it lasts; every method raises BrokerConnectionError when it is lost."""
+    """Open connection to a broker. Every method raises BrokerConnectionError if it is lost."""
 
     protocol: str
     """Name of the MQTT version."""
 
     async def subscribe(self, requests: str | None, others: Sequence[str]) -> dict[str, str]:
-        """Ask for messages at QoS 0.
+        """Subscribe at QoS 0.
 
         Args:
             requests: Topic filter subscribed with retain-as-published (MQTT 5), so that retained messages can be
-                recognized; None: nowhere.
+                recognized; None: no request topics.
             others: Further topics.
 
         Returns:
-            The topics that the broker refuses, and why.
+            Rejected topics with the broker's reasons.
         """
 
     async def publish(self, message: Message) -> PublishRejection | None:
-        """Hand over a message and wait until the broker has acknowledged it.
+        """Send a message and wait until the broker has acknowledged it.
 
         Messages of several tasks are sent in the order of their calls.
 
@@ -80,4 +81,4 @@ class Connection(Protocol):
 
 
 Connect = Callable[[Broker, ConnectOptions], AbstractAsyncContextManager[Connection]]
-"""Connects to a broker; entering raises BrokerConnectionError, and within a bounded time."""
+"""Connects to a broker. Entering succeeds or raises BrokerConnectionError within a bounded time."""

@@ -10,16 +10,16 @@ class DeliveryStats:
     """Counters of a pack's sent messages and received requests since start; topic ``health`` publishes them."""
 
     drops: int = 0
-    """States and events that found no room while the broker was away, or that it refused."""
+    """States and events dropped because the queue was full or the broker rejected them."""
     waiting: int = 0
     """States and events that the broker has not acknowledged yet."""
     store_trouble: Callable[[], str] = field(default=str, compare=False)
-    """Why the disk does not keep what waits, nor the history; empty if it can be written, or nothing is to be
-    stored."""
+    """Returns the reason for which queued messages and history cannot be stored; empty if they can, or if there is no
+    store."""
     losses: int = 0
-    """Connections to a broker that were lost."""
+    """Number of lost connections."""
     trouble: str | None = None
-    """Why the last one was lost, or a broker could not be reached."""
+    """Reason for the last lost or failed connection."""
     refused_topics: list[str] = field(default_factory=list)
     """Topics that the broker denies, as far as it reports them."""
     corrections: int = 0

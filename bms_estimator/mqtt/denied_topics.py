@@ -17,68 +17,69 @@ class DeniedTopics:
     """Reports denied topics in log and health, and has retained messages sent again after a temporary rejection.
 
     Args:
-        delivery: The topics are named there.
-        say_again: Sends all retained messages again.
-        first_delay_s: Delay after a temporary rejection; doubles each time [s].
+        delivery: Statistics that list the denied topics.
+        resend_retained: Sends all retained messages again.
+        first_delay_s: Delay after the first temporary rejection; doubles each time [s].
     """
 
-    def __init__(self, delivery: DeliveryStats, say_again: Callable[[], object], first_delay_s: float) -> None:
-        self._delivery, self._say_again, self._pauses = delivery, say_again, Backoff(first_delay_s)
-        self._said: set[str] = set()  # one line of the log for each topic and connection
-        self._denied: dict[str, None] = {}  # in the order in which it was found out
-        self._for_now: dict[str, None] = {}
-        self._again: asyncio.TimerHandle | None = None
+    def __init__(self, delivery: DeliveryStats, resend_retained: Callable[[], object], first_delay_s: float) -> None:
+        self._delivery, self._resend_retained, self._backoff = delivery, resend_retained, Backoff(first_delay_s)
+        self._logged: set[str] = set()  # each topic is logged once per connection
+        self._denied: dict[str, None] = {}  # dicts instead of sets: they keep the order of the rejections
+        self._temporarily_denied: dict[str, None] = {}
+        self._resend_timer: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
         """Clear the denied topics for a new connection."""
         self.end()
-        for of_the_last in (self._said, self._denied, self._for_now):
-            of_the_last.clear()
-        self._show()
-        self._pauses.reset()
+        for topics in (self._logged, self._denied, self._temporarily_denied):
+            topics.clear()
+        self._update_stats()
+        self._backoff.reset()
 
     def end(self) -> None:
-        """Cancel pending repeats."""
-        if self._again is not None:
-            self._again.cancel()
-            self._again = None
+        """Cancel a pending resend."""
+        if self._resend_timer is not None:
+            self._resend_timer.cancel()
+            self._resend_timer = None
 
-    def deny(self, topic: str, why: str) -> None:
+    def deny(self, topic: str, reason: str) -> None:
         """Record that a topic is denied."""
         self._denied[topic] = None
-        self._log("broker refuses a topic; see its access list", topic, why)
+        self._report("broker refuses a topic; see its access list", topic, reason)
 
     def allow(self, topic: str) -> None:
         """Record that a topic is allowed."""
         self._denied.pop(topic, None)
-        self._show()
+        self._update_stats()
 
-    def record_result(self, message: Message, refusal: PublishRejection | None) -> None:
+    def record_result(self, message: Message, rejection: PublishRejection | None) -> None:
         """Record that the broker accepted or rejected a message."""
-        if refusal is not None and refusal.is_retryable:
-            self._for_now[message.topic] = None
-            self._log("broker refuses a topic for now; it is tried again", message.topic, refusal.why)
-            if message.retain and self._again is None:
-                self._again = asyncio.get_running_loop().call_later(self._pauses.next_s(), self._due)
+        if rejection is not None and rejection.is_retryable:
+            self._temporarily_denied[message.topic] = None
+            self._report("broker temporarily refuses a topic; retrying", message.topic, rejection.reason)
+            if message.retain and self._resend_timer is None:
+                delay_s = self._backoff.next_s()
+                self._resend_timer = asyncio.get_running_loop().call_later(delay_s, self._resend)
             return
-        if message.topic in self._for_now:
-            del self._for_now[message.topic]
-            self._show()
-            if not self._for_now:
-                self._pauses.reset()
-        if refusal is not None:
-            self.deny(message.topic, f"not allowed to write it: {refusal.why}")
+        if message.topic in self._temporarily_denied:
+            del self._temporarily_denied[message.topic]
+            self._update_stats()
+            if not self._temporarily_denied:
+                self._backoff.reset()
+        if rejection is not None:
+            self.deny(message.topic, f"not allowed to write it: {rejection.reason}")
 
-    def _due(self) -> None:
-        self._again = None
-        self._say_again()
+    def _resend(self) -> None:
+        self._resend_timer = None
+        self._resend_retained()
 
-    def _log(self, event: str, topic: str, why: str) -> None:
-        """Report denied topics in log and health."""
-        self._show()
-        if topic not in self._said:
-            self._said.add(topic)
-            log.warning(event, topic=topic, reason=why)
+    def _report(self, event: str, topic: str, reason: str) -> None:
+        """Update the statistics, and log each topic once."""
+        self._update_stats()
+        if topic not in self._logged:
+            self._logged.add(topic)
+            log.warning(event, topic=topic, reason=reason)
 
-    def _show(self) -> None:
-        self._delivery.refused_topics = list(self._denied | self._for_now)
+    def _update_stats(self) -> None:
+        self._delivery.refused_topics = list(self._denied | self._temporarily_denied)

@@ -16,5 +16,5 @@ class QueuedMessage(NamedTuple):
     """A message on its way to the broker."""
 
     number: int
-    """Rises by one with each message."""
+    """Position in the queue, one higher for each message."""
     message: Message

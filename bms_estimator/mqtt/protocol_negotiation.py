@@ -10,25 +10,33 @@ from aiomqtt import ProtocolVersion
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import Broker, password, tls_context
-from bms_estimator.mqtt.client import PATIENCE, Client, Timeouts, connected, refusal, should_retry_with_v311
+from bms_estimator.mqtt.client import (
+    DEFAULT_TIMEOUTS,
+    Client,
+    Timeouts,
+    failure_reason,
+    open_client,
+    should_retry_with_v311,
+)
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
 from bms_estimator.settings.mqtt import MqttSettings
 
 
 class BrokerConnector:
-    """Connects by MQTT 5; by 3.1.1 if the broker rejects that or does not respond.
+    """Connects by MQTT 5, or by MQTT 3.1.1 if the broker rejects MQTT 5 or does not respond.
 
     Args:
-        settings: Name, password and certificates. The files are reloaded for each connection.
-        patience: Timeouts of the connection.
+        settings: User name, password and certificates. The files are reloaded for each connection.
+        timeouts: Timeouts of the connection.
     """
 
-    def __init__(self, settings: MqttSettings, patience: Timeouts = PATIENCE) -> None:
-        self._settings, self._patience = settings, patience
-        self._silent: set[str] = set()  # gave no answer at all to MQTT 5, as a stopped broker does, and a very old one
+    def __init__(self, settings: MqttSettings, timeouts: Timeouts = DEFAULT_TIMEOUTS) -> None:
+        self._settings, self._timeouts = settings, timeouts
+        # URLs that did not answer MQTT 5 at all: the broker is stopped, or too old to reject the version
+        self._silent: set[str] = set()
 
     @contextlib.asynccontextmanager
-    async def __call__(self, broker: Broker, hello: ConnectOptions) -> AsyncIterator[Client]:
+    async def __call__(self, broker: Broker, options: ConnectOptions) -> AsyncIterator[Client]:
         """Connect as ``Connect`` specifies.
 
         Raises:
@@ -36,36 +44,38 @@ class BrokerConnector:
         """
         async with contextlib.AsyncExitStack() as stack:
             try:
-                client = await self._connect(stack, await asyncio.to_thread(self._arguments, broker), broker.url, hello)
+                client = await self._connect(
+                    stack, await asyncio.to_thread(self._arguments, broker), broker.url, options
+                )
             except UserError as error:
                 raise BrokerConnectionError(str(error)) from None
             except aiomqtt.MqttError as error:
-                raise BrokerConnectionError(refusal(error)) from None
+                raise BrokerConnectionError(failure_reason(error)) from None
             yield client
 
     async def _connect(
-        self, stack: contextlib.AsyncExitStack, arguments: dict[str, Any], url: str, hello: ConnectOptions
+        self, stack: contextlib.AsyncExitStack, arguments: dict[str, Any], url: str, options: ConnectOptions
     ) -> Client:
         protocol = ProtocolVersion.V311 if url in self._silent else ProtocolVersion.V5
         try:
-            async with asyncio.timeout(self._patience.connected_s):
+            async with asyncio.timeout(self._timeouts.connect_s):
                 try:
-                    return await stack.enter_async_context(connected(arguments, protocol, hello, self._patience))
+                    return await stack.enter_async_context(open_client(arguments, protocol, options, self._timeouts))
                 except aiomqtt.MqttError as error:
                     if protocol is ProtocolVersion.V311 or not should_retry_with_v311(error):
                         raise
                 return await stack.enter_async_context(
-                    connected(arguments, ProtocolVersion.V311, hello, self._patience)
+                    open_client(arguments, ProtocolVersion.V311, options, self._timeouts)
                 )
         except TimeoutError:
-            self._silent ^= {url}  # the other version next time
-            raise BrokerConnectionError(f"no answer within {self._patience.connected_s:g} s") from None
+            self._silent ^= {url}  # try the other version next time
+            raise BrokerConnectionError(f"no answer within {self._timeouts.connect_s:g} s") from None
 
     def _arguments(self, broker: Broker) -> dict[str, Any]:
         """Return the arguments for aiomqtt; reads files.
 
         Raises:
-            UserError: One of them cannot be used.
+            UserError: A file cannot be used.
         """
         return {
             "hostname": broker.host,

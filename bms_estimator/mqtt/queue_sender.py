@@ -1,4 +1,4 @@
-"""Sender of messages that must reach the broker: oldest first, several in flight."""
+"""Sender of queued messages: oldest first, several in flight."""
 
 import asyncio
 from collections.abc import Sequence
@@ -11,11 +11,11 @@ from bms_estimator.mqtt.message import QueuedMessage
 from bms_estimator.process.backoff import Backoff
 
 WINDOW = 16
-"""Maximum number of unacknowledged messages: below the 20 that brokers allow, so that live topics have room."""
+"""Maximum number of unacknowledged queued messages. Brokers and paho allow 20 in flight; four remain for live topics."""
 
 
 class MessageQueue(Protocol):
-    """Messages in order, each with a number, as ``Outbox`` keeps them.
+    """Queue of numbered messages, such as ``Outbox``.
 
     Attributes:
         connected: True if a broker is connected, as set by the sender.
@@ -25,48 +25,48 @@ class MessageQueue(Protocol):
 
     @property
     def waiting(self) -> int:
-        """Messages that the broker has not acknowledged."""
+        """Number of messages that the broker has not acknowledged."""
 
     @property
     def dropped(self) -> int:
-        """Messages that found no room, since start."""
+        """Number of messages dropped since start because the queue was full."""
 
     async def take(self, most: int) -> Sequence[QueuedMessage]:
-        """Wait until there is a message, and hand out up to ``most`` of the oldest that were not since ``rewind``."""
+        """Wait for a message, then return up to ``most`` of the oldest that were not returned since ``rewind``."""
 
     def sent(self, number: int) -> None:
         """Record that the broker has acknowledged a message."""
 
     def rewind(self) -> None:
-        """Hand out again, in order, all messages that were not acknowledged, after a connection was lost."""
+        """Make ``take`` return all unacknowledged messages again, in order, after a lost connection."""
 
 
 class QueueSender:
-    """Empties what keeps messages in order.
+    """Sends the messages of a queue in order.
 
     Args:
-        outbox: What keeps them.
-        delivery: It is counted there what waits and what never arrives.
-        refusals: Receives the broker's results.
-        first_delay_s: Delay before a temporarily rejected message is retried; doubles with each time [s].
+        outbox: Queue to empty.
+        delivery: Statistics in which waiting and dropped messages are counted.
+        denied: Denied topics, updated from the broker's results.
+        first_delay_s: Delay before a temporarily rejected message is retried; doubles each time [s].
     """
 
     def __init__(
-        self, outbox: MessageQueue, delivery: DeliveryStats, refusals: DeniedTopics, first_delay_s: float
+        self, outbox: MessageQueue, delivery: DeliveryStats, denied: DeniedTopics, first_delay_s: float
     ) -> None:
-        self._outbox, self._delivery, self._refusals = outbox, delivery, refusals
-        self._pauses = Backoff(first_delay_s)
-        self._refused = 0
-        self._moved = asyncio.Event()
+        self._outbox, self._delivery, self._denied = outbox, delivery, denied
+        self._backoff = Backoff(first_delay_s)
+        self._rejected = 0
+        self._acknowledged = asyncio.Event()
 
     async def send(self, connection: Connection) -> None:
         """Send queued and new messages until the connection is lost.
 
         Raises:
-            BrokerConnectionError: It is, alone or in a group.
+            BrokerConnectionError: The connection is lost; may be raised inside an exception group.
         """
         self._outbox.connected = True
-        self._pauses.reset()
+        self._backoff.reset()
         try:
             while True:
                 await self._stream(connection)
@@ -76,55 +76,55 @@ class QueueSender:
             self._outbox.rewind()
 
     async def wait_until_empty(self) -> None:
-        """Wait until the broker has all of it."""
+        """Wait until the broker has acknowledged all messages."""
         while self._outbox.waiting:
-            self._moved.clear()
-            await self._moved.wait()
+            self._acknowledged.clear()
+            await self._acknowledged.wait()
 
     async def _stream(self, connection: Connection) -> None:
-        """Send until the broker refuses one for now; then none is on its way any more, nor handed out."""
-        room = asyncio.Semaphore(WINDOW)
+        """Send until the broker rejects a message temporarily. On return, no message is in flight."""
+        window = asyncio.Semaphore(WINDOW)
 
-        async def carry(waiting: QueuedMessage) -> None:
-            if not await self._send_one(connection, waiting):
+        async def send(queued: QueuedMessage) -> None:
+            if not await self._send_one(connection, queued):
                 feeding.cancel()
-            room.release()
+            window.release()
 
         async def feed() -> None:
             while True:
-                for waiting in await self._outbox.take(WINDOW):
-                    await room.acquire()
-                    on_their_way.create_task(carry(waiting))  # tasks begin in the order in which they are made
+                for queued in await self._outbox.take(WINDOW):
+                    await window.acquire()
+                    in_flight.create_task(send(queued))  # tasks start in the order of their creation
 
-        async with asyncio.TaskGroup() as on_their_way:
-            feeding = on_their_way.create_task(feed())
+        async with asyncio.TaskGroup() as in_flight:
+            feeding = in_flight.create_task(feed())
         self._outbox.rewind()
 
     async def _try_oldest(self, connection: Connection) -> None:
         """Retry the oldest message alone, so that none overtakes it, until the broker accepts or drops one."""
         while True:
-            await asyncio.sleep(self._pauses.next_s())
+            await asyncio.sleep(self._backoff.next_s())
             for oldest in await self._outbox.take(1):
                 if await self._send_one(connection, oldest):
-                    self._pauses.reset()
+                    self._backoff.reset()
                     return
             self._outbox.rewind()
 
-    async def _send_one(self, connection: Connection, waiting: QueuedMessage) -> bool:
-        """Send one message; False: to be tried again.
+    async def _send_one(self, connection: Connection, queued: QueuedMessage) -> bool:
+        """Send one message. Return False if it must be retried.
 
         A permanently rejected message is counted and dropped, because it would block all others.
         """
-        refusal = await connection.publish(waiting.message)
-        self._refusals.record_result(waiting.message, refusal)
-        if refusal is not None and refusal.is_retryable:
+        rejection = await connection.publish(queued.message)
+        self._denied.record_result(queued.message, rejection)
+        if rejection is not None and rejection.is_retryable:
             return False
-        self._refused += refusal is not None
-        self._outbox.sent(waiting.number)
-        self._count()
-        self._moved.set()
+        self._rejected += rejection is not None
+        self._outbox.sent(queued.number)
+        self._update_stats()
+        self._acknowledged.set()
         return True
 
-    def _count(self) -> None:
-        self._delivery.drops = self._outbox.dropped + self._refused
+    def _update_stats(self) -> None:
+        self._delivery.drops = self._outbox.dropped + self._rejected
         self._delivery.waiting = self._outbox.waiting

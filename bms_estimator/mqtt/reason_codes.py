@@ -1,4 +1,4 @@
-"""Descriptions of MQTT 5 reason codes; those of 3.1.1 are a subset."""
+"""Descriptions of MQTT 5 reason codes. paho translates the return codes of MQTT 3.1.1 to them."""
 
 from paho.mqtt.reasoncodes import ReasonCode
 
@@ -14,7 +14,7 @@ HINTS = {
     135: _NOT_ALLOWED,
     136: "the broker is not ready",
     138: "the broker does not want this client",
-    141: "it heard nothing from here for too long",
+    141: "it received nothing from this client for too long",
     142: "another client has the same name",
     149: "a message is longer than the broker takes",
     151: "the broker allows no more",
@@ -36,7 +36,7 @@ def is_final(reason: ReasonCode) -> bool:
     return reason.value in FINAL
 
 
-def words(reason: ReasonCode) -> str:
+def describe_reason(reason: ReasonCode) -> str:
     """Return a reason code as text: name, number, hint."""
     hint = HINTS.get(reason.value)
     return f"{reason.getName()} ({reason.value})" + (f": {hint}" if hint else "")

@@ -6,31 +6,31 @@ from collections.abc import Callable
 import aiomqtt
 
 MAX_WAITING = 100
-"""Messages that wait to be read; more are lost."""
+"""Maximum number of messages that wait to be read; further ones are lost."""
 MAX_BYTES = 16_384
-"""Maximum length of a received message [bytes]: an MQTT 5 broker enforces it, longer ones of an older broker are
-discarded."""
+"""Maximum length of a received message [bytes]. An MQTT 5 broker enforces it; longer messages of an older broker are
+discarded on arrival."""
 
 
 class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):
-    """Queue of received messages, bounded in number and bytes; lost messages are logged at intervals.
+    """Queue of received messages, bounded in their number and size. Lost messages are reported.
 
     Args:
-        lose: Called with reason and topic of each lost message.
-        most_bytes: Maximum size of a message with its topic.
-        maxsize: Messages.
+        on_lost: Callback with reason and topic of each lost message.
+        max_bytes: Maximum size of a message with its topic [bytes].
+        maxsize: Maximum number of messages.
     """
 
-    def __init__(self, lose: Callable[[str, str], None], most_bytes: int, maxsize: int) -> None:
+    def __init__(self, on_lost: Callable[[str, str], None], max_bytes: int, maxsize: int) -> None:
         super().__init__(maxsize)
-        self._lose, self._most_bytes = lose, most_bytes
+        self._on_lost, self._max_bytes = on_lost, max_bytes
 
     def put_nowait(self, item: aiomqtt.Message) -> None:
-        """Take a message, or report its loss."""
+        """Append a message, or report its loss."""
         topic = item.topic.value
-        if len(topic) + len(item.payload) > self._most_bytes:
-            self._lose("too_long", topic)
+        if len(topic) + len(item.payload) > self._max_bytes:
+            self._on_lost("too_long", topic)
         elif self.full():
-            self._lose("overflow", topic)
+            self._on_lost("overflow", topic)
         else:
             super().put_nowait(item)

@@ -1,4 +1,4 @@
-"""Staying connected: one broker after the other, for as long as it takes."""
+"""Loop that connects to the configured brokers in turn until it is closed."""
 
 import asyncio
 import itertools
@@ -12,64 +12,67 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.process.backoff import FIRST_DELAY_S, Backoff
 
 MIN_CONNECTION_S = 10.0
-"""A connection that ends sooner is taken as an attempt that failed [s]."""
+"""Minimum duration of a connection that counts as successful [s]; a shorter one is followed by the backoff delay."""
 LOG_S = 600.0
-"""Minimum interval between two log lines with equal reason [s]."""
+"""Minimum interval between two log lines with an unchanged reason [s]."""
 
 log = structlog.get_logger(__name__)
 
 
 class ReconnectLoop:
-    """Connects, serves, and connects again until it is closed.
+    """Connects, serves the connection, and reconnects until it is closed.
 
-    The next broker is tried at once. When all were tried there is a pause.
+    After a failure the next broker is tried without delay. After the last one there is a backoff delay.
 
     Args:
-        brokers: In the order in which they are tried.
-        hello: Connect options.
-        connect: Makes a connection.
-        serve: Uses it until it is lost or the link is closed.
-        delivery: What went wrong is noted there.
-        first_delay_s: The first pause [s].
+        brokers: Brokers in the order of attempts.
+        options: Connect options.
+        connect: Opens a connection.
+        serve: Uses a connection until it is lost or the loop is closed.
+        delivery: Statistics in which losses and their reasons are recorded.
+        first_delay_s: First backoff delay [s].
+
+    Attributes:
+        closing: Event that ends the loop.
     """
 
     def __init__(
         self,
         brokers: Sequence[Broker],
-        hello: ConnectOptions,
+        options: ConnectOptions,
         connect: Connect,
         serve: Callable[[Connection], Awaitable[None]],
         delivery: DeliveryStats,
         first_delay_s: float = FIRST_DELAY_S,
     ) -> None:
-        self._brokers, self._hello, self._connect, self._serve = brokers, hello, connect, serve
+        self._brokers, self._options, self._connect, self._serve = brokers, options, connect, serve
         self._delivery = delivery
-        self._pauses = Backoff(first_delay_s)
-        self._said: dict[str, tuple[str, float]] = {}  # by URL: the last reason and when it was logged
+        self._backoff = Backoff(first_delay_s)
+        self._logged: dict[str, tuple[str, float]] = {}  # by URL: last reason and the time at which it was logged
         self.closing = asyncio.Event()
 
     async def run(self) -> None:
-        """Stay connected until ``closing``."""
-        tried = 0
+        """Stay connected until ``closing`` is set."""
+        failed = 0
         for broker in itertools.cycle(self._brokers):
             if self.closing.is_set():
                 return
             if await self._attempt(broker):
-                tried = 0
-                self._pauses.reset()
-            tried += 1
-            if tried % len(self._brokers) == 0:
-                await self._pause(self._pauses.next_s())
+                failed = 0
+                self._backoff.reset()
+            failed += 1
+            if failed % len(self._brokers) == 0:
+                await self._pause(self._backoff.next_s())
 
     async def _attempt(self, broker: Broker) -> bool:
-        """One broker; True when it was worth the name of a connection."""
+        """Connect to one broker and serve. Return True if the connection lasted ``MIN_CONNECTION_S``."""
         loop = asyncio.get_running_loop()
         since_s: float | None = None
         try:
-            async with self._connect(broker, self._hello) as connection:
+            async with self._connect(broker, self._options) as connection:
                 since_s = loop.time()
                 log.info("broker connected", url=broker.url, protocol=connection.protocol)
-                self._said.clear()
+                self._logged.clear()
                 await self._serve(connection)
         except* BrokerConnectionError as errors:
             self._delivery.losses += since_s is not None
@@ -77,18 +80,18 @@ class ReconnectLoop:
         return since_s is not None and loop.time() - since_s >= MIN_CONNECTION_S
 
     def _log_loss(self, broker: Broker, event: str, errors: BaseException) -> None:
-        """Log why; an absent broker would give the same line each half minute for days."""
+        """Log a changed reason at once and an unchanged one rarely: a broker may be absent for days."""
         while isinstance(errors, BaseExceptionGroup):
             errors = errors.exceptions[0]
         reason, now_s = str(errors), asyncio.get_running_loop().time()
         self._delivery.trouble = reason
-        said, at_s = self._said.get(broker.url, ("", 0.0))
-        if reason != said or now_s - at_s >= LOG_S:
-            self._said[broker.url] = reason, now_s
+        logged_reason, logged_s = self._logged.get(broker.url, ("", 0.0))
+        if reason != logged_reason or now_s - logged_s >= LOG_S:
+            self._logged[broker.url] = reason, now_s
             log.warning(event, url=broker.url, reason=reason)
 
     async def _pause(self, delay_s: float) -> None:
-        """Sleep, but not through the end."""
+        """Sleep until the delay is over or the loop is closed."""
         try:
             async with asyncio.timeout(delay_s):
                 await self.closing.wait()

@@ -1,4 +1,4 @@
-"""A subscriber to all devices of a broker: it keeps the latest messages and reconnects."""
+"""Subscriber to all devices of a broker. It stores their latest messages and reconnects."""
 
 import asyncio
 import contextlib
@@ -19,9 +19,10 @@ from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
 
 MAX_WAITING = 2000
-"""Messages that wait to be read: a broker sends all that is retained at once, some twenty of each device."""
+"""Maximum number of messages that wait to be read. On subscription a broker sends all retained messages at once, about
+twenty for each device."""
 MAX_BYTES = 65_536
-"""Maximum length of a message: ``schema`` has a quarter of it."""
+"""Maximum length of a message [bytes]. The longest one, ``schema``, has a quarter of it."""
 REASONS = {"too_long": f"longer than {MAX_BYTES} bytes", "overflow": "faster than they are read"}
 LOG_S = 60.0
 """Minimum time between two log lines on dropped messages [s]."""
@@ -36,11 +37,11 @@ class Subscriber:
     """Receives ``<base_topic>/#`` within the context.
 
     Args:
-        settings: The brokers, and what opens their doors.
-        heard: Called with each message of a device after it is stored.
-        linked: Called when the broker was reached, and when it is lost; ``lost_since`` tells them apart.
-        connect: Makes a connection; over TCP when left out.
-        left_out: Called with the name of a device that is not stored, because there are too many.
+        settings: Brokers and credentials.
+        on_message: Called with each message of a device after it is stored.
+        on_link_change: Called after the broker was connected or lost; ``lost_since`` distinguishes the two.
+        connect: Opens a connection; default: over TCP.
+        left_out: Called with the name of a device that is not stored because there are too many.
         clock: The clocks.
         first_delay_s: Delay before a lost broker is retried; it grows as in ``Backoff`` [s].
 
@@ -51,8 +52,8 @@ class Subscriber:
     def __init__(
         self,
         settings: MqttSettings,
-        heard: Callable[[DeviceMessage], None] = lambda _: None,
-        linked: Callable[[], None] = lambda: None,
+        on_message: Callable[[DeviceMessage], None] = lambda _: None,
+        on_link_change: Callable[[], None] = lambda: None,
         *,
         connect: Connect | None = None,
         left_out: Callable[[str], object] = str,
@@ -60,14 +61,14 @@ class Subscriber:
         first_delay_s: float = FIRST_DELAY_S,
     ) -> None:
         check(settings)
-        self._heard, self._linked, self._clock = heard, linked, clock or Clock()
+        self._on_message, self._on_link_change, self._clock = on_message, on_link_change, clock or Clock()
         self._topic = f"{settings.base_topic}/#"
         self._published = TopicCache(settings.base_topic, left_out)
         self._delivery = DeliveryStats()
         self._lost_since: float | None = self._clock.wall()
-        hello = ConnectOptions(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MAX_WAITING, MAX_BYTES)
+        options = ConnectOptions(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MAX_WAITING, MAX_BYTES)
         connect = connect or BrokerConnector(settings)
-        self._link = ReconnectLoop(brokers(settings), hello, connect, self._serve, self._delivery, first_delay_s)
+        self._link = ReconnectLoop(brokers(settings), options, connect, self._serve, self._delivery, first_delay_s)
         self._task: asyncio.Task[None] | None = None
         self._loss_logged_s: float | None = None
         self.lost_messages = 0
@@ -85,7 +86,7 @@ class Subscriber:
 
     @property
     def lost_since(self) -> float | None:
-        """Since when there is no broker, seconds since 1970; None while there is one.
+        """Time at which the broker was lost [s since 1970]; None while connected.
 
         Raises:
             Exception: An exception of a callback, which has ended the task.
@@ -96,19 +97,19 @@ class Subscriber:
 
     @property
     def trouble(self) -> str | None:
-        """Why a broker was lost or could not be reached last; None: it never was."""
+        """Reason for the last lost or failed connection; None if there was none."""
         return self._delivery.trouble
 
     async def __aenter__(self) -> Self:
-        """Start reaching for the broker."""
+        """Start connecting to the broker."""
         self._task = asyncio.create_task(self._link.run(), name="subscriber")
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Part from the broker.
+        """Disconnect from the broker.
 
         Raises:
-            Exception: A callback's, if it ended the work.
+            Exception: An exception of a callback, which has ended the task.
         """
         if self._task is None:
             return
@@ -126,22 +127,22 @@ class Subscriber:
         self._report_link(None)
         try:
             async with asyncio.TaskGroup() as tasks:
-                hearing = tasks.create_task(self._receive(connection))
+                receiving = tasks.create_task(self._receive(connection))
                 await self._link.closing.wait()
-                hearing.cancel()
+                receiving.cancel()
         finally:
             self._report_link(self._clock.wall())
 
     async def _receive(self, connection: Connection) -> None:
         while True:
             message = await connection.receive()
-            heard = self._published.take(message.topic, message.payload, self._clock.wall())
-            if heard is not None:
-                self._heard(heard)
+            device_message = self._published.take(message.topic, message.payload, self._clock.wall())
+            if device_message is not None:
+                self._on_message(device_message)
 
     def _report_link(self, lost_since: float | None) -> None:
         self._lost_since = lost_since
-        self._linked()
+        self._on_link_change()
 
     def _lose(self, kind: str, topic: str) -> None:
         self.lost_messages += 1

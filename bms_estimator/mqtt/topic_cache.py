@@ -1,4 +1,4 @@
-"""Last publications of devices by topic: from messages to values. Pure: no connection, no clock.
+"""Last messages of devices by topic, parsed. Pure: no connection, no clock.
 
 Any client may publish anything, so the memory is bounded and payloads of any kind are accepted.
 """
@@ -13,16 +13,17 @@ from typing import Any, NamedTuple
 from bms_estimator.settings.pack import DEVICE_NAME
 
 MAX_DEVICES = 64
-"""Devices that are stored at a time."""
+"""Maximum number of stored devices."""
 MAX_TOPICS = 64
-"""Topics of one device; messages on further topics are ignored."""
+"""Maximum number of topics of one device; messages on further topics are ignored."""
 MAX_DEVICE_BYTES = 128 * 1024
-"""Payloads of one device together; a message that would exceed this is ignored."""
+"""Maximum total size of the payloads of one device [bytes]; a message that would exceed it is ignored."""
 MAX_HIDDEN = 10_000
-"""Names of devices without room that are counted."""
+"""Maximum number of counted devices that are not stored."""
 SILENT_S = 30.0
-"""A new device replaces the one that has been silent longest, if that is at least this [s]. A raised alarm does not wait."""
-ASKED = ("request", "response")
+"""Minimum silence after which a device may be replaced by a new one [s]. A new device with a raised alarm replaces one
+without an alarm at once."""
+REQUEST_LEVELS = ("request", "response")
 """First level of topics without device state."""
 ALARM = "alarm/"
 """Prefix of alarm topics."""
@@ -40,7 +41,7 @@ class DeviceMessage(NamedTuple):
 
 @dataclass
 class DeviceTopics:
-    """Last publications of one device."""
+    """Last messages of one device."""
 
     topics: dict[str, Any] = field(default_factory=dict)
     """Payloads by topic, parsed JSON or text."""
@@ -60,11 +61,11 @@ class DeviceTopics:
 
 
 class TopicCache:
-    """Last publications of each device below a base topic.
+    """Last messages of each device below a base topic.
 
     Args:
         base_topic: First part of all topics.
-        left_out: Called with the name of a device that has no room: a new one, or one that was replaced.
+        left_out: Called with the name of a device that is not stored: a new one, or one that was replaced.
     """
 
     def __init__(self, base_topic: str, left_out: Callable[[str], object] = str) -> None:
@@ -75,22 +76,22 @@ class TopicCache:
 
     @property
     def hidden(self) -> int:
-        """Number of devices that publish but have no room, ``MAX_HIDDEN`` at most."""
+        """Number of devices that publish but are not stored, at most ``MAX_HIDDEN``."""
         return len(self._hidden)
 
     def take(self, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
-        """Keep a message.
+        """Store a message.
 
         Args:
-            topic: In full.
-            payload: Received payload; empty: the topic holds nothing any more.
+            topic: Full topic.
+            payload: Received payload; empty if the topic was cleared.
             now_s: Arrival time, seconds since 1970.
 
         Returns:
-            The received message; None for a topic without a device, or beyond the limits.
+            The parsed message; None if the topic is not a device's, or a limit is exceeded.
         """
         name, _, rest = topic.removeprefix(self._root).partition("/")
-        if not topic.startswith(self._root) or not rest or rest.split("/")[0] in ASKED:
+        if not topic.startswith(self._root) or not rest or rest.split("/")[0] in REQUEST_LEVELS:
             return None
         if not re.fullmatch(DEVICE_NAME, name):
             return None
@@ -99,7 +100,7 @@ class TopicCache:
         return self._store(name, rest, payload, now_s)
 
     def _store(self, name: str, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
-        value = parsed(payload)
+        value = parse_payload(payload)
         raised = topic.startswith(ALARM) and isinstance(value, dict) and value.get("active") is True
         device = self.devices.get(name) or DeviceTopics()
         if topic not in device.topics and len(device.topics) >= MAX_TOPICS:
@@ -117,7 +118,7 @@ class TopicCache:
         return DeviceMessage(name, topic, value)
 
     def _make_room(self, now_s: float, *, urgent: bool) -> bool:
-        """Return whether one more device may be stored, dropping the least important one if necessary."""
+        """Return True if one more device may be stored, after dropping the least important one if necessary."""
         if len(self.devices) < MAX_DEVICES:
             return True
         name = min(self.devices, key=lambda each: self.devices[each].priority)
@@ -145,8 +146,8 @@ class TopicCache:
         return DeviceMessage(name, topic, None)
 
 
-def parsed(payload: bytes) -> Any:
-    """JSON as values, all numbers finite; anything else as text."""
+def parse_payload(payload: bytes) -> Any:
+    """Parse JSON in which all numbers are finite; return anything else as text."""
     try:
         return json.loads(payload, parse_float=_finite, parse_constant=_finite)
     except (ValueError, RecursionError):

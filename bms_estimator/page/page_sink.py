@@ -9,7 +9,7 @@ from typing import Self
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.topic_cache import parsed
+from bms_estimator.mqtt.topic_cache import parse_payload
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer
@@ -59,7 +59,7 @@ class PageSink:
         root = f"{self._messages.root}/"
         for message in messages:
             if message.topic.startswith(root):
-                self._hub.put(self._pack, message.topic.removeprefix(root), parsed(message.payload))
+                self._hub.put(self._pack, message.topic.removeprefix(root), parse_payload(message.payload))
 
 
 class Pages:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile, RunCounters
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
@@ -212,12 +212,12 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clo
     outcome = content.reason
     if not outcome:
         error = restore_state(estimator, content.state, content.unseen_s)
-        outcome = f"{REFUSED}{error}" if error else f"restored{_soc_text(estimator)}"
-    if refused := outcome.startswith(REFUSED):
+        outcome = f"{REJECTED}{error}" if error else f"restored{_soc_text(estimator)}"
+    if refused := outcome.startswith(REJECTED):
         outcome = f"{outcome}; {checkpoint.quarantine()}"
     write_log = log.warning if refused else log.info
     write_log("checkpoint", file=str(checkpoint.path), outcome=outcome)
-    return content.ledger, outcome
+    return content.counters, outcome
 
 
 def _restore_alarms(publisher: Publisher, saved: str) -> None:

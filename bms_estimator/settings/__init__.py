@@ -1,1 +1,1 @@
-"""Sections of the settings file, one file each, with defaults and checks."""
+"""Models of the settings files, one module for each section, with defaults and checks."""

@@ -1,4 +1,4 @@
-"""Monitored alarms from ``[alarms]`` and the cell: each with its limit and the level at which it ends.
+"""Monitored alarms, derived from ``[alarms]`` and the cell: limits, and levels at which the alarms end.
 
 Sources are in docs/pack/alarms.md.
 """
@@ -15,19 +15,19 @@ from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
 from bms_estimator.settings.pack import Settings
 
 MIN_SILENT_S = 10.0
-"""A link that is silent for less is not lost yet [s]."""
+"""Minimum default limit of ``link_lost`` [s]."""
 SILENT_PERIODS = 3
-"""Minimum number of missing samples or publications before an alarm on silence."""
+"""Default limit of ``link_lost`` in sample or publish periods."""
 
 
 class AlarmDefinition(NamedTuple):
-    """One alarm that is watched."""
+    """Limits and delays of a monitored alarm."""
 
     name: AlarmName
     severity: Literal["warning", "critical"]
     limit: float
     clear: float
-    """Level at which it ends; equal to ``limit`` without hysteresis."""
+    """Level at which the alarm ends; equal to ``limit`` without hysteresis."""
     delay_s: float
     clear_delay_s: float
     latch: bool
@@ -48,25 +48,23 @@ class Chemistry(NamedTuple):
 
 
 _BY_NOMINAL_V = (
-    (2.8, Chemistry(2.85, 2.70, 1.60, 1.90)),  # titanate: charged to 2.7..2.8 V, empty at 1.5
-    (3.45, Chemistry(3.65, 3.40, 2.70, 3.10)),  # LFP: as the Seplos BMS 3.0 is delivered
-    (math.inf, Chemistry(4.25, 4.15, 2.70, 3.00)),  # all that is charged to 4.2 V
+    (2.8, Chemistry(2.85, 2.70, 1.60, 1.90)),  # LTO: charged to 2.7..2.8 V, empty at 1.5 V
+    (3.45, Chemistry(3.65, 3.40, 2.70, 3.10)),  # LFP: factory settings of the Seplos BMS 3.0
+    (math.inf, Chemistry(4.25, 4.15, 2.70, 3.00)),  # all chemistries that are charged to 4.2 V
 )
-"""Up to which nominal voltage of a cell [V] it is taken to be of which chemistry."""
+"""Upper limits of a cell's nominal voltage [V], each with the voltage limits of its chemistry."""
 
 MIN_CHARGE = 0.02
-"""Minimum charge current as a fraction of the capacity per hour; a smaller one is the sensor's offset."""
-
-
+"""Minimum charge current as a fraction of the capacity per hour; a smaller one may be the sensor's offset."""
 DIGITS = 9
-"""0.1 - 0.08 is to be 0.02."""
+"""Decimals to which clear levels are rounded, so that 0.1 - 0.08 gives 0.02."""
 MAX_DISCHARGE = 5.0
 """Default maximum discharge current as a multiple of the capacity per hour; a generic cell's file accepts readings
 far above the continuous limit of most such cells."""
 
 
 class _Default(NamedTuple):
-    """An alarm's limit and clear limit for the pack; None: not watched unless it is set."""
+    """Default limit and clear level of an alarm; None: not monitored unless configured."""
 
     limit: float | None
     clear: float | None
@@ -76,36 +74,36 @@ def watched(settings: Settings, cell: PackModel) -> tuple[AlarmDefinition, ...]:
     """Return the monitored alarms of a pack, in the order of ``ALARMS``.
 
     Args:
-        settings: The pack's.
-        cell: The pack as one object (``CellModel.pack``).
+        settings: Settings of the pack.
+        cell: Model of the whole pack (``CellModel.pack``).
 
     Raises:
-        UserError: A limit beyond what ends the alarm.
+        UserError: A clear level lies beyond its limit.
     """
     defaults = _defaults(settings, cell)
-    found = (_watched(name, getattr(settings.alarms, name), defaults[name]) for name in ALARMS)
-    return tuple(each for each in found if each is not None)
+    definitions = (_definition(name, getattr(settings.alarms, name), defaults[name]) for name in ALARMS)
+    return tuple(each for each in definitions if each is not None)
 
 
 def silent_limit_s(settings: Settings) -> float:
-    """Time without a sample after which no alarm is watched any more [s]: the limit of ``link_lost``."""
+    """Return the time without a sample after which ``link_lost`` is raised and no other alarm is monitored [s]."""
     rule = settings.alarms.link_lost
     return (rule.limit_s or _silent_s(settings)) + rule.delay_s
 
 
 def _silent_s(settings: Settings) -> float:
-    """Default limit of ``link_lost`` [s]."""
+    """Return the default limit of ``link_lost`` [s]."""
     return max(MIN_SILENT_S, SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s))
 
 
 def charging_a(cell: PackModel) -> float:
-    """Minimum charge current [A]."""
-    of = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
-    return MIN_CHARGE * of
+    """Return the minimum current that counts as charging [A]."""
+    reference = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
+    return MIN_CHARGE * reference
 
 
 def out_of_range(settings: Settings, cell: PackModel) -> list[str]:
-    """One line for each limit that cannot be meant so; empty where all may be."""
+    """Return a line for each implausible limit."""
     return list(_out_of_range(watched(settings, cell), cell))
 
 
@@ -130,29 +128,29 @@ def _out_of_range(alarms: tuple[AlarmDefinition, ...], cell: PackModel) -> Itera
             )
 
 
-def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDefinition | None:
+def _definition(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDefinition | None:
     """Return the monitored alarm; None if it is switched off or has no limit."""
-    told, kind = rule.model_dump(exclude_none=True), ALARM_KINDS[name]
+    configured, kind = rule.model_dump(exclude_none=True), ALARM_KINDS[name]
     key = next((key for key in type(rule).model_fields if key.startswith("limit")), "limit")
-    limit = told.get(key, default.limit)
+    limit = configured.get(key, default.limit)
     if not rule.enabled or limit is None:
         return None
     hysteresis = 0.0 if default.clear is None or default.limit is None else default.clear - default.limit
     clear_key = key.replace("limit", "clear")
-    clear = told.get(clear_key, round(limit + hysteresis, DIGITS))
+    clear = configured.get(clear_key, round(limit + hysteresis, DIGITS))
     if (clear > limit) if kind.is_upper_limit else (clear < limit):
         beyond = "above" if kind.is_upper_limit else "below"
         raise UserError(
-            f"alarms.{name}.{clear_key} = {clear:g}: must not be {beyond} {key} = {limit:g}: there the alarm is raised"
+            f"alarms.{name}.{clear_key} = {clear:g}: must not be {beyond} {key} = {limit:g}, which raises the alarm"
         )
     delay_s = rule.delay_s
-    if name == "link_lost":  # silence is its own delay
+    if name == "link_lost":  # its value is a time, to which the delay is added
         limit, clear, delay_s = limit + delay_s, clear + delay_s, 0.0
     return AlarmDefinition(name, rule.severity, limit, clear, delay_s, rule.clear_delay_s, rule.latch)
 
 
 def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
-    """Return the defaults by alarm; a fuel cell has no SOC and no chemistry, and must not be charged."""
+    """Return the defaults by alarm."""
     n = cell.cell.series_count
     common: dict[AlarmName, _Default] = {
         "over_temperature": _Default(60.0, 55.0),
@@ -166,13 +164,13 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "link_lost": _Default(_silent_s(settings), None),
         "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0),
     }
-    return common | (_of_battery(cell) if isinstance(cell, CellModel) else _of_stack(cell))
+    return common | (_battery_defaults(cell) if isinstance(cell, CellModel) else _stack_defaults(cell))
 
 
-def _of_battery(cell: CellModel) -> dict[AlarmName, _Default]:
+def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
     c, n = cell.cell, cell.cell.series_count
-    each_v = c.nominal_voltage_v / n
-    v = next(chemistry for most_v, chemistry in _BY_NOMINAL_V if each_v < most_v)
+    nominal_v = c.nominal_voltage_v / n
+    v = next(chemistry for max_v, chemistry in _BY_NOMINAL_V if nominal_v < max_v)
     charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
     discharge_a = min(MAX_DISCHARGE * c.capacity_ah, c.current_max_a)
     return {
@@ -185,14 +183,15 @@ def _of_battery(cell: CellModel) -> dict[AlarmName, _Default]:
     }
 
 
-def _of_stack(cell: PackModel) -> dict[AlarmName, _Default]:
+def _stack_defaults(cell: PackModel) -> dict[AlarmName, _Default]:
+    """Return the defaults of a fuel cell, which has no cell voltages and must not be charged."""
     c = cell.cell
-    nothing = _Default(None, None)
+    unmonitored = _Default(None, None)
     return {
         "pack_over_voltage": _Default(c.voltage_max_v, 0.98 * c.voltage_max_v),
         "pack_under_voltage": _Default(c.voltage_min_v, 1.1 * c.voltage_min_v),
-        "cell_over_voltage": nothing,
-        "cell_under_voltage": nothing,
+        "cell_over_voltage": unmonitored,
+        "cell_under_voltage": unmonitored,
         "discharge_over_current": _Default(c.current_max_a, 0.95 * c.current_max_a),
         "charge_over_current": _Default(None, None),
         "charging_below_freezing": _Default(None, None),

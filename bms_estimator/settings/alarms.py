@@ -26,49 +26,49 @@ AlarmName = Literal[
     "hook_failed",
 ]
 ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
-"""All alarms that there are, in the order in which they are shown."""
+"""Names of all alarms, in the order in which they are shown."""
 
 
 class AlarmRule(Strict):
-    """Settings that all alarms share."""
+    """Settings that all alarms have."""
 
     enabled: bool = True
     severity: Literal["warning", "critical"] = "warning"
-    delay_s: NotNegative = Field(default=10.0, description="so long the limit must be reached until it is raised")
-    clear_delay_s: NotNegative = Field(default=60.0, description="so long it must be back beyond clear until it ends")
-    latch: bool = Field(default=False, description="stays until it is acknowledged")
+    delay_s: NotNegative = Field(default=10.0, description="time at the limit after which the alarm is raised")
+    clear_delay_s: NotNegative = Field(default=60.0, description="time beyond the clear level after which it ends")
+    latch: bool = Field(default=False, description="true: stays raised until it is acknowledged")
 
 
 class VoltageRule(AlarmRule):
-    """An alarm of a voltage; omitted values follow from the cell."""
+    """Alarm on a voltage; default limits follow from the cell."""
 
     limit_v: Positive | None = None
     clear_v: Positive | None = None
 
 
 class CurrentRule(AlarmRule):
-    """An alarm of a current's magnitude; omitted values follow from the cell."""
+    """Alarm on the magnitude of a current; default limits follow from the cell."""
 
     limit_a: Positive | None = None
     clear_a: NotNegative | None = None
 
 
 class TemperatureRule(AlarmRule):
-    """An alarm of a temperature."""
+    """Alarm on a temperature."""
 
     limit_c: float | None = None
     clear_c: float | None = None
 
 
-class ShareRule(AlarmRule):
-    """An alarm of something between 0 and 1."""
+class FractionRule(AlarmRule):
+    """Alarm on a quantity between 0 and 1."""
 
     limit: Fraction | None = None
     clear: Fraction | None = None
 
 
 class LinkRule(AlarmRule):
-    """An alarm of silence: its limit is its delay."""
+    """Alarm on the time without a sample."""
 
     limit_s: Positive | None = None
 
@@ -76,36 +76,36 @@ class LinkRule(AlarmRule):
 class AlarmHook(Strict):
     """Action when alarms are raised and end: run a program, publish a message, or switch the board's relay."""
 
-    alarms: tuple[AlarmName, ...] = Field(default=(), description="which ones; all but hook_failed when left out")
+    alarms: tuple[AlarmName, ...] = Field(default=(), description="names of alarms; default: all but hook_failed")
     on: tuple[Literal["raised", "cleared"], ...] = Field(
-        default=("raised", "cleared"), description="when a program is run or a message published"
+        default=("raised", "cleared"), description="changes at which a program is run or a message published"
     )
     run: tuple[Annotated[str, Field(min_length=1)], ...] | None = Field(
         default=None, description="program and its arguments; no shell"
     )
     timeout_s: Annotated[float, Field(gt=0, le=3600)] = Field(
-        default=10.0, description="a program that takes longer, with all it started, is killed"
+        default=10.0, description="time after which a program and its child processes are killed"
     )
     pass_environment: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = Field(
         default=(), description="further environment variables of the service that a program gets"
     )
     topic: Annotated[str, Field(pattern=r"^[^+#\s]{1,200}$")] | None = Field(
-        default=None, description="where a message is published at QoS 1, not retained"
+        default=None, description="topic of a message at QoS 1, not retained"
     )
     payload: str = Field(
-        default="$json", description="of the message; $json, $name, $state, $text and so on are filled in"
+        default="$json", description="payload of the message; $json, $name, $state, $text and others are substituted"
     )
     relay: Literal["high", "low"] | None = Field(
         default=None,
-        description="level of the board's relay pin while one of the alarms is active; else it is the other",
+        description="level of the board's relay pin while one of the alarms is active; otherwise the opposite level",
     )
     when_silent: Literal["keep", "high", "low"] | None = Field(
         default=None,
-        description="level of the pin once the board has received nothing from the service for silent_s; "
-        "that of relay, the safe side, when left out",
+        description="level of the pin after the board has received nothing from the service for silent_s; "
+        "default: relay, the safe side",
     )
     silent_s: Annotated[int, Field(ge=15, le=3600)] = 30
-    dry_run: bool = Field(default=False, description="log what would be done, and do nothing")
+    dry_run: bool = Field(default=False, description="true: only log the action")
 
     @property
     def level_when_silent(self) -> Literal["keep", "high", "low"] | None:
@@ -114,9 +114,9 @@ class AlarmHook(Strict):
 
     @model_validator(mode="after")
     def _one_of_three(self) -> Self:
-        told = [name for name in ("run", "topic", "relay") if getattr(self, name)]
-        if len(told) != 1:
-            raise ValueError("give one of run, topic and relay: a hook does one thing")
+        actions = [name for name in ("run", "topic", "relay") if getattr(self, name)]
+        if len(actions) != 1:
+            raise ValueError("give exactly one of run, topic and relay")
         try:
             Template(self.payload).substitute(dict.fromkeys(PAYLOAD_FIELDS, ""))
         except (KeyError, ValueError) as error:
@@ -141,11 +141,11 @@ class AlarmSettings(Strict):
     over_temperature: TemperatureRule = TemperatureRule(severity="critical")
     under_temperature: TemperatureRule = TemperatureRule()
     charging_below_freezing: TemperatureRule = TemperatureRule(severity="critical", clear_delay_s=10.0, latch=True)
-    soc_low: ShareRule = ShareRule()
-    stability_margin_low: ShareRule = ShareRule()
+    soc_low: FractionRule = FractionRule()
+    stability_margin_low: FractionRule = FractionRule()
     cell_imbalance: VoltageRule = VoltageRule(delay_s=60.0)
-    sensor_fault: ShareRule = Field(
-        default=ShareRule(clear_delay_s=30.0), description="limit: fraction of samples that are lost or unusable"
+    sensor_fault: FractionRule = Field(
+        default=FractionRule(clear_delay_s=30.0), description="limit: fraction of samples that are lost or unusable"
     )
     model_mismatch: VoltageRule = Field(
         default=VoltageRule(delay_s=60.0),
@@ -172,23 +172,23 @@ class AlarmSettings(Strict):
     @model_validator(mode="after")
     def _one_relay(self) -> Self:
         if sum(hook.relay is not None for hook in self.hook) > 1:
-            raise ValueError("hook: the board has one relay: give it one hook, with all its alarms")
+            raise ValueError("hook: the board has one relay; give one hook with all its alarms")
         return self
 
     @model_validator(mode="before")
     @classmethod
-    def _over_its_own_defaults(cls, table: object) -> object:
-        """Fill an alarm's missing settings from its own defaults, not from those of its kind."""
+    def _merge_defaults(cls, table: object) -> object:
+        """Fill an alarm's missing settings from the alarm's defaults, not from those of its class."""
         if not isinstance(table, dict):
             return table
         return {
-            name: _completed(cls.model_fields[name].default, told) if name in ALARMS else told
-            for name, told in table.items()
+            name: _merged(cls.model_fields[name].default, value) if name in ALARMS else value
+            for name, value in table.items()
         }
 
 
-def _completed(default: AlarmRule, told: Any) -> Any:
+def _merged(default: AlarmRule, rule: Any) -> Any:
     """Merge an alarm's settings into its defaults."""
-    if not isinstance(told, dict):
-        return told
-    return default.model_dump(exclude_none=True) | told
+    if not isinstance(rule, dict):
+        return rule
+    return default.model_dump(exclude_none=True) | rule

@@ -1,4 +1,4 @@
-"""A BMS that is polled over Bluetooth: ``[source]`` with ``kind = "ble"``."""
+"""BMS that is polled over Bluetooth: ``[source]`` with ``kind = "ble"``."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self
@@ -26,7 +26,7 @@ class BleSource(PolledSource):
     poll_s: Annotated[float, Field(ge=0.5, le=600)] = Field(default=2.0, description="interval between two readings")
 
     @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _address_or_name(self) -> Self:
         if (self.address is None) == (self.name is None):
             raise ValueError("give address or name, and not both")
         return self
@@ -43,7 +43,7 @@ class BleSource(PolledSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The library counts charge as positive for every BMS."""
+        """Return the ``[sensor]`` defaults; aiobmsble reports charge as positive for every BMS."""
         return {
             "current_sign": "charge_positive",
             "voltage_resolution_v": STEP_V,

@@ -1,4 +1,4 @@
-"""``[edge]``: raw samples to a fleet's server, in blocks."""
+"""``[edge]``: sending of raw samples to a fleet's server, in blocks."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import AfterValidator, ConfigDict, Field
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.mqtt import of_brokers
+from bms_estimator.settings.mqtt import validate_broker_urls
 
 
 class EdgeSettings(Strict):
@@ -14,7 +14,7 @@ class EdgeSettings(Strict):
 
     model_config = ConfigDict(hide_input_in_errors=True)
 
-    url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] = Field(
+    url: Annotated[str | tuple[str, ...], AfterValidator(validate_broker_urls)] = Field(
         default="mqtt://localhost:1883", description="URL of the fleet's server, or a list, as mqtt.url"
     )
     username: str | None = Field(default=None, description="as mqtt.username")

@@ -1,4 +1,4 @@
-"""Exports beside MQTT: InfluxDB, Prometheus."""
+"""``[influx]`` and ``[prometheus]``: exports besides MQTT."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -11,7 +11,7 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class InfluxSettings(Strict):
-    """InfluxDB, or another server for its line protocol over HTTP: each state, and each change of an alarm."""
+    """Export of states and alarm changes to InfluxDB, or another server with its line protocol over HTTP."""
 
     url: Annotated[str, Field(pattern=r"^https?://[^/@\s?#]+(/[^@\s?#]*)?$")] = Field(
         default="http://localhost:8086", description="http://host:port or https://host:port, without user and password"
@@ -28,7 +28,7 @@ class InfluxSettings(Strict):
     every_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(default=10.0, description="interval between requests")
 
     @model_validator(mode="after")
-    def _one_of_two(self) -> Self:
+    def _matching_credentials(self) -> Self:
         if self.bucket and (self.username or self.password_file):
             raise ValueError("username and password_file: of no use with bucket, give token_file")
         if not self.bucket and (self.token_file or self.org):
@@ -55,8 +55,8 @@ class PrometheusSettings(Strict):
         return int(self.listen.rpartition(":")[2])
 
     @model_validator(mode="after")
-    def _an_address(self) -> Self:
+    def _valid_address(self) -> Self:
         if not 0 < self.port < 65536:
             raise ValueError("port: must be 1 to 65535")
-        self.host.encode("idna")  # as the resolver has it
+        self.host.encode("idna")  # the resolver encodes the name this way and would fail later
         return self

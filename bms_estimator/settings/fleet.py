@@ -1,4 +1,4 @@
-"""The settings of a fleet's server: what ``fleet.toml`` holds."""
+"""Settings of a fleet's server, from ``fleet.toml``."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -13,71 +13,75 @@ Gigabytes = Annotated[float, Field(gt=0, le=1e6)]
 TenantName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
 
 
-def _of_listen(text: str) -> str:
+def _validate_listen(text: str) -> str:
     parse_listen(text)
     return text
 
 
-Address = Annotated[str, AfterValidator(_of_listen)]
+Address = Annotated[str, AfterValidator(_validate_listen)]
 
 
 class ServerSettings(Strict):
-    """One node, and what its streams keep."""
+    """Server node: addresses, and limits of its streams."""
 
     folder: Path | None = Field(
         default=None,
-        description="streams and keys; systemd's StateDirectory when left out, else the user's XDG state folder",
+        description="folder of streams and keys; default: systemd's StateDirectory, or the user's XDG state folder",
     )
-    listen: Address = Field(default="127.0.0.1:4222", description="host:port for workers, pages and questions")
-    mqtt: Address = Field(default="127.0.0.1:1883", description="host:port for edges; 8883 is usual with TLS")
+    listen: Address = Field(default="127.0.0.1:4222", description="host:port for workers, pages and queries")
+    mqtt: Address = Field(default="127.0.0.1:1883", description="host:port for edges; usually port 8883 with TLS")
     monitor: Address = Field(
-        default="127.0.0.1:8222", description="host:port where the server tells how it is; on the loopback"
+        default="127.0.0.1:8222", description="host:port of the server's monitoring; only on the loopback interface"
     )
     partitions: Annotated[int, Field(ge=1, le=256)] = Field(
-        default=64, description="among which workers share the packs; stays as it was when the streams were made"
+        default=64, description="number of partitions that workers share; fixed when the streams are created"
     )
     raw_gb: Gigabytes = Field(
         default=8.0,
-        description="what edges have sent is kept up to this size, a tenant; 100,000 packs at 1 Hz: 100 a day",
+        description="maximum size of stored blocks for each tenant; 100,000 packs at 1 Hz send 100 GB a day",
     )
-    raw_days: Annotated[float, Field(gt=0, le=3660)] = Field(default=7.0, description="and so long")
+    raw_days: Annotated[float, Field(gt=0, le=3660)] = Field(default=7.0, description="maximum age of stored blocks")
     disk_gb: Gigabytes | None = Field(
-        default=None, description="the most that all streams take; three quarters of what is free when left out"
+        default=None, description="maximum size of all streams; default: three quarters of the free space"
     )
     sync_s: Annotated[float, Field(ge=0, le=3600)] = Field(
         default=10.0,
-        description="a power cut may lose so much of what one node alone has; 0: nothing, each message waits for the disk",
+        description="interval between fsyncs, whose data a power cut may lose if no other node has them; 0: fsync each message",
     )
 
     @model_validator(mode="after")
-    def _monitor_asks_nobody(self) -> Self:
+    def _monitor_is_local(self) -> Self:
         if not parse_listen(self.monitor).loopback:
-            raise ValueError(f'monitor = "{self.monitor}": it asks nobody for a name: listen on 127.0.0.1')
+            raise ValueError(f'monitor = "{self.monitor}": it has no access control; listen on 127.0.0.1')
         return self
 
 
 class TlsSettings(Strict):
-    """Certificates of all ports but the monitor's, PEM."""
+    """Certificates for all ports but the monitor's, PEM."""
 
     cert_file: Path = Field(
-        description="the server's certificate, with what leads to its authority; a name alone: systemd's credential"
+        description="server certificate with its intermediate certificates; a name without folder: a systemd credential"
     )
-    key_file: Path = Field(description="its private key, not encrypted; as cert_file")
+    key_file: Path = Field(description="private key of cert_file, not encrypted; as cert_file")
     ca_file: Path | None = Field(
-        default=None, description="authority of the nodes' certificates, among several nodes; as cert_file"
+        default=None, description="authority of the nodes' certificates in a cluster; as cert_file"
     )
 
 
 class TenantSettings(Strict):
     """A tenant with separate streams, workers and packs."""
 
-    raw_gb: Gigabytes | None = Field(default=None, description="as server.raw_gb, which holds when left out")
-    raw_days: Annotated[float, Field(gt=0, le=3660)] | None = Field(default=None, description="as server.raw_days")
+    raw_gb: Gigabytes | None = Field(
+        default=None, description="maximum size of stored blocks; default: that of [server]"
+    )
+    raw_days: Annotated[float, Field(gt=0, le=3660)] | None = Field(
+        default=None, description="maximum age of stored blocks; default: that of [server]"
+    )
     disk_gb: Gigabytes | None = Field(
-        default=None, description="the most that all streams take, each copy counted; without: as much as there is"
+        default=None, description="maximum size of all streams of the tenant, including replicas; default: no limit"
     )
     revoked: dict[DeviceName, AwareDatetime] = Field(
-        default={}, description="pack -> time: its tokens from before are refused, as after a theft"
+        default={}, description="times by pack before which its tokens are rejected, for example after a theft"
     )
 
 
@@ -85,34 +89,36 @@ class FleetSettings(Strict):
     """A fleet's settings file."""
 
     server: ServerSettings = ServerSettings()
-    tls: TlsSettings | None = Field(default=None, description="needed beyond this machine")
+    tls: TlsSettings | None = Field(default=None, description="required for clients on other machines")
     tenants: dict[TenantName, TenantSettings] = Field(
-        default={}, description="[tenants.NAME]; without any, all who reach the server are one"
+        default={}, description="[tenants.NAME]; default: one tenant for all clients of the server"
     )
 
     @model_validator(mode="after")
-    def _open_to_others(self) -> Self:
+    def _protected(self) -> Self:
         for name in ("listen", "mqtt"):
-            where = getattr(self.server, name)
-            if not parse_listen(where).loopback:
-                self.refuse_open(f'server.{name} = "{where}"')
+            address = getattr(self.server, name)
+            if not parse_listen(address).loopback:
+                self.refuse_open(f'server.{name} = "{address}"')
         return self
 
-    def refuse_open(self, where: str) -> None:
+    def refuse_open(self, setting: str) -> None:
         """Reject a server that other machines can reach without TLS and tenants.
 
         Args:
-            where: What lets them.
+            setting: Setting or option that makes the server reachable, for the error.
 
         Raises:
-            ValueError: There is no TLS, or no tenant: whoever reaches it could read and write all.
+            ValueError: TLS or tenants are missing, so that any client could read and write all data.
         """
-        missing = [text for there, text in ((self.tls, "[tls]"), (self.tenants, "[tenants.NAME]")) if not there]
+        missing = [name for section, name in ((self.tls, "[tls]"), (self.tenants, "[tenants.NAME]")) if not section]
         if missing:
-            raise ValueError(f"{where} is open to other machines: add {' and '.join(missing)}, or listen on 127.0.0.1")
+            raise ValueError(
+                f"{setting} is open to other machines: add {' and '.join(missing)}, or listen on 127.0.0.1"
+            )
 
 
 def reachable(listen: str) -> Listen:
     """Return the address at which a program on this machine reaches the listener."""
     host, port = parse_listen(listen)
-    return Listen({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), port)  # noqa: S104 - what others listen on
+    return Listen({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), port)  # noqa: S104 - the server's address

@@ -1,4 +1,4 @@
-"""Settings of a pack in Home Assistant."""
+"""``[home_assistant]``: entities of a pack in Home Assistant."""
 
 from typing import Annotated, Literal
 
@@ -7,7 +7,7 @@ from pydantic import Field
 from bms_estimator.model.config_file import Strict
 
 Topic = Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")]
-"""No +, # or spaces, no / at either end."""
+"""MQTT topic without wildcards and spaces, and without a slash at either end."""
 
 
 class HomeAssistantSettings(Strict):

@@ -1,4 +1,4 @@
-"""``[source] kind = "linux"``: a sensor of this machine."""
+"""Current sensor of this machine: ``[source]`` with ``kind = "linux"``."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
@@ -9,9 +9,9 @@ from bms_estimator.model.config_file import Positive
 from bms_estimator.settings.polled_source import Name, PolledSource
 
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
-"""One step of the voltage by chip, at its own pins: INA219 data sheet, ADS1015 at 4.096 V full scale [V]."""
-FINE_V = 1.25e-3
-"""Voltage resolution of the INA226 [V]; hwmon shows finer ones in millivolts only."""
+"""Voltage resolution at the pins, by chip [V]: INA219 data sheet; ADS1015 at 4.096 V full scale."""
+DEFAULT_RESOLUTION_V = 1.25e-3
+"""Voltage resolution of the INA226 [V]; hwmon reports finer ones only in millivolts."""
 
 
 class LinuxSource(PolledSource):
@@ -55,5 +55,5 @@ class LinuxSource(PolledSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The chip's step, as the divider makes it."""
-        return {"voltage_resolution_v": RESOLUTION_V.get(self.chip, FINE_V) * self.voltage_scale}
+        """Return the ``[sensor]`` defaults: the chip's voltage resolution times the ratio of the divider."""
+        return {"voltage_resolution_v": RESOLUTION_V.get(self.chip, DEFAULT_RESOLUTION_V) * self.voltage_scale}

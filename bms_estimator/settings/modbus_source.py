@@ -1,4 +1,4 @@
-"""Registers of a Modbus device with its values: ``[source]`` with ``kind = "modbus"``."""
+"""Registers of a Modbus device: ``[source]`` with ``kind = "modbus"``."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self
@@ -9,13 +9,13 @@ from bms_estimator.model.config_file import Strict
 from bms_estimator.settings.polled_source import PolledSource, with_profile
 
 MAX_WORDS = 125
-"""Registers that one request may ask for, of the Modbus application protocol V1.1b3, section 6.3."""
+"""Maximum number of registers in a request (Modbus application protocol V1.1b3, section 6.3)."""
 WORDS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2}
-"""Registers of a value, by its type."""
+"""Number of registers of a value, by its type."""
 PROFILES: dict[str, dict[str, object]] = {
     # Victron's register list (attributes.csv of dbus_modbustcp), service com.victronenergy.battery; functions 3 and 4
-    # do the same. The unit is the one under Settings, Services, Modbus TCP, Available services; 225 is a BMV's.
-    # Unmeasured values read 0 (Mappings::getValue of dbus_modbustcp): a BMV without a sensor is not at 0 degC.
+    # read equal values. The unit is shown under Settings, Services, Modbus TCP, Available services; 225 is a BMV's.
+    # Unmeasured values read 0 (Mappings::getValue of dbus_modbustcp), also the temperature of a BMV without a sensor.
     "victron-gx": {
         "unit": 225,
         "voltage": {"address": 259, "type": "uint16", "scale": 0.01, "absent": 0},
@@ -32,55 +32,55 @@ PROFILES: dict[str, dict[str, object]] = {
         "cells": {"address": 0x1100, "table": "input", "type": "uint16", "scale": 0.001, "count": 16},
     },
 }
-"""Devices with known registers, by name: defaults of ``[source]``. All of them count charge as positive."""
+"""Defaults of ``[source]`` for devices with known registers, by name. All of them report charge as positive."""
 
 
 class Register(Strict):
-    """One value of the device: ``scale`` times what its registers hold, plus ``offset``."""
+    """Value of the device: content of its registers times ``scale``, plus ``offset``."""
 
     address: Annotated[int, Field(ge=0, le=0xFFFF)] = Field(
-        description="as a request has it, from 0: what a manual calls 40001 is holding register 0"
+        description="address in the request, from 0; 40001 in a manual is holding register 0"
     )
-    table: Literal["holding", "input"] = Field(default="holding", description="read by function 3 or by function 4")
+    table: Literal["holding", "input"] = Field(default="holding", description="holding: function 3; input: function 4")
     type: Literal["int16", "uint16", "int32", "uint32", "float32"] = "uint16"
-    low_word_first: bool = Field(default=False, description="of a value of two registers the lower half comes first")
-    scale: float = Field(default=1.0, description="from what is read to V, A or degC")
-    offset: float = Field(default=0.0, description="added after the scale, such as -273.15")
-    absent: int | None = Field(
-        default=None, description="what is read where nothing is measured, before the scale, such as 32767"
+    low_word_first: bool = Field(
+        default=False, description="true: the first of two registers is the low word of the value"
     )
+    scale: float = Field(default=1.0, description="factor from the register value to V, A or degC")
+    offset: float = Field(default=0.0, description="offset added after scale, such as -273.15")
+    absent: int | None = Field(default=None, description="register value that means not measured, such as 32767")
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
         if self.scale == 0.0:
             raise ValueError("scale: must not be 0")
         if self.address + self.words > 0x10000:
-            raise ValueError("address: the value ends behind the last register, 65535")
+            raise ValueError("address: the value ends beyond the last register, 65535")
         return self
 
     @property
     def words(self) -> int:
-        """Registers that it takes."""
+        """Number of registers of the value."""
         return WORDS[self.type]
 
 
 class CellRegisters(Register):
-    """Voltages of cells, one after the other."""
+    """Registers of cell voltages at equal distances."""
 
-    count: Annotated[int, Field(ge=1, le=96)] = Field(description="how many cells")
+    count: Annotated[int, Field(ge=1, le=96)] = Field(description="number of cells")
     step: Annotated[int, Field(ge=1, le=MAX_WORDS)] | None = Field(
-        default=None, description="registers from one cell to the next; those of a value when left out"
+        default=None, description="distance from one cell to the next in registers; default: consecutive"
     )
 
     def cell(self, number: int) -> Register:
-        """Index of the cell, from 0."""
+        """Return the register of a cell; numbers start from 0."""
         first = Register(**self.model_dump(exclude={"count", "step"}))
         return first.model_copy(update={"address": self.address + number * (self.step or self.words)})
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:
         if self.cell(self.count - 1).address + self.words > 0x10000:
-            raise ValueError("count: the last cell lies behind the last register, 65535")
+            raise ValueError("count: the last cell lies beyond the last register, 65535")
         return self
 
 
@@ -88,7 +88,7 @@ class ModbusSource(PolledSource):
     """Modbus device, on the network or on a serial line."""
 
     kind: Literal["modbus"]
-    profile: str | None = Field(default=None, description=f"a device whose registers are known: {', '.join(PROFILES)}")
+    profile: str | None = Field(default=None, description=f"device with known registers: {', '.join(PROFILES)}")
     host: str | None = Field(default=None, description="Modbus TCP: host name or address of the device or gateway")
     tcp_port: Annotated[int, Field(ge=1, le=65535)] = 502
     port: str | None = Field(
@@ -116,7 +116,7 @@ class ModbusSource(PolledSource):
         return with_profile(table, PROFILES)
 
     @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _host_or_port(self) -> Self:
         if (self.host is None) == (self.port is None):
             raise ValueError("give host for Modbus TCP, or port for a serial line, and not both")
         if self.port is not None and self.framing == "tcp":
@@ -131,12 +131,12 @@ class ModbusSource(PolledSource):
     @property
     def described(self) -> str:
         """Description in a few words."""
-        where = f"{self.host}:{self.tcp_port}" if self.port is None else self.port
-        return f"Modbus unit {self.unit} at {where}"
+        address = f"{self.host}:{self.tcp_port}" if self.port is None else self.port
+        return f"Modbus unit {self.unit} at {address}"
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """Return the sign of a known device, and the steps of its integer values."""
+        """Return the ``[sensor]`` defaults: sign of a known device, and resolution of integer values."""
         sign = {"current_sign": "charge_positive"} if self.profile else {}
         volts = {} if self.voltage.type == "float32" else {"voltage_resolution_v": abs(self.voltage.scale)}
         amperes = {} if self.current.type == "float32" else {"current_resolution_a": abs(self.current.scale)}

@@ -1,4 +1,4 @@
-"""``[mqtt]``: the broker."""
+"""``[mqtt]``: brokers, credentials and allowed commands."""
 
 import re
 from pathlib import Path
@@ -9,32 +9,32 @@ from pydantic import AfterValidator, ConfigDict, Field
 from bms_estimator.model.config_file import Strict
 
 Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate"]
-"""A request that changes something."""
+"""Name of a request that changes the estimator or the service."""
 
 
-def of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
-    """Addresses as they must be.
+def validate_broker_urls(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
+    """Return broker URLs after checking them.
 
     Raises:
-        ValueError: One is not valid, or holds a name or a password.
+        ValueError: A URL is invalid, or contains a user name or a password.
     """
     urls = (value,) if isinstance(value, str) else value
     if not urls:
         raise ValueError("must name a broker")
     for url in urls:
         if "@" in url:
-            raise ValueError("a name goes to mqtt.username, a password to a file that mqtt.password_file names")
+            raise ValueError("set a user name as mqtt.username, and a password in the file mqtt.password_file")
         if not re.fullmatch(r"mqtts?://[^/\s]+", url):
             raise ValueError("must be mqtt://host:port")
     return value
 
 
 class MqttSettings(Strict):
-    """MQTT broker, and the requests that it may pass on."""
+    """MQTT broker, and the commands that clients may send."""
 
     model_config = ConfigDict(hide_input_in_errors=True)
 
-    url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] = Field(
+    url: Annotated[str | tuple[str, ...], AfterValidator(validate_broker_urls)] = Field(
         default="mqtt://localhost:1883",
         description="mqtt://host:port, or mqtts://host:port for TLS; or a list to try in turn",
     )
@@ -59,5 +59,5 @@ class MqttSettings(Strict):
 
     @property
     def urls(self) -> tuple[str, ...]:
-        """The addresses of all brokers."""
+        """URLs of all brokers, in the order of attempts."""
         return (self.url,) if isinstance(self.url, str) else self.url

@@ -1,7 +1,7 @@
-"""Profiles of battery projects that publish over MQTT: settings of ``[source]`` by the project's name.
+"""Profiles of battery projects that publish over MQTT: defaults of ``[source]`` by the project's name.
 
-``{prefix}`` is ``source.prefix``, ``{instance}`` is ``source.instance``, ``{cell}`` the number of a cell from 1. Explicit
-settings take precedence over a profile. Each profile names its source; looked up in November 2026.
+``{prefix}`` is ``source.prefix``, ``{instance}`` is ``source.instance``, and ``{cell}`` is the number of a cell from 1.
+Explicit settings take precedence over a profile. Each profile names its source, as of November 2026.
 """
 
 from collections.abc import Mapping
@@ -22,27 +22,29 @@ CHARGE, DISCHARGE = "charge_positive", "discharge_positive"
 
 
 class Profile(NamedTuple):
-    """One project."""
+    """Defaults of one project."""
 
     table: Mapping[str, Any]
-    """Values of ``[source]``."""
+    """Defaults of ``[source]``."""
     current_sign: str
-    """Direction that the device calls positive; the steps of its values follow."""
+    """Direction of positive current, as ``sensor.current_sign``."""
     voltage_resolution_v: float
     current_resolution_a: float
     needs: Mapping[str, str] = {}
-    """Parameters without which it cannot be found: what each is."""
+    """Descriptions of the required settings, by name."""
 
 
 def _esphome(voltage: str, current: str, temperature: str, cell: str) -> dict[str, Any]:
-    """ESPHome: ``<topic_prefix>/sensor/<object_id>/state``, a plain number; the object id is the sensor's name.
+    """Return the defaults of an ESPHome node.
 
-    esphome/components/mqtt/mqtt_component.cpp. The examples begin each name with that of the node, which is the
-    prefix unless ``instance`` names another; names without it are taken, too.
+    Its topics are ``<topic_prefix>/sensor/<object_id>/state`` with a plain number
+    (esphome/components/mqtt/mqtt_component.cpp). The object id is the sensor's name. In the examples each name begins
+    with that of the node, which is the prefix unless ``instance`` is set. Names without the node's name are accepted
+    too.
     """
 
     def topics(name: str) -> dict[str, Any]:
-        return {"topic": [f"{{prefix}}/sensor/{begin}{name}/state" for begin in ("{prefix}_", "{instance}_", "")]}
+        return {"topic": [f"{{prefix}}/sensor/{node}{name}/state" for node in ("{prefix}_", "{instance}_", "")]}
 
     return {
         "voltage": topics(voltage),
@@ -58,7 +60,7 @@ def _node(example: str) -> dict[str, str]:
 
 
 PROFILES: Mapping[ProfileName, Profile] = {
-    # bmslib/mqtt_util.py, bmslib/wire/fields.py; the sign: issue 10. Unchanged values are published every 10 s only.
+    # bmslib/mqtt_util.py, bmslib/wire/fields.py; sign: issue 10. Unchanged values are published only every 10 s.
     "batmon-ha": Profile(
         {
             "voltage": {"topic": "{prefix}/soc/total_voltage"},
@@ -88,8 +90,8 @@ PROFILES: Mapping[ProfileName, Profile] = {
         0.01,
         _node("jbd-bms-ble"),
     ),
-    # ESPHome's own daly_bms with the names of its documentation: every 20 s there; the sign is the frame's
-    # (esphome/components/daly_bms/daly_bms.cpp), which is that of protocols/devices/daly.py
+    # ESPHome's daly_bms, with the sensor names and the interval of 20 s of its documentation. The sign is that of the
+    # frame (esphome/components/daly_bms/daly_bms.cpp), as in protocols/devices/daly.py
     "esphome-daly": Profile(
         _esphome("battery_voltage", "battery_current", "max_temperature", "cell_{cell}_voltage") | {"interval_s": 20.0},
         DISCHARGE,
@@ -97,8 +99,8 @@ PROFILES: Mapping[ProfileName, Profile] = {
         0.1,
         _node("daly-bms"),
     ),
-    # victronenergy/dbus-flashmq, README: values are published on change and on request; the keep-alive lasts
-    # 60 s. Cells as dbus-serialbattery has them with BATTERY_CELL_DATA_FORMAT = 1.
+    # victronenergy/dbus-flashmq, README: values are published on change and on request; a keep-alive lasts 60 s.
+    # Cell topics are those of dbus-serialbattery with BATTERY_CELL_DATA_FORMAT = 1.
     "venus": Profile(
         {
             "voltage": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Voltage", "path": "value"},
@@ -123,7 +125,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "instance": "device instance of the battery, as in the topics N/<portal>/battery/<instance>/...",
         },
     ),
-    # dalathegreat/Battery-Emulator, Software/src/devboard/mqtt/mqtt.cpp; the sign: issue 342. Cells each minute.
+    # dalathegreat/Battery-Emulator, Software/src/devboard/mqtt/mqtt.cpp; sign: issue 342. Cells are sent each minute.
     "battery-emulator": Profile(
         {
             "prefix": "BE",

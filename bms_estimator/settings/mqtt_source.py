@@ -1,4 +1,4 @@
-"""``[source] kind = "mqtt"``: battery readings that another program publishes."""
+"""Battery values that another program publishes: ``[source]`` with ``kind = "mqtt"``."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from bms_estimator.model.config_file import Positive, Strict
-from bms_estimator.settings.mqtt import of_brokers
+from bms_estimator.settings.mqtt import validate_broker_urls
 from bms_estimator.settings.mqtt_profiles import PROFILES, ProfileName
 from bms_estimator.settings.polled_source import Name, PolledSource
 
@@ -31,19 +31,20 @@ LINEAR: Mapping[Unit, tuple[float, float]] = {
 
 
 class ValueLocation(Strict):
-    """Location of a quantity in messages, and its conversion to SI. A text alone is the path."""
+    """Location of a quantity in messages, and its conversion to SI units. A string alone is the path."""
 
     topic: Name | tuple[Name, ...] | None = Field(
-        default=None, description="or several, of which one comes; source.topic when left out; {cell}: number of a cell"
+        default=None,
+        description="topic, or several alternatives; default: source.topic; {cell} is the number of a cell",
     )
     path: str = Field(
         default="",
-        description="in JSON: keys, and numbers in lists, with dots between; empty: the payload is the number; "
-        "{cell}: number of a cell; of cells also that of a list",
+        description="path in JSON: keys and list indices, separated by dots; empty: the payload is a plain number; "
+        "{cell} is the number of a cell; the path of cells may also lead to a list",
     )
-    unit: Unit | None = Field(default=None, description="of what comes")
-    scale: float = Field(default=1.0, description="what comes is multiplied by it")
-    offset: float = Field(default=0.0, description="added after that, in what comes")
+    unit: Unit | None = Field(default=None, description="unit of the received value")
+    scale: float = Field(default=1.0, description="factor of the received value")
+    offset: float = Field(default=0.0, description="offset added after scale, in the unit of the received value")
 
     @model_validator(mode="before")
     @classmethod
@@ -62,7 +63,7 @@ class ValueLocation(Strict):
 
 
 class MqttSource(PolledSource):
-    """Battery values that another program publishes over MQTT: see docs/pack/mqtt-source.md."""
+    """Battery values that another program publishes over MQTT, see docs/pack/mqtt-source.md."""
 
     kind: Literal["mqtt"]
     profile: ProfileName | None = Field(default=None, description="publisher, which sets the defaults of this section")
@@ -93,7 +94,7 @@ class MqttSource(PolledSource):
         default={}, description="requests: payload by topic, for publishers that only answer"
     )
     ask_s: Positive = Field(default=10.0, description="interval of the requests")
-    url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] | None = Field(
+    url: Annotated[str | tuple[str, ...], AfterValidator(validate_broker_urls)] | None = Field(
         default=None, description="URL of the broker, or a list to try in turn; default: that of [mqtt]"
     )
     username: str | None = Field(default=None, description="user at the broker in url")
@@ -104,7 +105,7 @@ class MqttSource(PolledSource):
 
     @model_validator(mode="before")
     @classmethod
-    def _as_the_profile_has_it(cls, table: object) -> object:
+    def _merge_profile(cls, table: object) -> object:
         """Merge settings into the profile, part by part for each quantity."""
         profile = PROFILES.get(table.get("profile", "")) if isinstance(table, dict) else None
         if profile is None or not isinstance(table, dict):
@@ -121,37 +122,37 @@ class MqttSource(PolledSource):
         return merged
 
     @model_validator(mode="after")
-    def _whole(self) -> "MqttSource":
+    def _complete(self) -> "MqttSource":
         for name in ("voltage", "current"):
             if getattr(self, name) is None:
-                raise ValueError(f"{name}: missing; tell where it is found, or a profile: {', '.join(PROFILES)}")
+                raise ValueError(f"{name}: missing; give its path, or a profile: {', '.join(PROFILES)}")
         for name, place in self.places():
             if not place.topics and not self.topic:
-                raise ValueError(f"{name}.topic: missing, and there is no topic for all of them")
+                raise ValueError(f"{name}.topic: missing, and source.topic is not set")
             if place.unit and place.unit not in UNITS[name]:
                 raise ValueError(f"{name}.unit = {place.unit}: must be one of {', '.join(UNITS[name])}")
             if place.scale == 0.0:
                 raise ValueError(f"{name}.scale = 0: must not be 0")
         if self.url is None and (self.username or self.password_file or self.ca_file):
             raise ValueError(
-                "username, password_file and ca_file are for a broker at url; without, those of [mqtt] count"
+                "username, password_file and ca_file are for a broker at url; without url, those of [mqtt] apply"
             )
         return self
 
     def places(self) -> Iterator[tuple[str, ValueLocation]]:
-        """Return the quantities to read, by name."""
+        """Yield name and location of each configured quantity."""
         for name in self.quantities:
             place = getattr(self, name)
             if place is not None:
                 yield name, place
 
-    def filled(self, text: str) -> str:
-        """Fill prefix and instance into a topic or a path."""
+    def substitute(self, text: str) -> str:
+        """Substitute prefix and instance in a topic or a path."""
         return text.replace("{prefix}", self.prefix or "").replace("{instance}", self.instance)
 
     def topics(self, place: ValueLocation) -> list[str]:
-        """Topics of a quantity; ``{cell}`` may be in them."""
-        return [self.filled(topic) for topic in place.topics or (self.topic or "",)]
+        """Return the topics of a quantity, which may contain ``{cell}``."""
+        return [self.substitute(topic) for topic in place.topics or (self.topic or "",)]
 
     @property
     def period_s(self) -> float:
@@ -161,14 +162,14 @@ class MqttSource(PolledSource):
     @property
     def described(self) -> str:
         """Description in a few words."""
-        who = self.profile or (self.topics(self.voltage)[0] if self.voltage else "")
-        return f"{who} {self.prefix or ''}".strip() + " by MQTT"
+        publisher = self.profile or (self.topics(self.voltage)[0] if self.voltage else "")
+        return f"{publisher} {self.prefix or ''}".strip() + " by MQTT"
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """Current sign and resolution of the profile."""
+        """Return the ``[sensor]`` defaults: current sign and resolution of the profile."""
         if self.profile is None:
             return {"voltage_resolution_v": 0.01}
         profile = PROFILES[self.profile]
-        shown = ("current_sign", "voltage_resolution_v", "current_resolution_a")
-        return {name: getattr(profile, name) for name in shown}
+        names = ("current_sign", "voltage_resolution_v", "current_resolution_a")
+        return {name: getattr(profile, name) for name in names}

@@ -1,4 +1,4 @@
-"""``[observer]`` and ``[identifier]``: adaptive observer and filter."""
+"""``[observer]`` and ``[identifier]``: adaptive observer and joint Kalman filter."""
 
 from typing import Annotated, Literal
 
@@ -44,7 +44,7 @@ class ObserverSettings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _no_rearm(cls, table: object) -> object:
-        """``rearm_gain = "never"`` in a file, since TOML has no null."""
+        """Convert ``rearm_gain = "never"`` to None, because TOML has no null."""
         if isinstance(table, dict) and table.get("rearm_gain") == "never":
             return table | {"rearm_gain": None}
         return table

@@ -1,4 +1,4 @@
-"""The settings of one pack: what ``pack.toml`` holds. Values are in SI units, which the keys contain."""
+"""Settings of one pack, from ``pack.toml``. Keys contain the unit."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -61,7 +61,7 @@ class PublishSettings(Strict):
 
 
 class StateSettings(Strict):
-    """State that outlives a restart."""
+    """State that survives a restart."""
 
     folder: Path | None = Field(
         default=None,
@@ -75,7 +75,7 @@ class StateSettings(Strict):
 
 
 class StoreSettings(Strict):
-    """Data in the state folder: messages for a broker that is away, and the pack's history."""
+    """Data in the state folder: queued messages during a broker outage, and the pack's history."""
 
     outbox_messages: Annotated[int, Field(ge=1, le=10_000_000)] = Field(
         default=90_000,
@@ -104,7 +104,7 @@ class Settings(Strict):
     mqtt: MqttSettings | None = Field(default=None, description="omit to publish nothing")
     edge: EdgeSettings | None = Field(default=None, description="omit to send no samples to a fleet")
     home_assistant: HomeAssistantSettings = HomeAssistantSettings()
-    influx: InfluxSettings | None = Field(default=None, description="omit to write to none")
+    influx: InfluxSettings | None = Field(default=None, description="omit to disable")
     prometheus: PrometheusSettings | None = Field(default=None, description="omit to disable")
     page: PageSettings | None = Field(default=None, description="omit to serve no page")
     state: StateSettings = StateSettings()
@@ -114,8 +114,11 @@ class Settings(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _law_that_learns(cls, tables: object) -> object:
-        """Select the default law: without the identifier it is the adaptive law that learns, because the printed law has only its bounds (docs/theory/comparison.md)."""
+    def _select_law(cls, tables: object) -> object:
+        """Select the law ``learning`` by default if the identifier is off.
+
+        The printed law moves its parameters between bounds without identifying them (docs/theory/comparison.md).
+        """
         if not isinstance(tables, dict):
             return tables
         identifier, observer = tables.get("identifier"), tables.get("observer", {})
@@ -125,30 +128,30 @@ class Settings(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _sensor_of_the_source(cls, tables: object) -> object:
-        """Return the ``[sensor]`` defaults of a source that is not a serial port: it yields text lines.
+    def _add_source_defaults(cls, tables: object) -> object:
+        """Add the ``[sensor]`` defaults of a ``[source]``, whose protocol is always text lines.
 
         Raises:
-            ValueError: The table is of a serial device.
+            ValueError: ``[sensor]`` describes a serial device.
         """
         if not isinstance(tables, dict) or tables.get("source") is None:
             return tables
         sensor = tables.get("sensor", {})
-        told = sensor.model_dump(exclude_unset=True) if isinstance(sensor, SensorSettings) else sensor
+        configured = sensor.model_dump(exclude_unset=True) if isinstance(sensor, SensorSettings) else sensor
         try:
             source = SOURCE.validate_python(tables["source"])
-        except ValidationError:  # the section itself reports it
+        except ValidationError:  # the validation of the section reports it
             return tables
-        if not isinstance(told, dict):
+        if not isinstance(configured, dict):
             return tables
-        if serial := [name for name, none in NO_DEVICE.items() if told.get(name, none[0]) not in none]:
+        if serial := [name for name, allowed in NO_DEVICE.items() if configured.get(name, allowed[0]) not in allowed]:
             names = ", ".join(f"sensor.{name}" for name in serial)
-            raise ValueError(f"{names}: tells of a serial device, and [source] is none: take that away, or [source]")
-        return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **told, "protocol": "text"}}
+            raise ValueError(f"{names}: describes a serial device, which [source] replaces: remove one of them")
+        return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **configured, "protocol": "text"}}
 
     @property
     def sampling(self) -> Sampling:
-        """Return period and current resolution of the source."""
+        """Sampling of the source."""
         s = self.sensor
         return Sampling(s.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0)
 
@@ -157,6 +160,6 @@ def load_settings(path: Path) -> Settings:
     """Read a pack's settings.
 
     Raises:
-        UserError: As ``read_toml``.
+        UserError: The file cannot be read, or a setting is invalid.
     """
     return read_toml(path, Settings)

@@ -1,4 +1,4 @@
-"""The settings of the live page: where it is served, and to whom."""
+"""``[page]``: address and access token of the live page."""
 
 import ipaddress
 from pathlib import Path
@@ -17,7 +17,7 @@ class Listen(NamedTuple):
 
     host: str
     port: int
-    """0: any that is free."""
+    """TCP port; 0: any free port."""
 
     @property
     def loopback(self) -> bool:
@@ -29,15 +29,15 @@ class Listen(NamedTuple):
 
 
 def parse_listen(text: str) -> Listen:
-    """``host:port``.
+    """Parse ``host:port``.
 
     Raises:
-        ValueError: It is something else.
+        ValueError: The text is something else.
     """
     try:
         url = urlsplit(f"//{text}")
         host, port = url.hostname, url.port
-        (host or "").encode("idna")  # as the resolver has it
+        (host or "").encode("idna")  # the resolver encodes the name this way and would fail later
     except ValueError as error:
         raise ValueError(f"must be host:port: {error}") from None
     if not host or port is None or url.netloc != text or "@" in text:
@@ -45,7 +45,7 @@ def parse_listen(text: str) -> Listen:
     return Listen(host, port)
 
 
-def _of_listen(text: str) -> str:
+def _validate_listen(text: str) -> str:
     parse_listen(text)
     return text
 
@@ -53,7 +53,7 @@ def _of_listen(text: str) -> str:
 class PageSettings(Strict):
     """Live page for a browser."""
 
-    listen: Annotated[str, AfterValidator(_of_listen)] = Field(
+    listen: Annotated[str, AfterValidator(_validate_listen)] = Field(
         default=DEFAULT_LISTEN,
         description="host:port; packs of one process with the same address share a page. Beyond this machine, such as 0.0.0.0:8765, token_file is required",
     )
@@ -65,7 +65,7 @@ class PageSettings(Strict):
 
     @property
     def address(self) -> Listen:
-        """``listen`` in its parts."""
+        """Host and port of ``listen``."""
         return parse_listen(self.listen)
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Settings that all kinds of ``[source]`` share."""
+"""Base class of all kinds of ``[source]``."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -11,11 +11,11 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class PolledSource(Strict):
-    """Settings that all kinds of sources share."""
+    """Base class of all kinds of ``[source]``."""
 
     @property
     def period_s(self) -> float:
-        """Expected time between two samples [s]; values are fresh for three of them."""
+        """Expected time between two samples [s]; values count as fresh for three periods."""
         raise NotImplementedError
 
     @property
@@ -30,10 +30,10 @@ class PolledSource(Strict):
 
 
 def with_profile(table: object, profiles: Mapping[str, Mapping[str, object]]) -> object:
-    """Fill a settings section from its ``profile`` where it leaves a value out.
+    """Add the defaults of its ``profile`` to a settings section.
 
     Raises:
-        ValueError: There is no profile of this name.
+        ValueError: The profile is unknown.
     """
     if not isinstance(table, dict) or not isinstance(name := table.get("profile"), str):
         return table

@@ -10,7 +10,7 @@ class Sampling:
     period_s: float = 0.01
     """Time between two samples [s]."""
     current_resolution_a: float = 0.0
-    """One step of the current [A]; 0: negligible."""
+    """Resolution of the current [A]; 0: negligible."""
     current_dead_band_a: float = 0.0
     """Currents below this are reported as 0 [A]."""
 

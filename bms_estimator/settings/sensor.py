@@ -1,4 +1,4 @@
-"""``[sensor]``: the device that measures."""
+"""``[sensor]``: the measuring device."""
 
 from typing import Annotated, Literal, Self
 
@@ -9,11 +9,11 @@ from bms_estimator.model.one_of import OneOf
 from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
 
 NO_DEVICE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
-"""Values of ``[sensor]`` that are allowed beside ``[source]``: those of a file with all defaults."""
+"""Values of ``[sensor]`` that are allowed besides ``[source]``: those of a file that contains all defaults."""
 
 
 def _filled(sensor: dict[str, object]) -> dict[str, object]:
-    """Fill in the device's resolution where the table ``[sensor]`` leaves it out."""
+    """Add the device's resolution to the table ``[sensor]``, unless configured."""
     protocol = sensor.get("protocol")
     if not isinstance(protocol, str) or protocol not in DEVICES:
         return sensor
@@ -64,19 +64,19 @@ class SensorSettings(Strict):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _as_the_device_does(cls, table: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Fill in the protocol's defaults without counting them as set."""
+    def _add_device_defaults(cls, table: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        """Add the protocol's defaults without counting them as set."""
         if not isinstance(table, dict):
             return validate(table)
-        made = validate(_filled(table))
-        made.model_fields_set.intersection_update(table)
-        return made
+        settings = validate(_filled(table))
+        settings.model_fields_set.intersection_update(table)
+        return settings
 
     @model_validator(mode="after")
     def _only_boards_have_serials(self) -> Self:
         if self.serial and self.protocol != "binary":
             raise ValueError(
-                f"serial: only a binary board tells its number, and protocol is {self.protocol}; leave it out"
+                f"serial: only a binary board reports its serial number, but protocol is {self.protocol}; remove it"
             )
         return self
 

@@ -1,7 +1,4 @@
-"""Sinks of estimates: MQTT, terminal, CSV and Parquet files.
-
-All sinks are peers: async context managers with a ``publish`` that neither blocks nor fails.
-"""
+"""Interface of all live sinks, such as MQTT, terminal and exports."""
 
 from typing import Protocol, Self
 
@@ -9,13 +6,13 @@ from bms_estimator.model.payloads import Snapshot
 
 
 class Sink(Protocol):
-    """Takes snapshots, once for each publish period."""
+    """Sink of snapshots, one for each publish period."""
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Take a snapshot; returns at once and never raises for an outage on the other side."""
+        """Publish a snapshot. It neither waits nor raises for an outage of the receiver."""
 
     async def __aenter__(self) -> Self:
-        """Start."""
+        """Start publishing."""
 
     async def __aexit__(self, *_: object) -> None:
-        """Hand over queued messages and end."""
+        """Send queued messages and stop."""

@@ -1,6 +1,6 @@
-"""Estimates of each sample to CSV or Parquet, block by block, so that memory does not grow.
+"""CSV and Parquet files with the estimates of each sample, written in blocks, so that memory does not grow.
 
-The columns are the trace's fields; every value can be read back to the last bit.
+The columns are the trace's fields. Every value can be read back exactly.
 """
 
 import gzip
@@ -14,23 +14,23 @@ from numpy.typing import NDArray
 from bms_estimator.model.errors import UserError
 
 GZIP_LEVEL = 3
-"""A third of the time of level 9 for some percent more bytes."""
+"""Compression level of gzip: a third of the time of level 9, for some percent more bytes."""
 
 
 class TableSink(Protocol):
-    """A file that grows by trace blocks; leaving completes it.
+    """File to which blocks of a trace are appended; leaving the context completes it.
 
     The first block replaces an older file, so that an earlier failure leaves that one unchanged.
     """
 
     def __enter__(self) -> Self:
-        """Nothing to open yet."""
+        """Return the sink; the first block opens the file."""
 
     def __exit__(self, *_: object) -> None:
         """Complete the file."""
 
     def write(self, trace: NDArray[np.void]) -> None:
-        """Append a row for each of ``trace``, a structured array of one dtype for all calls.
+        """Append the rows of ``trace``, a structured array with the dtype of all earlier calls.
 
         Raises:
             UserError: The file cannot be written.
@@ -38,7 +38,7 @@ class TableSink(Protocol):
 
 
 class CsvSink:
-    """CSV, gzipped when the name ends in .gz.
+    """CSV file, gzipped if its name ends in .gz.
 
     Args:
         path: The file.
@@ -50,7 +50,7 @@ class CsvSink:
         self._file: IO[bytes] | None = None
 
     def __enter__(self) -> Self:
-        """Nothing to open yet."""
+        """Return the sink; the first block opens the file."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -74,21 +74,21 @@ class CsvSink:
 
 
 class ParquetSink:
-    """Parquet; needs pyarrow.
+    """Parquet file; needs pyarrow.
 
     Args:
         path: The file.
     """
 
     def __init__(self, path: Path) -> None:
-        import pyarrow  # noqa: F401, ICN001, PLC0415 - optional: its absence must show before the work, not after
+        import pyarrow  # noqa: F401, ICN001, PLC0415 - optional; a missing package must be reported before the replay
 
         self._path = path
         self._files = ExitStack()
         self._writer: Any = None
 
     def __enter__(self) -> Self:
-        """Nothing to open yet."""
+        """Return the sink; the first block opens the file."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -114,7 +114,7 @@ def table_sink(path: Path) -> TableSink:
     """Return the sink of ``path`` by its file name extension.
 
     Raises:
-        UserError: The extension is not known.
+        UserError: The extension is unknown.
     """
     for suffix, writer in WRITERS.items():
         if path.name.lower().endswith(suffix):
@@ -130,7 +130,7 @@ def _create(path: Path) -> IO[bytes]:
 
 
 def _lines(trace: NDArray[np.void]) -> bytes:
-    """Rows as CSV, with enough digits to restore each float exactly."""
+    """Return rows as CSV, with enough digits to restore each float exactly."""
     columns = [map(repr, trace[name].tolist()) for name in trace.dtype.names or ()]
     return ("\n".join(map(",".join, zip(*columns, strict=True))) + "\n").encode()
 

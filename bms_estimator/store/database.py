@@ -1,4 +1,4 @@
-"""A pack's SQLite file, in a thread of its own: the event loop never waits for the disk, nor fails with it."""
+"""SQLite file of a pack, accessed in a separate thread, so that a slow or failed disk does not block the event loop."""
 
 import asyncio
 import contextlib
@@ -17,20 +17,20 @@ from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.store.migrations import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
 
 HANG_S = 10.0
-"""A disk that has not answered by then is taken to hang [s]."""
-ENDING_S = 5.0
+"""Timeout after which the disk counts as hung [s]."""
+SHUTDOWN_TIMEOUT_S = 5.0
 """Timeout of all writes during shutdown [s]."""
 RETRY_S = 10.0
-"""A disk that failed is tried again no more often than this [s]."""
+"""Minimum delay before a failed disk is retried [s]."""
 SYNC_S = 30.0
 """Minimum interval between two fsyncs [s]. Commits in between are only handed to the OS. A power failure loses
 everything since the last fsync, which happens only with a commit."""
-LOCKED_S = 5.0
-"""Time that another process may lock the file [s]."""
+LOCK_TIMEOUT_S = 5.0
+"""Timeout of a lock that another process holds on the file [s]."""
 LOG_BYTES = 4 << 20
 """Maximum size of the write-ahead log [bytes]."""
 FREE_PAGES = 1024
-"""Number of free pages of 4 KiB for later rows."""
+"""Number of free pages of 4 KiB that stay in the file for later rows."""
 TRIMMED_PAGES = 4096
 """Maximum number of pages moved to shrink the file after one transaction."""
 UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT)
@@ -48,17 +48,19 @@ class StoreError(Exception):
 
 
 class Database:
-    """Runs transactions one after the other. What fails is tried again with a later one, in a new file if need be.
+    """Runs transactions one after the other, in a new file if the old one is unusable.
+
+    A caller repeats the work of a failed transaction in a later one.
 
     Args:
-        path: The file, made where it is not there.
-        tables: What makes its tables, as ``MIGRATIONS``.
+        path: Database file, created if missing.
+        tables: Statements that create the tables, as ``MIGRATIONS``.
         sync_s: Minimum interval between two fsyncs [s].
         hang_s: Timeout of a transaction [s].
-        retry_s: After a failure, before the disk is tried again [s].
+        retry_s: Delay after a failure before the disk is retried [s].
 
     Attributes:
-        reason: Why it cannot be used now; empty when it can.
+        reason: Reason for which the database cannot be used now; empty if it can.
     """
 
     def __init__(
@@ -76,11 +78,11 @@ class Database:
         self._stuck: asyncio.Future[Any] | None = None
         self._failed_s = -retry_s
         self._end_s = math.inf
-        self._waits: set[asyncio.Timeout] = set()
+        self._open_timeouts: set[asyncio.Timeout] = set()
         self._file = _File(path, tables, sync_s)
 
     async def __aenter__(self) -> Self:
-        """Nothing to open yet: the first transaction does."""
+        """Return the database; the first transaction opens the file."""
         return self
 
     async def __aexit__(self, *_error: object) -> None:
@@ -89,35 +91,35 @@ class Database:
         await self._wait(asyncio.wrap_future(self._thread.submit(self._file.close)))
 
     def begin_shutdown(self) -> None:
-        """Begin the shutdown: pending writes get ``ENDING_S`` in total, and nothing is waited for longer."""
-        self._end_s = min(self._end_s, asyncio.get_running_loop().time() + ENDING_S)
-        for wait in self._waits:
-            if not wait.expired():
-                wait.reschedule(min(wait.when() or self._end_s, self._end_s))
+        """Begin the shutdown: all pending and further transactions together may take ``SHUTDOWN_TIMEOUT_S``."""
+        self._end_s = min(self._end_s, asyncio.get_running_loop().time() + SHUTDOWN_TIMEOUT_S)
+        for timeout in self._open_timeouts:
+            if not timeout.expired():
+                timeout.reschedule(min(timeout.when() or self._end_s, self._end_s))
 
     async def _wait(self, waiter: asyncio.Future[Any]) -> bool:
         """Return True if the disk responded in time."""
         due_s = min(asyncio.get_running_loop().time() + self._hang_s, self._end_s)
         try:
-            async with asyncio.timeout_at(due_s) as wait:
-                self._waits.add(wait)
+            async with asyncio.timeout_at(due_s) as timeout:
+                self._open_timeouts.add(timeout)
                 await asyncio.wait([waiter])
         except TimeoutError:
             return waiter.done()
         finally:
-            self._waits.discard(wait)
+            self._open_timeouts.discard(timeout)
         return True
 
     @property
     def opened(self) -> int:
-        """Number of times the file was opened: earlier content may be gone."""
+        """Number of times that the file was opened. A new opening may have found an empty file."""
         return self._file.opened
 
     async def call(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run ``work`` in a transaction.
 
         Raises:
-            StoreError: It was not committed, or that is unknown.
+            StoreError: The transaction was not committed, or its result is unknown.
         """
         now_s = asyncio.get_running_loop().time()
         if (self._stuck and not self._stuck.done()) or now_s - self._failed_s < self._retry_s:
@@ -149,39 +151,39 @@ class Database:
 
 
 class _File:
-    """The connection; all of it runs in the thread."""
+    """SQLite connection and its file. All methods run in the database thread."""
 
     def __init__(self, path: Path, tables: tuple[str, ...], sync_s: float) -> None:
         self._path, self._tables, self._sync_s = path, tables, sync_s
         self._connection: sqlite3.Connection | None = None
         self._inode = (0, 0)
-        self._ready = False  # tables are as they must be
+        self._ready = False  # the schema was checked
         self._synced_s = 0.0
         self.opened = 0
 
     def run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
-        """One transaction; in a new file where the one that is there cannot be used."""
+        """Run one transaction, in a new file if the existing one is unusable."""
         try:
             return self._run(work)
         except (NewerVersionError, OtherTablesError) as error:
-            self._set_aside(str(error))
-        except UnicodeDecodeError as error:  # parts of SQLite's messages on damaged tables
+            self._quarantine(str(error))
+        except UnicodeDecodeError as error:  # SQLite's error messages quote names of damaged tables
             if self._ready:
                 raise
-            self._set_aside(str(error))
+            self._quarantine(str(error))
         except sqlite3.DatabaseError as error:
             code = getattr(error, "sqlite_errorcode", 0)
-            # READONLY in full is no matter of rights: we have just opened the file to write
+            # plain READONLY comes from the file's header and not from permissions: the file was just opened for writing
             unusable = code == sqlite3.SQLITE_READONLY or code & 0xFF in (UNUSABLE if self._ready else UNUSABLE_AT_OPEN)
             if not unusable:
                 raise
-            self._set_aside(str(error))
+            self._quarantine(str(error))
         return self._run(work)
 
     def _run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
-        """Open or close the file as necessary."""
+        """Run one transaction; open the file if necessary, and close it after an error."""
         try:
-            connection = self._opened()
+            connection = self._open()
             due = time.monotonic() - self._synced_s >= self._sync_s
             connection.execute(f"PRAGMA synchronous = {'FULL' if due else 'NORMAL'}")
             connection.execute("BEGIN IMMEDIATE")
@@ -197,26 +199,26 @@ class _File:
         return result
 
     def close(self) -> None:
-        """Close; uncommitted changes are undone."""
+        """Close the file and roll back uncommitted changes."""
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
 
-    def _opened(self) -> sqlite3.Connection:
-        """Return a connection to the present file; a deleted one would accept data and keep nothing."""
+    def _open(self) -> sqlite3.Connection:
+        """Return a connection to the file at the path, reopened if it was replaced: a deleted file would lose all data."""
         if self._connection is not None and _inode(self._path) == self._inode:
             return self._connection
         self.close()
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         for suffix in ("", "-wal", "-shm"):
-            self._refuse_planted(self._path.with_name(self._path.name + suffix))
+            self._quarantine_symlink(self._path.with_name(self._path.name + suffix))
         descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         try:
-            os.fchmod(descriptor, 0o600)  # SQLite gives its log the same
+            os.fchmod(descriptor, 0o600)  # SQLite creates its log with the permissions of the database
         finally:
             os.close(descriptor)
         self._inode, self._ready = _inode(self._path), False
-        self._connection = sqlite3.connect(self._path, timeout=LOCKED_S, isolation_level=None)
+        self._connection = sqlite3.connect(self._path, timeout=LOCK_TIMEOUT_S, isolation_level=None)
         self._connection.text_factory = lambda raw: raw.decode(errors="surrogateescape")  # a damaged row must not fail
         self._prepare(self._connection)
         self._ready = True
@@ -224,34 +226,34 @@ class _File:
         return self._connection
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
-        connection.execute("PRAGMA auto_vacuum = INCREMENTAL")  # of a new file
+        connection.execute("PRAGMA auto_vacuum = INCREMENTAL")  # effective only in a new file
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute(f"PRAGMA journal_size_limit = {LOG_BYTES}")
         migrate(connection, self._tables)
 
-    def _refuse_planted(self, path: Path) -> None:
-        """Quarantine a link or anything but a regular file: SQLite would write to its target."""
+    def _quarantine_symlink(self, path: Path) -> None:
+        """Rename a symlink or any other non-regular file, because SQLite would write to its target."""
         try:
-            found = path.lstat()
+            status = path.lstat()
         except FileNotFoundError:
             return
-        if not stat.S_ISREG(found.st_mode):
+        if not stat.S_ISREG(status.st_mode):
             path.replace(path.with_name(f"{path.name}.refused"))
-            log.warning("no file stands where the database must: set aside", file=str(path))
+            log.warning("database path is not a regular file; renamed to *.refused", file=str(path))
 
-    def _set_aside(self, reason: str) -> None:
-        """Quarantine an unusable file and its log."""
-        aside = self._path.with_name(f"{self._path.stem}.refused{self._path.suffix}")
+    def _quarantine(self, reason: str) -> None:
+        """Rename an unusable file and its log."""
+        renamed = self._path.with_name(f"{self._path.stem}.refused{self._path.suffix}")
         for suffix in ("", "-wal", "-shm"):
-            source, target = (path.with_name(path.name + suffix) for path in (self._path, aside))
+            source, target = (path.with_name(path.name + suffix) for path in (self._path, renamed))
             target.unlink(missing_ok=True)
             if source.exists():
                 source.replace(target)
-        log.warning("database set aside, a new one is begun", file=str(self._path), reason=reason, aside=aside.name)
+        log.warning("database set aside, a new one is begun", file=str(self._path), reason=reason, aside=renamed.name)
 
 
 def _trim(connection: sqlite3.Connection) -> None:
-    """Release free pages once they are most of the file, so that data are moved at most once or twice."""
+    """Release free pages once they are half of the file, so that a page is moved at most once or twice."""
     (free,) = connection.execute("PRAGMA freelist_count").fetchone()
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     if free > max(FREE_PAGES, pages // 2):
@@ -260,7 +262,7 @@ def _trim(connection: sqlite3.Connection) -> None:
 
 def _inode(path: Path) -> tuple[int, int]:
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return 0, 0
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino

@@ -1,7 +1,7 @@
-"""The pack's history: a row for each minute, and what happened, for as long as is set.
+"""History of a pack: one-minute rows and events, for the configured number of days.
 
-Written each minute, and when something happens, in one transaction, off the event loop. ``kill -9`` costs the minute that
-was open, and what the disk had not yet taken.
+Each minute and each event is written in a transaction outside the event loop. ``kill -9`` loses the open minute and
+rows that are not on disk yet.
 """
 
 import asyncio
@@ -14,12 +14,13 @@ from typing import Self, TypeVar
 from bms_estimator.model.events import Event, events
 from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, minute_of, seen
+from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_of
 
 MINUTES_A_DAY = 1440
 WAITING_MINUTES = 2 * MINUTES_A_DAY
 """Maximum number of rows in memory while the disk cannot be written."""
 WAITING_EVENTS = 1000
+"""Maximum number of events in memory while the disk cannot be written."""
 MAX_EVENTS = 50_000
 """Maximum number of events in the database, so that a flapping line does not fill the disk."""
 
@@ -51,7 +52,7 @@ _INSERT = (
 
 
 class History:
-    """A sink that keeps minutes and events.
+    """Sink that stores one-minute rows and events.
 
     Args:
         database: Database of the history.
@@ -59,26 +60,27 @@ class History:
     """
 
     def __init__(self, database: Database, *, days: int) -> None:
-        self._database, self._most = database, days * MINUTES_A_DAY
-        self._before: Snapshot | None = None
-        self._last: Estimate | None = None
-        self._span_s = 0.0  # to it from the one before
+        self._database, self._max_rows = database, days * MINUTES_A_DAY
+        self._last_snapshot: Snapshot | None = None
+        self._last_estimate: Estimate | None = None
+        self._last_interval_s = 0.0  # between the last two estimates
         self._open: MinuteAccumulator | None = None
-        self._minutes: deque[tuple[int, Minute]] = deque(maxlen=WAITING_MINUTES)  # with their numbers
+        # waiting rows and events with their numbers
+        self._minutes: deque[tuple[int, Minute]] = deque(maxlen=WAITING_MINUTES)
         self._events: deque[tuple[int, Event]] = deque(maxlen=WAITING_EVENTS)
-        self._run, self._number = secrets.token_hex(8), 0
+        self._run_id, self._number = secrets.token_hex(8), 0
         self._due = asyncio.Event()
         self._closing = False
         self._unpruned = MINUTES_A_DAY  # minutes since the last removal of old rows, which happens at the first one too
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
-        """Start to write."""
-        self._task = asyncio.create_task(self._stay_written(), name="history")
+        """Start the writing task."""
+        self._task = asyncio.create_task(self._write_repeatedly(), name="history")
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Write the minute that is open, too."""
+        """Write the waiting rows and the open minute."""
         if self._task is None:
             return
         self._close_minute()
@@ -88,13 +90,13 @@ class History:
         await self._task
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Take a snapshot; returns at once."""
+        """Record a snapshot without waiting for the disk."""
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
-        if happened := events(self._before, snapshot):
-            self._events.extend((self._next(), event) for event in happened)
+        if new_events := events(self._last_snapshot, snapshot):
+            self._events.extend((self._next_number(), event) for event in new_events)
             self._due.set()
-        self._before = snapshot
+        self._last_snapshot = snapshot
         if snapshot.estimate is not None:
             self._add(snapshot.estimate)
 
@@ -103,25 +105,25 @@ class History:
         if self._open is None or self._open.time_s != time_s:
             self._close_minute()
             self._open = MinuteAccumulator(time_s)
-        span_s = estimate.board_time_s - self._last.board_time_s if self._last else 0.0
-        self._open.add(estimate, seen(span_s, self._span_s))
-        self._last, self._span_s = estimate, span_s
+        interval_s = estimate.board_time_s - self._last_estimate.board_time_s if self._last_estimate else 0.0
+        self._open.add(estimate, measured_time(interval_s, self._last_interval_s))
+        self._last_estimate, self._last_interval_s = estimate, interval_s
 
     def _close_minute(self) -> None:
         row = self._open.row() if self._open else None
         self._open = None
         if row is not None:
-            self._minutes.append((self._next(), row))
+            self._minutes.append((self._next_number(), row))
             self._due.set()
 
-    def _next(self) -> int:
+    def _next_number(self) -> int:
         self._number += 1
         return self._number
 
-    async def _stay_written(self) -> None:
-        """Each minute and each event; what the disk does not take is tried with the next, or in a minute."""
+    async def _write_repeatedly(self) -> None:
+        """Write each minute and event. After a failure retry with the next one, or in a minute."""
         while not self._closing:
-            with contextlib.suppress(TimeoutError):  # without samples no minute ends
+            with contextlib.suppress(TimeoutError):  # without samples no minute ends, but a failed write is retried
                 async with asyncio.timeout(MINUTE_S):
                     await self._due.wait()
             self._due.clear()
@@ -130,23 +132,26 @@ class History:
         await self._write()
 
     async def _write(self) -> None:
-        """Write the waiting rows, skipping existing ones, because an earlier attempt may have been written."""
-        minutes, happened, last = list(self._minutes), list(self._events), self._number
-        if not minutes and not happened:
+        """Write the waiting rows. Skip those that a transaction with unknown result has written."""
+        minutes, waiting_events, last = list(self._minutes), list(self._events), self._number
+        if not minutes and not waiting_events:
             return
         prune = self._unpruned + len(minutes) > MINUTES_A_DAY
 
         def write(connection: sqlite3.Connection) -> None:
-            (there,) = connection.execute("SELECT max(number) FROM history_mark WHERE run = ?", (self._run,)).fetchone()
-            after = there or 0
-            for row in [row for number, row in minutes if number > after]:
-                connection.execute(_INSERT, row._replace(time_s=_second(connection, row)))
-            rows = [(epoch_s(event.time), event.name, event.text) for number, event in happened if number > after]
+            query = "SELECT max(number) FROM history_mark WHERE run = ?"
+            (marked,) = connection.execute(query, (self._run_id,)).fetchone()
+            written = marked or 0
+            for row in [row for number, row in minutes if number > written]:
+                connection.execute(_INSERT, row._replace(time_s=_row_time(connection, row)))
+            rows = [
+                (epoch_s(event.time), event.name, event.text) for number, event in waiting_events if number > written
+            ]
             connection.executemany("INSERT INTO event (time_s, name, text) VALUES (?, ?, ?)", rows)
             connection.execute("DELETE FROM history_mark")
-            connection.execute("INSERT INTO history_mark VALUES (?, ?)", (self._run, last))
+            connection.execute("INSERT INTO history_mark VALUES (?, ?)", (self._run_id, last))
             if prune:
-                _prune(connection, self._most)
+                _prune(connection, self._max_rows)
 
         try:
             await self._database.call(write)
@@ -157,13 +162,16 @@ class History:
         self._unpruned = 0 if prune else self._unpruned + len(minutes)
 
 
-def _second(connection: sqlite3.Connection, row: Minute) -> int:
-    """Return the timestamp of a row: its minute, or a second later if the clock went through that minute before."""
-    for second in range(row.time_s, row.time_s + MINUTE_S):
-        there = connection.execute("SELECT seen_s FROM minute WHERE time_s = ?", (second,)).fetchone()
-        if there is None or there[0] + row.seen_s <= MINUTE_S:
+def _row_time(connection: sqlite3.Connection, row: Minute) -> int:
+    """Return the timestamp of a row: the start of its minute, or some seconds later if the clock was set back.
+
+    Two rows of a minute that hold more than a minute together come from different passes of the clock.
+    """
+    for time_s in range(row.time_s, row.time_s + MINUTE_S):
+        existing = connection.execute("SELECT seen_s FROM minute WHERE time_s = ?", (time_s,)).fetchone()
+        if existing is None or existing[0] + row.seen_s <= MINUTE_S:
             break
-    return second
+    return time_s
 
 
 def _remove(waiting: deque[tuple[int, Row]], last: int) -> None:
@@ -172,13 +180,13 @@ def _remove(waiting: deque[tuple[int, Row]], last: int) -> None:
         waiting.popleft()
 
 
-def _prune(connection: sqlite3.Connection, most: int) -> None:
-    """Leave the newest: by number and not by the clock, for one that jumps ahead must not cost all there is."""
+def _prune(connection: sqlite3.Connection, max_rows: int) -> None:
+    """Delete all but the newest rows. The number of rows decides, because a clock that jumps ahead would delete all."""
     oldest = connection.execute(
-        "SELECT time_s FROM minute ORDER BY time_s DESC LIMIT 1 OFFSET ?", (most - 1,)
+        "SELECT time_s FROM minute ORDER BY time_s DESC LIMIT 1 OFFSET ?", (max_rows - 1,)
     ).fetchone()
     if oldest is not None:
         connection.execute("DELETE FROM minute WHERE time_s < ?", oldest)
         connection.execute("DELETE FROM event WHERE time_s < ?", oldest)
-    beyond = "SELECT number FROM event ORDER BY number DESC LIMIT 1 OFFSET ?"
-    connection.execute(f"DELETE FROM event WHERE number <= ({beyond})", (MAX_EVENTS,))  # noqa: S608
+    newest_excess = "SELECT number FROM event ORDER BY number DESC LIMIT 1 OFFSET ?"
+    connection.execute(f"DELETE FROM event WHERE number <= ({newest_excess})", (MAX_EVENTS,))  # noqa: S608

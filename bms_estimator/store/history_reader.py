@@ -1,4 +1,4 @@
-"""Reading a pack's history, while the service writes it or not."""
+"""Reader of a pack's history, also while the service writes it."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ _SUMMED = "sum(charge_out_ah), sum(charge_in_ah), sum(energy_out_wh), sum(energy
 
 
 class PastEvent(NamedTuple):
-    """Something that happened."""
+    """Event in a pack's history."""
 
     time_s: float
     """Seconds since 1970."""
@@ -23,27 +23,28 @@ class PastEvent(NamedTuple):
 
 
 class HistoryFile:
-    """A pack's history.
+    """History database of a pack, opened read-only.
 
     Args:
-        path: The database of the service.
+        path: Database file of the service.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def rows(self, since_s: float, until_s: float, step_s: int) -> list[Minute]:
-        """Minutes put together, those without a publication left out.
+        """Return rows of ``step_s``, aggregated from one-minute rows; intervals without publications are left out.
 
         Args:
             since_s: Start time [s since 1970].
-            until_s: To before [s since 1970].
-            step_s: Length of a row [s], whole minutes; one minute has two rows if the clock went through it twice.
+            until_s: End time, exclusive [s since 1970].
+            step_s: Length of a row [s], whole minutes. With 60 s, a minute that a clock set back has repeated gives
+                two rows.
 
         Raises:
-            UserError: It cannot be read.
+            UserError: The history cannot be read.
         """
-        begin = "time_s" if step_s == MINUTE_S else "time_s / :step * :step"  # rows of one minute stay apart
+        begin = "time_s" if step_s == MINUTE_S else "time_s / :step * :step"
         columns = f"{begin}, {_mean('voltage', 'v')}, {_mean('current', 'a')}, {_mean('temperature', 'c')}"
         grouped = (
             f"SELECT {columns}, {_SUMMED}, max(time_s) AS last_s FROM minute "  # noqa: S608 - names of ours
@@ -51,18 +52,18 @@ class HistoryFile:
         )
         query = f"SELECT g.*, m.soc, m.soc_std FROM ({grouped}) AS g JOIN minute AS m ON m.time_s = g.last_s ORDER BY 1"  # noqa: S608
         with self._reading() as connection:
-            found = connection.execute(query, {"since": since_s, "until": until_s, "step": step_s}).fetchall()
-        return [Minute._make((*row[:10], *row[-2:], *row[10:16])) for row in found]
+            rows = connection.execute(query, {"since": since_s, "until": until_s, "step": step_s}).fetchall()
+        return [Minute._make((*row[:10], *row[-2:], *row[10:16])) for row in rows]
 
     def events(self, since_s: float, until_s: float) -> list[PastEvent]:
-        """Yield the events, oldest first.
+        """Return the events, oldest first.
 
         Args:
             since_s: Start time [s since 1970].
-            until_s: To before [s since 1970].
+            until_s: End time, exclusive [s since 1970].
 
         Raises:
-            UserError: It cannot be read.
+            UserError: The history cannot be read.
         """
         query = "SELECT time_s, name, text FROM event WHERE time_s >= ? AND time_s < ? ORDER BY time_s, number"
         with self._reading() as connection:
@@ -86,6 +87,6 @@ class HistoryFile:
 
 def _mean(quantity: str, unit: str) -> str:
     """Return SQL of mean and extremes of a quantity over one-minute rows."""
-    mean, least, most = (f"{quantity}_{part}{unit}" for part in ("", "min_", "max_"))
+    mean, minimum, maximum = (f"{quantity}_{part}{unit}" for part in ("", "min_", "max_"))
     weight = f"sum(CASE WHEN {mean} IS NULL THEN 0 ELSE publications END)"
-    return f"sum({mean} * publications) / {weight}, min({least}), max({most})"
+    return f"sum({mean} * publications) / {weight}, min({minimum}), max({maximum})"

@@ -1,4 +1,4 @@
-"""The tables of a pack's database, and how older ones become them."""
+"""Tables of a pack's database, and migrations from older versions."""
 
 import contextlib
 import functools
@@ -37,32 +37,32 @@ MIGRATIONS = (
 
 
 class NewerVersionError(Exception):
-    """A later version wrote this database."""
+    """The database was written by a later version of the program."""
 
 
 class OtherTablesError(Exception):
-    """The tables are not those that were made."""
+    """The tables differ from those that the migrations create."""
 
 
 def migrate(connection: sqlite3.Connection, migrations: tuple[str, ...] = MIGRATIONS) -> None:
-    """Bring a database to this version; a new one is empty.
+    """Migrate a database to the latest version. An empty database has version 0.
 
     Args:
-        connection: To the database.
-        migrations: What makes its tables, as ``MIGRATIONS``.
+        connection: Connection to the database.
+        migrations: Statements of each version, as ``MIGRATIONS``.
 
     Raises:
-        NewerVersionError: It is beyond this version.
-        OtherTablesError: The tables were changed.
-        sqlite3.Error: It cannot be read or written.
+        NewerVersionError: The database has a later version.
+        OtherTablesError: The tables differ from those that the migrations create.
+        sqlite3.Error: The database cannot be read or written.
     """
     (version,) = connection.execute("PRAGMA user_version").fetchone()
     if version > len(migrations):
         raise NewerVersionError(f"version {version}, this program knows {len(migrations)}")
     for number, script in enumerate(migrations[version:], start=version + 1):
         connection.executescript(f"BEGIN IMMEDIATE; {script} PRAGMA user_version = {number}; COMMIT;")
-    if not _wanted(migrations) <= _tables(connection):
-        raise OtherTablesError("its tables are not those that were made")
+    if not _expected_tables(migrations) <= _tables(connection):
+        raise OtherTablesError("its tables differ from those of this version")
 
 
 def _tables(connection: sqlite3.Connection) -> frozenset[tuple[str, str]]:
@@ -70,7 +70,7 @@ def _tables(connection: sqlite3.Connection) -> frozenset[tuple[str, str]]:
 
 
 @functools.cache
-def _wanted(migrations: tuple[str, ...]) -> frozenset[tuple[str, str]]:
+def _expected_tables(migrations: tuple[str, ...]) -> frozenset[tuple[str, str]]:
     with contextlib.closing(sqlite3.connect(":memory:")) as connection:
         connection.executescript("".join(migrations))
         return _tables(connection)

@@ -1,4 +1,4 @@
-"""A minute of a pack: means, extremes and sums of its publications. Pure."""
+"""One-minute row of a pack: means, extremes and sums of its publications. Pure."""
 
 import math
 from dataclasses import dataclass, field
@@ -8,17 +8,17 @@ from typing import NamedTuple
 from bms_estimator.model.payloads import Estimate
 
 MINUTE_S = 60
-MAX_S = 30.0
-"""Longest interval between two publications that is not a gap; over a gap no charge is counted [s]."""
+MAX_INTERVAL_S = 30.0
+"""Maximum interval between two publications that is never a gap [s]. No charge is counted over a gap."""
 GAP_RATIO = 3.0
-"""An interval counts as a gap if it is this many times as long as the one before, so that a slow source has none."""
+"""Maximum ratio of an interval to the previous one that is not a gap, so that a slow source has no gaps."""
 
 
 class Minute(NamedTuple):
-    """One row of history; None for missing values. Means and extremes are over published values."""
+    """One row of history; None for missing values. Means and extremes are taken over published values."""
 
     time_s: int
-    """Beginning of the minute [s since 1970]."""
+    """Start of the minute [s since 1970]."""
     voltage_v: float
     voltage_min_v: float
     voltage_max_v: float
@@ -30,7 +30,7 @@ class Minute(NamedTuple):
     temperature_min_c: float | None
     temperature_max_c: float | None
     soc: float | None
-    """The last, 0..1."""
+    """Last published SOC, 0..1."""
     soc_std: float | None
     charge_out_ah: float
     charge_in_ah: float
@@ -43,27 +43,27 @@ class Minute(NamedTuple):
 
 @dataclass
 class _Mean:
-    """Mean of one quantity."""
+    """Mean and extremes of one quantity."""
 
     count: int = 0
     total: float = 0.0
-    least: float = math.inf
-    most: float = -math.inf
+    minimum: float = math.inf
+    maximum: float = -math.inf
 
     def add(self, value: float | None) -> None:
         if value is not None:
             self.count += 1
             self.total += value
-            self.least, self.most = min(self.least, value), max(self.most, value)
+            self.minimum, self.maximum = min(self.minimum, value), max(self.maximum, value)
 
     @property
     def values(self) -> tuple[float, float, float]:
-        return self.total / self.count, self.least, self.most
+        return self.total / self.count, self.minimum, self.maximum
 
 
 @dataclass
 class MinuteAccumulator:
-    """The open minute; ``time_s`` is its begin [s since 1970]."""
+    """Accumulator of the open minute, which starts at ``time_s`` [s since 1970]."""
 
     time_s: int
     _voltage: _Mean = field(default_factory=_Mean)
@@ -75,7 +75,7 @@ class MinuteAccumulator:
     _seen_s: float = 0.0
 
     def add(self, estimate: Estimate, seen_s: float) -> None:
-        """Take a publication; ``seen_s`` is the time since the one before, as ``seen`` has it [s]."""
+        """Add a publication. ``seen_s`` is the measured time since the previous one, from ``measured_time`` [s]."""
         self._voltage.add(estimate.voltage_v)
         self._current.add(estimate.current_a)
         self._temperature.add(estimate.temperature_c)
@@ -96,21 +96,21 @@ class MinuteAccumulator:
         return Minute._make((self.time_s, *measured, *temperature, self._last.soc, self._last.soc_std, *sums))
 
 
-def seen(span_s: float, before_s: float) -> float:
-    """Return the measured part of the time between two publications [s]: nothing of a gap.
+def measured_time(interval_s: float, previous_s: float) -> float:
+    """Return the time between two publications [s], or 0 if it is a gap or the clock went back.
 
     Args:
-        span_s: Time between the two on the board's clock [s].
-        before_s: Time between the previous two [s].
+        interval_s: Time between the two on the board's clock [s].
+        previous_s: Time between the previous two [s].
     """
-    return span_s if 0.0 < span_s <= max(MAX_S, GAP_RATIO * before_s) else 0.0
+    return interval_s if 0.0 < interval_s <= max(MAX_INTERVAL_S, GAP_RATIO * previous_s) else 0.0
 
 
 def epoch_s(time: str) -> float:
-    """Seconds since 1970 of a published time."""
+    """Convert a published time to seconds since 1970."""
     return datetime.fromisoformat(time).timestamp()
 
 
 def minute_of(epoch: float) -> int:
-    """Begin of the minute [s since 1970]."""
+    """Return the start of the minute [s since 1970]."""
     return int(epoch // MINUTE_S) * MINUTE_S

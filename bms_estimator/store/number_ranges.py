@@ -1,14 +1,14 @@
-"""Numbers in ascending order, stored as runs without a gap: a day of them is one run. Pure."""
+"""Ascending numbers, stored as contiguous ranges: messages of a day take one range. Pure."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
 
 
 class NumberRanges:
-    """Numbers that are taken at the front and put at the back.
+    """Ascending queue of numbers, stored as ranges.
 
     Args:
-        runs: Each after the one before.
+        runs: Disjoint ranges in ascending order.
     """
 
     def __init__(self, runs: Iterable[range] = ()) -> None:
@@ -32,11 +32,11 @@ class NumberRanges:
 
     @property
     def end(self) -> int:
-        """One after the highest."""
+        """The highest number plus one."""
         return self._runs[-1].stop
 
     def add(self, number: int) -> None:
-        """Put the highest number."""
+        """Append a number, which must exceed all others."""
         if self._runs and self._runs[-1].stop == number:
             self._runs[-1] = range(self._runs[-1].start, number + 1)
         else:
@@ -44,7 +44,7 @@ class NumberRanges:
         self._count += 1
 
     def pop(self) -> int:
-        """Take the lowest number."""
+        """Remove and return the lowest number."""
         run = self._runs.popleft()
         if len(run) > 1:
             self._runs.appendleft(run[1:])
@@ -52,16 +52,16 @@ class NumberRanges:
         return run.start
 
     def take_before(self, end: int) -> "NumberRanges":
-        """Take all that are below ``end``."""
+        """Remove and return all numbers below ``end``."""
         taken = NumberRanges(range(run.start, min(run.stop, end)) for run in self._runs)
         rest = NumberRanges(range(max(run.start, end), run.stop) for run in self._runs)
         self._runs, self._count = rest._runs, rest._count
         return taken
 
-    def moved(self, by: int) -> "NumberRanges":
+    def shifted(self, by: int) -> "NumberRanges":
         """Return the ranges with each number increased by ``by``."""
         return NumberRanges(range(run.start + by, run.stop + by) for run in self._runs)
 
-    def both(self, other: "NumberRanges") -> "NumberRanges":
+    def intersection(self, other: "NumberRanges") -> "NumberRanges":
         """Return the intersection of two sets of ranges."""
         return NumberRanges(range(max(a.start, b.start), min(a.stop, b.stop)) for a in self._runs for b in other)

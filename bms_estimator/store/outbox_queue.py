@@ -1,7 +1,7 @@
-"""The order of what waits for the broker, in memory and on disk. Pure: no disk, no clock, no task.
+"""Order of queued messages, in memory and on disk. Pure: no disk, no clock, no task.
 
-From the oldest to the newest, a message is sent (``in_flight``), ready to be sent, on disk only (``stored``), or in
-the tail of the newest. While the broker accepts messages, none goes beyond ready.
+From the oldest to the newest, messages are ``in_flight`` (sent and not acknowledged), ready to be sent, ``stored`` (on
+disk only), or in the tail. New messages enter the tail. While none is stored, messages are sent from the tail.
 """
 
 from collections import deque
@@ -12,29 +12,28 @@ from itertools import chain
 from bms_estimator.mqtt.message import Message, QueuedMessage
 from bms_estimator.store.number_ranges import NumberRanges
 
-MEMORY_MOST = 4096
-"""Messages of the tail: some megabytes, and an hour of states for a disk that cannot be written."""
+MAX_TAIL = 4096
+"""Maximum number of messages in the tail: some megabytes, or an hour of states while the disk cannot be written."""
 PAGE = 1000
-"""Messages that are ready; the next ones are read from disk once half of them are gone."""
-
+"""Maximum number of ready messages. The next page is read from disk once fewer than half of them are left."""
 
 LOWEST = -(1 << 62)
 """Number below all others, here and on disk."""
 
 
 @dataclass
-class Queue:
-    """Messages in order.
+class OutboxQueue:
+    """Queue of numbered messages.
 
     Attributes:
-        most: Maximum number of stored messages; beyond it the oldest one not in flight is dropped.
-        dropped: Messages that found no room.
-        next: The number of the next message.
-        in_flight: Sent and not yet acknowledged.
-        stale: True if the disk may contain messages that are not queued any more.
+        most: Maximum number of queued messages; beyond it the oldest one not in flight is dropped.
+        dropped: Number of dropped and lost messages.
+        next: Number of the next message.
+        in_flight: Messages that were taken and are not acknowledged yet.
+        stale: True if the disk may contain messages that are no longer queued.
         disk_state_known: True if the content of the disk is known; if not, the messages in memory are written again.
-        stored: Messages on disk only.
-        skip_disk: Return the newest messages although older ones are on disk, which cannot be read.
+        stored: Numbers of the messages that are on disk only.
+        skip_disk: True to take messages of the tail before stored ones, because the disk cannot be read.
     """
 
     most: int
@@ -47,44 +46,44 @@ class Queue:
     stored: NumberRanges = field(default_factory=NumberRanges)
     _ready: deque[QueuedMessage] = field(default_factory=deque)
     _tail: deque[QueuedMessage] = field(default_factory=deque)
-    _written: set[int] = field(default_factory=set)  # in memory, and on disk as well
+    _written: set[int] = field(default_factory=set)  # numbers of messages in memory that are also on disk
 
     @property
     def waiting(self) -> int:
-        """Messages that are not acknowledged."""
+        """Number of messages that are not acknowledged."""
         return len(self.in_flight) + len(self._ready) + len(self.stored) + len(self._tail)
 
     @property
     def oldest(self) -> int | None:
-        """The lowest number that waits."""
+        """Lowest number of a message that is not acknowledged; None if the queue is empty."""
         if self.stored and not self.in_flight and not self._ready:
             return self.stored.first
         return next((waiting.number for waiting in self._in_memory()), None)
 
     @property
-    def can_hand_out(self) -> bool:
+    def can_take(self) -> bool:
         """True if ``take_next`` returns a message."""
         return bool(self._ready or (self._tail and (self.skip_disk or not self.stored)))
 
     @property
     def needs_page(self) -> bool:
-        """True if messages should be read from disk."""
+        """True if the next page should be read from disk."""
         return bool(self.stored) and len(self._ready) < PAGE // 2
 
     def put(self, message: Message) -> None:
-        """Take the newest message."""
+        """Append a message."""
         self._tail.append(QueuedMessage(self.next, message))
         self.next += 1
         if self.waiting > self.most:
             self._drop_oldest()
-        if len(self._tail) > MEMORY_MOST:
+        if len(self._tail) > MAX_TAIL:
             self._forget(self._tail.popleft().number)
             self.dropped += 1
 
     def take_next(self, most: int) -> list[QueuedMessage]:
-        """Up to ``most`` of the oldest."""
+        """Return up to ``most`` of the oldest messages in memory, which are then in flight."""
         taken: list[QueuedMessage] = []
-        while len(taken) < most and self.can_hand_out:
+        while len(taken) < most and self.can_take:
             taken.append((self._ready or self._tail).popleft())
         self.in_flight |= {waiting.number: waiting for waiting in taken}
         return taken
@@ -95,7 +94,7 @@ class Queue:
             self._forget(number)
 
     def rewind(self) -> None:
-        """Nothing is on its way any more."""
+        """Make the messages in flight ready again."""
         self._ready.extendleft(reversed(self.in_flight.values()))
         self.in_flight.clear()
 
@@ -105,30 +104,31 @@ class Queue:
             waiting for waiting in self._in_memory() if not self.disk_state_known or waiting.number not in self._written
         ]
 
-    def writing(self, rows: Iterable[QueuedMessage]) -> None:
-        """Record that these messages may be on disk from now on."""
+    def mark_writing(self, rows: Iterable[QueuedMessage]) -> None:
+        """Record that messages may be on disk from now on."""
         self._written.update(waiting.number for waiting in rows)
 
-    def wrote(self) -> None:
-        """Record that the pending messages are on disk; of the tail, keep the ready ones in memory."""
+    def mark_written(self) -> None:
+        """Move the written messages out of the tail: they become ready up to a page, and stored beyond it."""
         while self._tail and self._tail[0].number in self._written:
-            newest = self._tail.popleft()
+            oldest = self._tail.popleft()
             if not self.stored and len(self._ready) < PAGE:
-                self._ready.append(newest)
+                self._ready.append(oldest)
             else:
-                self._written.discard(newest.number)
-                self.stored.add(newest.number)
+                self._written.discard(oldest.number)
+                self.stored.add(oldest.number)
 
-    def loaded(self, rows: Iterable[QueuedMessage], end: int) -> None:
-        """Take over messages read from disk; those before ``end`` that are missing are lost."""
+    def add_page(self, rows: Iterable[QueuedMessage], end: int) -> None:
+        """Make messages read from disk ready; stored ones before ``end`` that are missing are lost."""
         wanted = self.stored.take_before(end)
-        read = {waiting.number: waiting for waiting in rows if waiting.number in wanted}  # some were dropped meanwhile
+        # the page may contain messages that were dropped while it was read
+        read = {waiting.number: waiting for waiting in rows if waiting.number in wanted}
         self._ready.extend(read.values())
         self._written.update(read)
         self._lose(len(wanted) - len(read))
 
-    def found(self, runs: NumberRanges) -> int:
-        """Take over messages that an earlier run left on disk; they precede all that were not handed out.
+    def prepend_backlog(self, runs: NumberRanges) -> int:
+        """Insert messages that an earlier run left on disk before all messages of this run.
 
         Args:
             runs: Message numbers on disk.
@@ -136,28 +136,28 @@ class Queue:
         Returns:
             Offset from the numbers on disk to those of the queue.
         """
-        first = self._tail[0].number if self._tail else self.next
+        first = self._tail[0].number if self._tail else self.next  # no message was taken before the backlog was read
         if not runs:
             return -first
         span = runs.end - runs.first
         self._tail = deque(QueuedMessage(waiting.number + span, waiting.message) for waiting in self._tail)
         self.next += span
-        self.stored = runs.moved(first - runs.first)
+        self.stored = runs.shifted(first - runs.first)
         for _ in range(self.waiting - self.most):
             self._drop_oldest()
         return runs.first - first
 
-    def left(self, runs: NumberRanges) -> None:
-        """Keep only the messages in ``runs`` of those that are only on disk; the others are lost."""
+    def retain_stored(self, runs: NumberRanges) -> None:
+        """Keep only those stored messages that are in ``runs``; the others are lost."""
         before = len(self.stored)
-        self.stored = self.stored.both(runs)
+        self.stored = self.stored.intersection(runs)
         self._lose(before - len(self.stored))
 
     def gaps(self) -> list[tuple[int, int]]:
-        """Yield ranges of numbers that are not stored and never will be again."""
-        kept = [range(waiting.number, waiting.number + 1) for waiting in self._in_memory()]
+        """Return ranges of numbers that are no longer queued, as half-open intervals."""
+        in_memory = [range(waiting.number, waiting.number + 1) for waiting in self._in_memory()]
         gaps, begin = [], LOWEST
-        for run in sorted([*kept, *self.stored], key=lambda run: run.start):
+        for run in sorted([*in_memory, *self.stored], key=lambda run: run.start):
             if begin < run.start:
                 gaps.append((begin, run.start))
             begin = run.stop
@@ -167,13 +167,13 @@ class Queue:
         return chain(self.in_flight.values(), self._ready, self._tail)
 
     def _forget(self, number: int) -> None:
-        """Mark a message on disk as no longer needed."""
+        """Record that the disk contains a message that is no longer queued, if it was written."""
         if number in self._written:
             self._written.discard(number)
             self.stale = True
 
     def _lose(self, count: int) -> None:
-        """Drop messages that are only on an unreadable disk, and mark what may remain there as not needed."""
+        """Count stored messages that cannot be read. Their rows may still exist and are deleted later."""
         if count:
             self.dropped += count
             self.stale = True

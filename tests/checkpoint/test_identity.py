@@ -1,4 +1,4 @@
-"""Identities that saved files depend on. A refactoring that changes one would discard every pack's state."""
+"""Identities of saved files. A refactoring that changes an identity would discard every pack's state."""
 
 from pathlib import Path
 from typing import Any
@@ -52,5 +52,5 @@ def test_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
     checkpoint.path.write_bytes(FILE.read_bytes())
     restored = checkpoint.load()
     assert restored.reason == ""
-    assert restored.ledger.restarts == 4
+    assert restored.counters.restarts == 4
     assert restored.state["observer.soc"][0] == 0.3709922542638329

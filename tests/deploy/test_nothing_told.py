@@ -40,7 +40,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     authority = Authority(tmp_path)
     for name in ("server", "pack"):
-        authority.vouch_for(name)
+        authority.sign(name)
     files = f"cafile {tmp_path}/ca.crt\ncertfile {tmp_path}/server.crt\nkeyfile {tmp_path}/server.key\n"
     broker = Broker(tmp_path, f"{files}require_certificate true\nallow_anonymous true").start()
     yield broker

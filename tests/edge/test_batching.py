@@ -1,4 +1,4 @@
-"""Samples divided into blocks: none lost or repeated."""
+"""Division of samples into blocks, without loss or repetition."""
 
 import numpy as np
 from hypothesis import given
@@ -9,30 +9,30 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 
 def samples(times_s: np.ndarray) -> SampleBlock:
-    made = np.zeros(times_s.size, dtype=SAMPLE)
-    made["time_s"] = times_s
-    return made
+    rows = np.zeros(times_s.size, dtype=SAMPLE)
+    rows["time_s"] = times_s
+    return rows
 
 
-def test_a_minute_at_one_a_second_is_sixty_samples() -> None:
-    gathering = Batcher(60.0)
-    blocks = [block for t in range(181) for block in gathering.add(samples(np.array([float(t)])), t + 0.5)]
+def test_a_minute_at_1_hz_is_60_samples() -> None:
+    batcher = Batcher(60.0)
+    blocks = [block for t in range(181) for block in batcher.add(samples(np.array([float(t)])), t + 0.5)]
     assert [block.samples.size for block in blocks] == [60, 60, 60]
     assert [block.arrival_s for block in blocks] == [59.5, 119.5, 179.5]
-    assert [block.samples.size for block in gathering.cut()] == [1]
-    assert gathering.cut() == []
+    assert [block.samples.size for block in batcher.cut()] == [1]
+    assert batcher.cut() == []
 
 
 @given(st.lists(st.lists(st.floats(0.0, 30.0), max_size=40), max_size=20), st.integers(1, 7))
-def test_what_comes_goes_on_in_order(reads: list[list[float]], most: int) -> None:
-    gathering, time_s, given_s, blocks = Batcher(20.0, most), 0.0, [], []
+def test_blocks_contain_all_samples_in_order(reads: list[list[float]], most: int) -> None:
+    batcher, time_s, added_s, blocks = Batcher(20.0, most), 0.0, [], []
     for steps in reads:
         times_s = time_s + np.cumsum(steps)
         time_s = times_s[-1] if times_s.size else time_s
-        given_s.append(times_s)
-        blocks += gathering.add(samples(times_s), time_s)
-    blocks += gathering.cut()
+        added_s.append(times_s)
+        blocks += batcher.add(samples(times_s), time_s)
+    blocks += batcher.cut()
     assert all(1 <= block.samples.size <= most for block in blocks)
     assert all(np.ptp(block.samples["time_s"]) < 20.0 for block in blocks)
-    gone = [block.samples["time_s"] for block in blocks]
-    assert np.concatenate([*gone, []]).tolist() == np.concatenate([*given_s, []]).tolist()
+    divided = [block.samples["time_s"] for block in blocks]
+    assert np.concatenate([*divided, []]).tolist() == np.concatenate([*added_s, []]).tolist()

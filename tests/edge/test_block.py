@@ -1,4 +1,4 @@
-"""The bytes of a block."""
+"""Binary format of a block."""
 
 import contextlib
 import struct
@@ -31,50 +31,50 @@ BLOCK = Block(1_700_000_000_000_000_000, 7, 3, 1.7e9, samples())
         elements=st.tuples(*(st.floats(width=64) for _ in range(4)), st.integers(0, 2**32 - 1)),
     )
 )
-def test_every_bit_of_a_sample_comes_through(rows: SampleBlock) -> None:
-    came = decode(encode(Block(1, 1, 1, 0.0, rows))).samples
+def test_samples_are_encoded_bit_for_bit(rows: SampleBlock) -> None:
+    decoded = decode(encode(Block(1, 1, 1, 0.0, rows))).samples
     for name in SAMPLE.names or ():
-        assert came[name].tobytes() == rows[name].tobytes()
+        assert decoded[name].tobytes() == rows[name].tobytes()
 
 
-def test_its_header_comes_through() -> None:
-    came = decode(encode(BLOCK))
-    assert (came.store, came.number, came.oldest, came.arrival_s) == (BLOCK.store, 7, 3, 1.7e9)
+def test_header_is_encoded() -> None:
+    decoded = decode(encode(BLOCK))
+    assert (decoded.store, decoded.number, decoded.oldest, decoded.arrival_s) == (BLOCK.store, 7, 3, 1.7e9)
 
 
-def test_a_minute_at_an_even_pace_is_small() -> None:
+def test_a_minute_at_a_constant_period_takes_few_bytes() -> None:
     assert len(encode(BLOCK)) < 200
 
 
 @pytest.mark.parametrize("count", [0, MAX_SAMPLES + 1])
-def test_no_block_is_empty_or_too_long(count: int) -> None:
+def test_empty_and_long_blocks_are_not_encoded(count: int) -> None:
     with pytest.raises(ValueError, match=f"{count} samples in a block"):
         encode(Block(1, 1, 1, 0.0, samples(count)))
 
 
 @given(st.binary(max_size=200))
-def test_bytes_that_are_no_block_are_refused(data: bytes) -> None:
-    for one in (data, b"BMSB" + data, encode(BLOCK)[:40] + data):
+def test_invalid_bytes_are_rejected(data: bytes) -> None:
+    for invalid in (data, b"BMSB" + data, encode(BLOCK)[:40] + data):
         with pytest.raises(BlockError):
-            decode(one)
+            decode(invalid)
 
 
 @given(st.integers(0), st.integers(1, 255))
-def test_a_damaged_block_is_refused_or_of_the_same_size(place: int, change: int) -> None:
+def test_damaged_block_is_rejected_or_keeps_its_size(place: int, change: int) -> None:
     data = bytearray(encode(BLOCK))
     data[place % len(data)] ^= change
     with contextlib.suppress(BlockError):
         assert decode(bytes(data)).samples.size == BLOCK.samples.size
 
 
-def test_what_follows_a_block_is_refused() -> None:
-    with pytest.raises(BlockError, match="not that of 60 samples"):
+def test_bytes_after_a_block_are_rejected() -> None:
+    with pytest.raises(BlockError, match="does not hold 60 samples"):
         decode(encode(BLOCK) + b"more")
 
 
-def test_a_body_that_would_fill_the_memory_is_not_unpacked() -> None:
+def test_decompression_is_bounded() -> None:
     header = encode(BLOCK)[:40]
-    with pytest.raises(BlockError, match="not that of 60 samples"):
+    with pytest.raises(BlockError, match="does not hold 60 samples"):
         decode(header + zlib.compress(bytes(50_000_000)))
 
 
@@ -82,13 +82,13 @@ def test_a_body_that_would_fill_the_memory_is_not_unpacked() -> None:
     ("store", "number", "oldest", "arrival_s"),
     [(0, 1, 1, 0.0), (1, 0, 0, 0.0), (1, 2, 3, 0.0), (1, 2**63, 1, 0.0), (1, 1, 0, 0.0), (1, 1, 1, np.nan)],
 )
-def test_numbers_that_cannot_be_are_refused(store: int, number: int, oldest: int, arrival_s: float) -> None:
+def test_implausible_header_is_rejected(store: int, number: int, oldest: int, arrival_s: float) -> None:
     header = struct.pack("<4sBxHQQQd", b"BMSB", 1, 60, store, number, oldest, arrival_s)
-    with pytest.raises(BlockError, match="cannot be"):
+    with pytest.raises(BlockError, match="implausible header"):
         decode(header + encode(BLOCK)[40:])
 
 
-def test_a_later_version_is_refused_by_its_number() -> None:
+def test_later_version_is_rejected() -> None:
     data = bytearray(encode(BLOCK))
     data[4] = 2
     with pytest.raises(BlockError, match="version 2; this program reads version 1"):

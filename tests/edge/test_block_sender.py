@@ -1,4 +1,4 @@
-"""An edge and the real server: after any fault the samples in the order of their blocks are those taken."""
+"""Block sender with a real server: under all faults the received samples equal those sent, in order."""
 
 import asyncio
 import contextlib
@@ -25,6 +25,7 @@ from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S
 
 WALL_S = 1.7e9
+"""Wall clock at the start [s since 1970]."""
 SETTINGS = {"block_s": 60.0, "store_mib": 1.0}
 
 
@@ -42,7 +43,7 @@ async def receiver(engine: Engine, request: pytest.FixtureRequest) -> AsyncItera
 
 
 class Feed:
-    """An edge, and samples at one a second by clocks that the test turns."""
+    """Block sender with one sample a second, by clocks that the test advances."""
 
     def __init__(self, receiver: Receiver, folder: Path, url: str, **settings: float) -> None:
         self.now_s, self._count, self._reads = 0.0, 0, list[SampleBlock]()
@@ -58,7 +59,7 @@ class Feed:
             handover_s=LONG_S,
         )
 
-    def give(self, minutes: float) -> None:
+    def add(self, minutes: float) -> None:
         for _ in range(round(60 * minutes)):
             sample = np.zeros(1, dtype=SAMPLE)
             sample["time_s"], sample["voltage_v"] = self.now_s, 3.0 + 1e-6 * self._count
@@ -72,15 +73,15 @@ class Feed:
     def count(self) -> int:
         return self._count
 
-    async def all_came(self) -> None:
-        """All that was given, without the block that is open: to the last bit, once and in order."""
-        ended = self._count - len(self.edge._gathering)
-        await self.receiver.until(ended)
-        assert same(self.receiver.samples, np.concatenate(self._reads[:ended]))
+    async def assert_all_received(self) -> None:
+        """Check that all samples of completed blocks have arrived bit for bit, once and in order."""
+        completed = self._count - len(self.edge._batcher)
+        await self.receiver.until(completed)
+        assert equal(self.receiver.samples, np.concatenate(self._reads[:completed]))
 
 
-def same(some: SampleBlock, others: SampleBlock) -> bool:
-    """Return whether both are equal to the last bit; padding between the columns does not count."""
+def equal(some: SampleBlock, others: SampleBlock) -> bool:
+    """Return True if both are equal bit for bit, apart from padding between the columns."""
     return all(some[name].tobytes() == others[name].tobytes() for name in SAMPLE.names or ())
 
 
@@ -94,107 +95,105 @@ async def until(condition) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_samples_come_in_blocks_and_the_last_one_at_a_clean_stop(
+async def test_samples_arrive_in_blocks_and_the_open_one_at_shutdown(
     receiver: Receiver, engine: Engine, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
-        feed.give(30.5)
+        feed.add(30.5)
         await receiver.until(30 * 60)
-        await until(lambda: feed.edge.store.oldest > 20)  # the worker has said so
-    await feed.all_came()
+        await until(lambda: feed.edge.store.oldest > 20)  # the worker has confirmed 20 blocks
+    await feed.assert_all_received()
     assert [block.number for block in receiver.blocks] == list(range(1, 32))
     assert {block.samples.size for block in receiver.blocks[:-1]} == {60}
     assert receiver.blocks[-1].arrival_s == WALL_S + feed.now_s - 1.0
     assert (receiver.resends, receiver.gaps, feed.edge.store.dropped) == (0, 0, 0)
 
 
-async def test_a_link_that_is_cut_costs_nothing(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+async def test_no_sample_is_lost_by_a_cut_connection(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
     async with Proxy(engine.mqtt_port) as network:
         feed = Feed(receiver, tmp_path, network.url)
         async with feed.edge:
-            feed.give(5)
-            await feed.all_came()
+            feed.add(5)
+            await feed.assert_all_received()
             for _ in range(3):
                 network.leave()
-                feed.give(40)
+                feed.add(40)
                 await until(lambda: not feed.edge.store.connected)
                 network.away = False
-                feed.give(1)
-                await feed.all_came()
+                feed.add(1)
+                await feed.assert_all_received()
         assert feed.edge.delivery.losses == 3
 
 
-async def test_a_store_that_must_be_later_than_the_clock_goes_on_at_the_same_pace(
+async def test_samples_keep_their_period_in_a_store_later_than_the_clock(
     receiver: Receiver, engine: Engine, tmp_path: Path
 ) -> None:
-    feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:9")  # nobody is there
+    feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:9")  # no server listens there
     async with feed.edge:
-        feed.give(2)
+        feed.add(2)
         later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
-        await until(lambda: feed.edge.store._settled.kept.next == 2)  # on disk
+        await until(lambda: feed.edge.store._on_disk.kept.next == 2)  # on disk
         feed.edge.store.on_request(later)
         await until(lambda: feed.edge.store.last_s > WALL_S + 1e8)
-        feed.give(4)
+        feed.add(4)
         async with asyncio.timeout(LONG_S):
             first, second, third = [decode((await feed.edge.store.take(1))[0].message.payload) for _ in range(3)]
     assert (first.number, first.store > later.store) == (1, True)
-    assert (first.samples["time_s"] == 0.0).all()  # they had been placed by then
+    assert (first.samples["time_s"] == 0.0).all()  # they were timestamped before the request
     assert second.samples["time_s"].tolist() == [*np.arange(60.0)]
     assert third.samples["time_s"].tolist() == [*np.arange(60.0, 120.0)]
 
 
-async def test_a_server_that_is_killed_in_mid_send_costs_nothing(tmp_path: Path) -> None:
+async def test_no_sample_is_lost_by_a_killed_server(tmp_path: Path) -> None:
     with running(tmp_path, partitions=4) as engine:
         async with Receiver(engine.url, "pack") as receiver:
             feed = Feed(receiver, tmp_path, url(engine))
             async with feed.edge:
                 for kill in range(2):
-                    feed.give(200)
+                    feed.add(200)
                     await receiver.until((205 * kill + 1) * 60)
                     await asyncio.to_thread(engine.kill, 0)
-                    feed.give(5)
+                    feed.add(5)
                     await asyncio.to_thread(engine.start, 0)
-                feed.give(1)
-                await feed.all_came()
+                feed.add(1)
+                await feed.assert_all_received()
 
 
-async def test_an_edge_that_begins_anew_sends_what_is_not_safe_and_goes_on(
+async def test_restarted_edge_sends_unconfirmed_blocks_first(
     receiver: Receiver, engine: Engine, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:1")
     async with feed.edge:
-        feed.give(50)
-    given = feed._reads
-    again = Feed(receiver, tmp_path, url(engine))
-    again.now_s, again._count, again._reads = feed.now_s, feed.count, given
-    async with again.edge:
-        again.give(10)
-        await again.all_came()
-    await again.all_came()
+        feed.add(50)
+    earlier = feed._reads
+    restarted = Feed(receiver, tmp_path, url(engine))
+    restarted.now_s, restarted._count, restarted._reads = feed.now_s, feed.count, earlier
+    async with restarted.edge:
+        restarted.add(10)
+        await restarted.assert_all_received()
+    await restarted.assert_all_received()
     assert [block.number for block in receiver.blocks] == list(range(1, 61))
 
 
-async def test_what_the_stream_has_lost_is_sent_again(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
-    """As when a leader is killed after acknowledging messages that no other node has."""
+async def test_blocks_lost_by_the_stream_are_sent_again(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+    """A leader may be killed after acknowledging messages that no other node has."""
     receiver.lose = {5, 6, 14, 30}
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
-        feed.give(40)
-        await feed.all_came()
+        feed.add(40)
+        await feed.assert_all_received()
     assert receiver.lose == set()
     assert receiver.gaps > 0
 
 
-async def test_an_edge_without_room_says_from_where_on_it_has_blocks(
-    receiver: Receiver, engine: Engine, tmp_path: Path
-) -> None:
+async def test_full_edge_announces_its_oldest_block(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
     async with Proxy(engine.mqtt_port) as network:
         network.away = True
         feed = Feed(receiver, tmp_path, network.url, store_mib=0.1)
         async with feed.edge:
             for _ in range(3):
-                feed.give(60)
+                feed.add(60)
                 await until(lambda: not feed.edge.store._waiting)
             dropped = feed.edge.store.dropped
             network.away = False
@@ -203,16 +202,14 @@ async def test_an_edge_without_room_says_from_where_on_it_has_blocks(
     assert dropped > 0
     assert receiver.gaps == 0
     assert receiver.blocks[0].oldest == receiver.blocks[0].number == dropped + 1
-    assert same(receiver.samples, np.concatenate(feed._reads[60 * dropped :]))
+    assert equal(receiver.samples, np.concatenate(feed._reads[60 * dropped :]))
 
 
-async def test_garbage_from_who_is_no_worker_changes_nothing(
-    receiver: Receiver, engine: Engine, tmp_path: Path
-) -> None:
+async def test_invalid_requests_are_ignored(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
-        feed.give(3)
-        await feed.all_came()
+        feed.add(3)
+        await feed.assert_all_received()
         store = receiver.blocks[0].store
         garbage = [b"", b"\xff\x00", b"{}", b'{"store": -1, "number": 1, "resend": false}', b"9" * 10_000, b"[" * 9_000]
         garbage += [f'{{"store": {n}, "number": {n}, "resend": true}}'.encode() for n in (10**30, 10**400)]
@@ -221,56 +218,54 @@ async def test_garbage_from_who_is_no_worker_changes_nothing(
         await receiver.say(BlockRequest(store=1, number=1, resend=True))
         await receiver.say(BlockRequest(store=store, number=1, resend=False))
         await until(lambda: feed.edge.unread == len(garbage))
-        feed.give(3)
-        await feed.all_came()
+        feed.add(3)
+        await feed.assert_all_received()
 
 
-async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
-    """A receiver there confirms blocks and requests resends."""
+async def test_blocks_are_sent_to_any_mqtt_broker(broker: Broker, tmp_path: Path) -> None:
+    """A receiver at an MQTT broker without NATS confirms blocks and requests resends."""
     edge = BlockSender(EdgeSettings(url=broker.url), "pack", tmp_path, handover_s=LONG_S)
-    async with Listener(broker, "raw/#") as heard, edge:
+    async with Listener(broker, "raw/#") as listener, edge:
         samples = np.zeros(600, dtype=SAMPLE)
         samples["time_s"] = np.arange(600.0)
         edge.take(samples)
-        await heard.wait("raw/pack", lambda data: decode(data).number == 9)
-        store = decode(heard.all("raw/pack")[0]).store
-        before = len(heard.messages)
-        await heard.publish(
+        await listener.wait("raw/pack", lambda data: decode(data).number == 9)
+        store = decode(listener.all("raw/pack")[0]).store
+        before = len(listener.messages)
+        await listener.publish(
             "edge/pack/awaits", BlockRequest(store=store, number=7, resend=True).model_dump_json(), qos=1
         )
-        again = decode(await heard.wait("raw/pack", skip=before))
-        await heard.wait("raw/pack", lambda data: decode(data).number == 9, skip=before)
-        assert (again.number, again.oldest) == (7, 7)
-        await until(lambda: not edge.store.waiting)  # the broker's acknowledgement is on its way
+        resent = decode(await listener.wait("raw/pack", skip=before))
+        await listener.wait("raw/pack", lambda data: decode(data).number == 9, skip=before)
+        assert (resent.number, resent.oldest) == (7, 7)
+        await until(lambda: not edge.store.waiting)  # the broker's acknowledgement may arrive later
         assert edge.health() == EdgeHealth(blocks_kept=3, blocks_unsent=0, blocks_dropped=0, trouble=None)
 
 
-async def test_a_source_that_is_silent_holds_no_samples_back(
+async def test_open_block_is_sent_if_the_source_falls_silent(
     receiver: Receiver, engine: Engine, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, url(engine), block_s=1.0)
     async with feed.edge:
-        feed.give(1 / 60)
+        feed.add(1 / 60)
         await receiver.until(1)
 
 
-async def test_a_server_that_lets_nobody_in_is_named(engine: Engine, tmp_path: Path) -> None:
+async def test_unreadable_password_file_raises_an_error(engine: Engine, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^edge.password_file = /none: cannot be read"):
         BlockSender(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
 
 
-async def test_the_server_keeps_what_came_from_an_edge_by_its_pack(
-    receiver: Receiver, engine: Engine, tmp_path: Path
-) -> None:
+async def test_stream_stores_blocks_by_pack(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
-        feed.give(2)
+        feed.add(2)
         await receiver.until(60)
     async with contextlib.AsyncExitStack() as stack:
         nc = await nats.connect(engine.url)
         stack.push_async_callback(nc.close)
-        found = await nc.jetstream().stream_info(
+        stream = await nc.jetstream().stream_info(
             subjects.RAW_STREAM, subjects_filter=subjects.kept(0).replace("0", "*", 1)
         )
-        assert found.state.subjects
-        assert sum(name.endswith(f".raw.{receiver.pack}") for name in found.state.subjects) == 1
+        assert stream.state.subjects
+        assert sum(name.endswith(f".raw.{receiver.pack}") for name in stream.state.subjects) == 1

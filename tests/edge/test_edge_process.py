@@ -1,4 +1,4 @@
-"""The real program beside a pack: killed in mid-send, ended cleanly, and with no kernel loaded."""
+"""Process of command ``edge``: kill, clean shutdown, and imports without kernels."""
 
 import asyncio
 import contextlib
@@ -33,14 +33,14 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
 
 
 class Board:
-    """Prints a line at a time; no voltage is repeated."""
+    """Board that prints lines with distinct voltages."""
 
     def __init__(self, line: Line) -> None:
         self._line, self._number = line, itertools.count(1)
 
-    async def speak(self) -> None:
+    async def print_lines(self) -> None:
         with contextlib.suppress(OSError):
-            self._line.received()  # a line that nobody has opened is not to hold anybody up
+            self._line.received()  # the tests continue even if no process opens the line
         while True:
             with contextlib.suppress(BlockingIOError):
                 self._line.write(b"%.4f,0.10,25.0\r\n" % (3.0 + 1e-4 * next(self._number)))
@@ -75,27 +75,27 @@ async def program(*command: object, stderr: IO[bytes]) -> AsyncIterator[Process]
         await process.wait()
 
 
-async def test_what_a_killed_edge_had_ended_comes_once_and_one_that_is_asked_to_end_sends_all(
+async def test_killed_edge_sends_completed_blocks_once_and_sigterm_sends_all(
     tmp_path: Path, line: Line, engine: Engine
 ) -> None:
     line.plug()
-    pack, said = pack_file(tmp_path, line, engine.mqtt_port), tmp_path / "log"
-    board = asyncio.create_task(Board(line).speak())
+    pack, log_file = pack_file(tmp_path, line, engine.mqtt_port), tmp_path / "log"
+    board = asyncio.create_task(Board(line).print_lines())
     async with Receiver(engine.url, "pack") as receiver:
-        with said.open("wb") as log:
+        with log_file.open("wb") as log:
             async with program(PROGRAM, "edge", pack, stderr=log) as process:
                 await receiver.until(1)
                 process.kill()
-            before = said.stat().st_size
+            before = log_file.stat().st_size
             async with program(sys.executable, "-X", "importtime", PROGRAM, "edge", pack, stderr=log) as process:
                 async with asyncio.timeout(LONG_S):  # blocks of the first may still come while the second imports
-                    while b"store of blocks" not in said.read_bytes()[before:]:  # noqa: ASYNC110 - another process does it
+                    while b"store of blocks" not in log_file.read_bytes()[before:]:  # noqa: ASYNC110 - another process does it
                         await asyncio.sleep(0.02)
                 await receiver.until(sum(block.samples.size for block in receiver.blocks) + 1)
                 process.send_signal(signal.SIGTERM)
                 assert await asyncio.wait_for(process.wait(), LONG_S) == 0
         board.cancel()
-        lines = said.read_text().splitlines()
+        lines = log_file.read_text().splitlines()
         state = next(json.loads(each) for each in reversed(lines) if "store of blocks" in each)
         voltages = receiver.samples["voltage_v"].tolist()
     assert voltages == sorted(set(voltages))
@@ -107,9 +107,9 @@ async def test_what_a_killed_edge_had_ended_comes_once_and_one_that_is_asked_to_
     assert not [name for name in imported if name.split(".")[0] in ("numba", "scipy") or ".kernels" in name]
 
 
-async def test_run_sends_what_it_estimates_from(tmp_path: Path, line: Line, engine: Engine) -> None:
+async def test_run_sends_the_samples_of_its_estimates(tmp_path: Path, line: Line, engine: Engine) -> None:
     line.plug()
-    board, stop = asyncio.create_task(Board(line).speak()), asyncio.Event()
+    board, stop = asyncio.create_task(Board(line).print_lines()), asyncio.Event()
     edge = {"url": f"mqtt://127.0.0.1:{engine.mqtt_port}", "block_s": 1.0}
     settings = Settings.model_validate(
         {"pack": {"name": "both"}, "sensor": {"port": str(line.path), "protocol": "text"}, "edge": edge}
@@ -121,41 +121,40 @@ async def test_run_sends_what_it_estimates_from(tmp_path: Path, line: Line, engi
         estimator = await asyncio.wait_for(service, LONG_S)
         counters = sample_counters(estimator.state[0])
         samples = counters["samples"] + sum(n for name, n in counters.items() if name.startswith("dropped_"))
-        async with BlockSender(
-            EdgeSettings.model_validate(edge), "both", tmp_path
-        ):  # has what a busy machine had no time for
+        # on a busy machine the service may end before it has sent all blocks
+        async with BlockSender(EdgeSettings.model_validate(edge), "both", tmp_path):
             await receiver.until(samples)
         assert receiver.samples.size == samples
     board.cancel()
 
 
-def test_a_pack_that_is_sent_nowhere_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edge_without_a_server_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "pack.toml"
     path.write_text("[pack]\n")
-    code, _, said = run(capsys, "edge", path)
+    code, _, err = run(capsys, "edge", path)
     assert code == 2
-    assert 'edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"' in said
+    assert 'edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"' in err
 
 
 @pytest.mark.parametrize(
-    ("table", "said"),
+    ("table", "message"),
     [
         ('url = "http://a"', "edge.url = 'http://a': must be mqtt://host:port"),
         ("block_s = 0", "edge.block_s = 0: Input should be greater than or equal to 1"),
         ('key_file = "a"', "edge.key_file = a: of no use without edge.cert_file"),
     ],
 )
-def test_settings_that_cannot_be_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, said: str
+def test_error_names_the_invalid_setting(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, message: str
 ) -> None:
     path = tmp_path / "pack.toml"
     path.write_text(f'[sensor]\nport = "/dev/none"\n[edge]\n{table}\n')
     code, _, err = run(capsys, "edge", path)
     assert code == 2
-    assert said in err
+    assert message in err
 
 
-def test_config_check_looks_at_what_opens_the_servers_door(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_check_reads_the_password_file_of_the_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, token = tmp_path / "pack.toml", tmp_path / "token"
     path.write_text(f'[edge]\nusername = "a"\npassword_file = "{token}"\n')
     assert run(capsys, "config", "check", path)[::2] == (
@@ -164,6 +163,6 @@ def test_config_check_looks_at_what_opens_the_servers_door(tmp_path: Path, capsy
     )
     token.write_text("secret")
     token.chmod(0o644)
-    code, _, said = run(capsys, "config", "check", path)
+    code, _, err = run(capsys, "config", "check", path)
     assert code == 0
-    assert f"edge.password_file = {token}: every user of this machine may read it" in said
+    assert f"edge.password_file = {token}: every user of this machine may read it" in err

@@ -1,10 +1,10 @@
-"""Certificates for tests, by openssl: an authority, and those it signs."""
+"""Certificate authority for tests, by openssl."""
 
 import subprocess
 from pathlib import Path
 
 EC_KEY = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
-HERE = "subjectAltName=IP:127.0.0.1,DNS:localhost"
+SUBJECT_ALT_NAMES = "subjectAltName=IP:127.0.0.1,DNS:localhost"
 
 
 def openssl(*arguments: str | Path) -> None:
@@ -12,7 +12,7 @@ def openssl(*arguments: str | Path) -> None:
 
 
 class Authority:
-    """Signs certificates; its own is ``certificate``."""
+    """Certificate authority with the certificate ``certificate``."""
 
     def __init__(self, folder: Path, name: str = "ca") -> None:
         self._folder = folder
@@ -21,11 +21,11 @@ class Authority:
             "req", "-x509", *EC_KEY, "-keyout", self._key, "-out", self.certificate, "-days", "2", "-subj", "/CN=CA"
         )
 
-    def vouch_for(self, name: str) -> tuple[Path, Path]:
+    def sign(self, name: str) -> tuple[Path, Path]:
         """Create certificate and key for a name on this machine."""
         certificate, key, request = (self._folder / f"{name}.{kind}" for kind in ("crt", "key", "csr"))
         names = self._folder / "names"
-        names.write_text(HERE)
+        names.write_text(SUBJECT_ALT_NAMES)
         openssl("req", *EC_KEY, "-keyout", key, "-out", request, "-subj", f"/CN={name}")
         openssl("x509", "-req", "-in", request, "-CA", self.certificate, "-CAkey", self._key, "-CAcreateserial",
                 "-out", certificate, "-days", "2", "-extfile", names)  # fmt: skip

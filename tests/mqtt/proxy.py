@@ -1,16 +1,15 @@
-"""Proxy between a client and its broker: a network that fails silently, an older broker, or one that accepts
-nothing."""
+"""Proxy between a client and its broker that simulates a silent network, a broker without MQTT 5, or rejections."""
 
 import asyncio
 import contextlib
 from typing import Self
 
-REFUSED = b"\x20\x02\x00\x01"
+REJECTED = b"\x20\x02\x00\x01"
 """CONNACK for an unsupported protocol version."""
 
 
 async def read_packet(reader: asyncio.StreamReader) -> bytes:
-    """One packet of MQTT."""
+    """Read one MQTT packet."""
     head = await reader.readexactly(2)
     while head[-1] & 0x80:
         head += await reader.readexactly(1)
@@ -18,8 +17,8 @@ async def read_packet(reader: asyncio.StreamReader) -> bytes:
     return head + await reader.readexactly(length)
 
 
-def published(packet: bytes) -> tuple[str, bytes] | None:
-    """Topic and identifier of a message at QoS 1; None of all else."""
+def qos1_message(packet: bytes) -> tuple[str, bytes] | None:
+    """Return topic and packet identifier of a message at QoS 1; None for any other packet."""
     if packet[0] & 0xF6 != 0x32:
         return None
     start = next(i for i, byte in enumerate(packet[1:], 2) if not byte & 0x80)
@@ -31,25 +30,25 @@ class Proxy:
     """Forwards to the broker on ``port``.
 
     Args:
-        port: The broker's.
-        knows_5: Else a client of MQTT 5 is refused, as a broker of 3.1.1 does.
+        port: Port of the broker.
+        supports_5: False to reject MQTT 5 clients as a broker with MQTT 3.1.1 does.
 
     Attributes:
-        port: Where it listens.
-        swallows: All that comes from either side is lost, and nobody hears of it; for connections of that time for good.
-        away: Who comes is turned away.
-        refuses: The reason code by which messages at QoS 1 are refused in place of the broker; 0: none is.
-        refused: Their topics.
+        port: Listening port.
+        swallows: True to lose all bytes of both directions silently. Connections of that time never recover.
+        away: True to close new connections.
+        reject_code: Reason code by which the proxy rejects messages at QoS 1; 0: forward them.
+        rejected: Topics of the rejected messages.
         half_open_ended: Set when the broker has ended a connection that was left half-open.
     """
 
-    def __init__(self, port: int, *, knows_5: bool = True) -> None:
-        self._broker_port, self._knows_5 = port, knows_5
+    def __init__(self, port: int, *, supports_5: bool = True) -> None:
+        self._broker_port, self._supports_5 = port, supports_5
         self._clients: list[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._half_open = self.swallows = self.away = False
-        self.refuses = 0
-        self.refused: list[str] = []
+        self.reject_code = 0
+        self.rejected: list[str] = []
         self.half_open_ended = asyncio.Event()
 
     @property
@@ -83,7 +82,7 @@ class Proxy:
         self._clients = []
 
     def end(self, reason: int) -> None:
-        """The connections are ended as a broker of MQTT 5 does that has a reason."""
+        """Disconnect all clients with a reason code, as an MQTT 5 broker does."""
         for client, _ in self._clients:
             client.write(bytes([0xE0, 1, reason]))
         self.away = True
@@ -101,30 +100,30 @@ class Proxy:
         if self.away:
             return
         start = await read_packet(reader)
-        if b"MQTT\x05" in start and not self._knows_5:
-            writer.write(REFUSED)
+        if b"MQTT\x05" in start and not self._supports_5:
+            writer.write(REJECTED)
             await writer.drain()
             return
-        while self.swallows:  # what came is lost
+        while self.swallows:  # also lose CONNECT
             if not await reader.read(65_536):
                 return
         from_broker, to_broker = await asyncio.open_connection("127.0.0.1", self._broker_port)
         to_broker.write(start)
         self._clients.append((writer, to_broker))
-        up = asyncio.create_task(self._hand_up(reader, to_broker, writer))
+        upstream = asyncio.create_task(self._pump_to_broker(reader, to_broker, writer))
         try:
-            await self._pump(from_broker, writer)
-            while await from_broker.read(4096):  # the client is gone, the broker does not know
+            await self._pump_to_client(from_broker, writer)
+            while await from_broker.read(4096):  # the client is gone, and the broker has not noticed
                 pass
             if self.swallows:
-                await up
+                await upstream
             if self._half_open:
                 self.half_open_ended.set()
         finally:
-            up.cancel()
+            upstream.cancel()
             to_broker.transport.abort()
 
-    async def _hand_up(
+    async def _pump_to_broker(
         self, reader: asyncio.StreamReader, to_broker: asyncio.StreamWriter, to_client: asyncio.StreamWriter
     ) -> None:
         """Forward the client's bytes until either end is closed."""
@@ -133,16 +132,16 @@ class Proxy:
             while not to_broker.transport.is_closing():
                 packet = await read_packet(reader)
                 lost |= self.swallows
-                message = published(packet) if self.refuses else None
+                message = qos1_message(packet) if self.reject_code else None
                 if message and not lost:
-                    self.refused.append(message[0])
-                    to_client.write(bytes([0x40, 3, *message[1], self.refuses]))
+                    self.rejected.append(message[0])
+                    to_client.write(bytes([0x40, 3, *message[1], self.reject_code]))
                 elif not lost:
                     to_broker.write(packet)
                     await to_broker.drain()
 
-    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Hand on until either end is gone."""
+    async def _pump_to_client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Forward the broker's bytes until either end is closed."""
         lost = False
         with contextlib.suppress(ConnectionError):
             while data := await reader.read(65_536):

@@ -25,18 +25,18 @@ from tests.sinks.snapshots import ONE
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with ca, server, pack and a certificate of another authority."""
+    """Return a folder with the certificates of the authority, the server, a pack and of another authority."""
     folder = tmp_path_factory.mktemp("certificates")
     authority = Authority(folder)
-    authority.vouch_for("server")
-    authority.vouch_for("pack")
-    Authority(folder, "other-ca").vouch_for("stranger")
+    authority.sign("server")
+    authority.sign("pack")
+    Authority(folder, "other-ca").sign("foreign")
     return folder
 
 
 @pytest.fixture
 def strict_broker(folder: Path, tmp_path: Path) -> Iterator[Broker]:
-    """Lets in whom its authority vouches for; the name in the certificate is the user's."""
+    """Start a broker that requires a certificate of its authority and uses its name as user name."""
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     broker = Broker(
@@ -58,7 +58,7 @@ def sink(settings: MqttSettings) -> MqttSink:
     return MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, most=4), first_delay_s=0.1)
 
 
-async def test_our_certificate_opens_the_broker(strict_broker: Broker, folder: Path) -> None:
+async def test_client_certificate_is_accepted(strict_broker: Broker, folder: Path) -> None:
     tls = aiomqtt.TLSParameters(*(str(folder / name) for name in ("ca.crt", "pack.crt", "pack.key")))
     async with (
         Listener(strict_broker, tls_params=tls) as live,
@@ -68,24 +68,24 @@ async def test_our_certificate_opens_the_broker(strict_broker: Broker, folder: P
         await live.wait(STATE)
 
 
-@pytest.mark.parametrize(("name", "why"), [(None, "certificate required"), ("stranger", "unknown ca")])
-async def test_who_has_no_certificate_of_the_broker_s_authority_is_told_so(
-    strict_broker: Broker, folder: Path, name: str | None, why: str
+@pytest.mark.parametrize(("name", "reason"), [(None, "certificate required"), ("foreign", "unknown ca")])
+async def test_rejected_certificate_is_logged_with_the_reason(
+    strict_broker: Broker, folder: Path, name: str | None, reason: str
 ) -> None:
     with structlog.testing.capture_logs() as logs:
         async with sink(settings(strict_broker, folder, name)):
-            # a broker that closes before CONNECT is written takes its reason along; the next attempt hears it
-            await until(lambda: [line for line in logs if why in line.get("reason", "")])
+            # a broker that closes before CONNECT is written gives no reason; a later attempt receives one
+            await until(lambda: [line for line in logs if reason in line.get("reason", "")])
     assert {line["event"] for line in logs} == {"broker not reachable"}
 
 
-async def test_a_certificate_that_is_replaced_is_used_without_a_restart(
+async def test_replaced_certificate_is_used_without_restart(
     strict_broker: Broker, folder: Path, tmp_path: Path
 ) -> None:
     own = tmp_path / "own"
     own.mkdir()
     for kind in ("crt", "key"):
-        shutil.copy(folder / f"stranger.{kind}", own / f"pack.{kind}")
+        shutil.copy(folder / f"foreign.{kind}", own / f"pack.{kind}")
     shutil.copy(folder / "ca.crt", own)
     with structlog.testing.capture_logs() as logs:
         async with sink(settings(strict_broker, own, "pack")):
@@ -95,29 +95,29 @@ async def test_a_certificate_that_is_replaced_is_used_without_a_restart(
             await until(lambda: [line for line in logs if line["event"] == "broker connected"])
 
 
-def test_nothing_older_than_tls_1_2_is_spoken(folder: Path) -> None:
+def test_minimum_version_is_tls_1_2(folder: Path) -> None:
     assert tls_context(MqttSettings(url="mqtts://host")).minimum_version is ssl.TLSVersion.TLSv1_2
 
 
-def test_an_own_key_that_every_user_may_read_is_warned_of(folder: Path, tmp_path: Path) -> None:
+def test_key_readable_by_every_user_causes_a_warning(folder: Path, tmp_path: Path) -> None:
     key = tmp_path / "open.key"
     shutil.copy(folder / "pack.key", key)
-    given = MqttSettings(url="mqtts://host", cert_file=folder / "pack.crt", key_file=key)
-    assert check(given) == []
+    chosen = MqttSettings(url="mqtts://host", cert_file=folder / "pack.crt", key_file=key)
+    assert check(chosen) == []
     key.chmod(0o644)
-    [warning] = check(given)
+    [warning] = check(chosen)
     assert f"mqtt.key_file = {key}: every user" in warning
 
 
-def test_a_key_is_found_among_the_credentials_of_the_unit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_key_is_found_in_the_credentials_directory(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(folder))
     assert check(MqttSettings(url="mqtts://host", cert_file=Path("pack.crt"), key_file=Path("pack.key"))) == []
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "error"),
     [
-        ({"key_file": "stranger.key"}, r"mqtt\.key_file = .*stranger\.key: is not the key of mqtt\.cert_file = .*pack\.crt$"),
+        ({"key_file": "foreign.key"}, r"mqtt\.key_file = .*foreign\.key: is not the key of mqtt\.cert_file = .*pack\.crt$"),
         ({"cert_file": "none.crt"}, r"mqtt\.cert_file = .*none\.crt: cannot be read: No such file or directory$"),
         ({"key_file": "none.key"}, r"mqtt\.key_file = .*none\.key: cannot be read: No such file or directory$"),
         ({"cert_file": "pack.key"}, r"mqtt\.cert_file = .*pack\.key.*: no certificate in PEM with its key"),
@@ -127,9 +127,9 @@ def test_a_key_is_found_among_the_credentials_of_the_unit(folder: Path, monkeypa
         ({"url": "mqtt://host"}, r"mqtt\.cert_file = .*: of no use without TLS: mqtt\.url must be mqtts://"),
     ],
 )  # fmt: skip
-def test_certificates_that_cannot_be_used_are_named(folder: Path, changes: dict[str, Any], said: str) -> None:
+def test_error_names_the_unusable_certificate(folder: Path, changes: dict[str, Any], error: str) -> None:
     openssl("ec", "-in", folder / "pack.key", "-aes128", "-passout", "pass:word", "-out", folder / "locked.key")
-    given = {"url": "mqtts://host", "cert_file": "pack.crt", "key_file": "pack.key"} | changes
-    files = {key: folder / str(name) for key, name in given.items() if key != "url" and name is not None}
-    with pytest.raises(UserError, match=said):
-        check(MqttSettings(url=given["url"], **files))
+    chosen = {"url": "mqtts://host", "cert_file": "pack.crt", "key_file": "pack.key"} | changes
+    files = {key: folder / str(name) for key, name in chosen.items() if key != "url" and name is not None}
+    with pytest.raises(UserError, match=error):
+        check(MqttSettings(url=chosen["url"], **files))

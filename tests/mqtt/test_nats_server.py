@@ -15,11 +15,11 @@ from tests.sinks.service import STATE, Sink, assert_all_in_order, state, until
 COUNT = 400
 """Number of published states."""
 MESSAGES = "$MQTT_msgs"
-"""Stream in which the server keeps messages of QoS 1 until all subscribers have them."""
+"""Stream in which the server stores QoS 1 messages until all subscribers have them."""
 
 
 class Collector:
-    """Receives the pack's messages over any live node without a loss: its session is in the cluster."""
+    """Receives the pack's messages from any live node without loss, because the cluster stores its session."""
 
     def __init__(self, server: Engine) -> None:
         self._ports = server.mqtt_ports
@@ -66,7 +66,7 @@ def mqtt_url(server: Engine, node: int) -> str:
     return f"mqtt://127.0.0.1:{server.mqtt_ports[node]}"
 
 
-async def test_one_node_that_is_killed_and_comes_back_gets_all_states(tmp_path: Path) -> None:
+async def test_restarted_node_receives_all_states(tmp_path: Path) -> None:
     with running(tmp_path) as server:
         async with Collector(server) as live, Sink(mqtt_url(server, 0), most_kept=10_000) as sink:
             await publish(sink, 0, COUNT // 2)
@@ -81,7 +81,7 @@ async def test_one_node_that_is_killed_and_comes_back_gets_all_states(tmp_path: 
 
 @pytest.mark.parametrize("serving", [pytest.param(True, id="serves us"), pytest.param(False, id="serves others")])
 @pytest.mark.parametrize("leading", [pytest.param(True, id="leads"), pytest.param(False, id="follows")])
-async def test_a_node_killed_in_mid_stream_costs_no_state(tmp_path: Path, *, serving: bool, leading: bool) -> None:
+async def test_killed_cluster_node_loses_no_state(tmp_path: Path, *, serving: bool, leading: bool) -> None:
     if "CLUSTER" not in os.environ:
         pytest.skip("takes 6 to 30 s: part of `make nats`")
     with running(tmp_path, 3) as server:

@@ -17,12 +17,12 @@ from tests.patience import LONG_S
 from tests.sinks.service import STATE, Sink, assert_all_in_order, numbers, state, until
 from tests.sinks.snapshots import ONE
 
-SOON = Timeouts(connected_s=1.0, keepalive_s=1, acknowledged_s=1.0)
-"""A busy machine may take a broker for lost that is not: then it is found again."""
+SHORT_TIMEOUTS = Timeouts(connect_s=1.0, keepalive_s=1, acknowledge_s=1.0)
+"""Short timeouts. On a busy machine a live broker may count as lost; the client then reconnects."""
 
 
-def dial(url: str | tuple[str, ...], patience: Timeouts = SOON) -> dict[str, Any]:
-    return {"connect": BrokerConnector(MqttSettings(url=url), patience), "most_kept": 10_000}
+def connect_options(url: str | tuple[str, ...], timeouts: Timeouts = SHORT_TIMEOUTS) -> dict[str, Any]:
+    return {"connect": BrokerConnector(MqttSettings(url=url), timeouts), "most_kept": 10_000}
 
 
 @pytest.fixture
@@ -37,16 +37,16 @@ def other(tmp_path: Path) -> Iterator[Broker]:
 
 @pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])
 async def network(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[Proxy]:
-    async with Proxy(broker.port, knows_5=request.param == "MQTT 5") as proxy:
+    async with Proxy(broker.port, supports_5=request.param == "MQTT 5") as proxy:
         yield proxy
 
 
-async def test_states_of_an_outage_arrive_afterwards_in_order(broker: Broker, network: Proxy) -> None:
+async def test_states_published_during_outages_arrive_in_order(broker: Broker, network: Proxy) -> None:
     async with Listener(broker) as live, Sink(network.url, most_kept=10_000) as sink:
         for number in range(1000):
             sink.mqtt.publish(state(number))
             if number % 300 == 250:
-                await until(lambda: numbers(live))  # it is in the middle of them
+                await until(lambda: numbers(live))  # delivery has begun and is not finished
                 network.leave()
                 live_before = len(numbers(live))
             if number % 300 == 280:
@@ -58,7 +58,7 @@ async def test_states_of_an_outage_arrive_afterwards_in_order(broker: Broker, ne
     assert sink.delivery.drops == 0
 
 
-async def test_live_topics_do_not_wait_for_a_backlog(broker: Broker, network: Proxy) -> None:
+async def test_live_topics_overtake_a_backlog(broker: Broker, network: Proxy) -> None:
     network.leave()
     async with Listener(broker) as live, Sink(network.url, most_kept=10_000) as sink:
         for number in range(2000):
@@ -70,7 +70,7 @@ async def test_live_topics_do_not_wait_for_a_backlog(broker: Broker, network: Pr
         assert STATE in topics[topics.index(f"bms/pack/{topic}") + 1000 :], topic
 
 
-async def test_what_waits_at_the_end_is_handed_over_before_offline(broker: Broker) -> None:
+async def test_queued_states_are_sent_before_offline_at_shutdown(broker: Broker) -> None:
     async with Listener(broker) as live:
         async with Sink(broker.url, most_kept=10_000) as sink:
             await live.wait("bms/pack/availability")
@@ -80,11 +80,11 @@ async def test_what_waits_at_the_end_is_handed_over_before_offline(broker: Broke
     assert numbers(live) == list(range(300))
 
 
-async def test_a_line_that_falls_silent_is_given_up_for_the_next_broker(broker: Broker, other: Broker) -> None:
+async def test_silent_connection_is_replaced_by_the_next_broker(broker: Broker, other: Broker) -> None:
     async with Proxy(broker.port) as silent, Listener(broker) as first, Listener(other) as second:
         urls = (silent.url, other.url)
         with structlog.testing.capture_logs() as logs:
-            async with Sink(urls, **dial(urls)) as sink:
+            async with Sink(urls, **connect_options(urls)) as sink:
                 for number in range(10):
                     sink.mqtt.publish(state(number))
                 await first.wait_json(STATE, lambda s: s["frames_received"] == 9)
@@ -95,17 +95,17 @@ async def test_a_line_that_falls_silent_is_given_up_for_the_next_broker(broker: 
                 await second.wait_json(STATE, lambda s: s["frames_received"] == 29)
                 async with Listener(other) as late:
                     assert await late.wait("bms/pack/availability") == b"online"
-                # what the first broker says of us there
+                # the first broker has published the will
                 assert await first.wait("bms/pack/availability", lambda p: p == b"offline")
     assert_all_in_order(numbers(first) + numbers(second), 30)
     assert [line["url"] for line in logs if line["event"] == "broker connected"][:2] == [silent.url, other.url]
     assert [line["url"] for line in logs if line["event"] == "broker lost"][:1] == [silent.url]
 
 
-async def test_a_line_that_falls_silent_while_nothing_is_to_be_said_is_found_out(broker: Broker) -> None:
+async def test_silent_connection_is_detected_without_traffic(broker: Broker) -> None:
     async with Proxy(broker.port) as silent, Listener(broker) as live:
         with structlog.testing.capture_logs() as logs:
-            async with Sink(silent.url, **dial(silent.url, Timeouts(keepalive_s=1))) as sink:
+            async with Sink(silent.url, **connect_options(silent.url, Timeouts(keepalive_s=1))) as sink:
                 await live.wait("bms/pack/schema")
                 silent.swallows = True
                 await until(lambda: any(line["event"] == "broker lost" for line in logs))
@@ -115,11 +115,11 @@ async def test_a_line_that_falls_silent_while_nothing_is_to_be_said_is_found_out
                 await live.wait(STATE, skip=before)
                 async with Listener(broker) as late:
                     assert await late.wait("bms/pack/availability") == b"online"
-    assert next(line["reason"] for line in logs if line["event"] == "broker lost") == "the broker gave no sign of life"
+    assert next(line["reason"] for line in logs if line["event"] == "broker lost") == "the broker did not answer a ping"
 
 
-async def test_a_broker_is_told_to_expect_a_sign_of_life_each_10_s() -> None:
-    """A broker that receives none publishes the will after one and a half times that."""
+async def test_connect_announces_a_keepalive_of_10_s() -> None:
+    """A broker publishes the will 1.5 keepalive intervals after the last packet."""
     first = asyncio.get_running_loop().create_future()
 
     async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -130,12 +130,12 @@ async def test_a_broker_is_told_to_expect_a_sign_of_life_each_10_s() -> None:
 
     server = await asyncio.start_server(accept, "127.0.0.1", 0)
     async with server, Sink(f"mqtt://127.0.0.1:{server.sockets[0].getsockname()[1]}"):
-        _, behind = (await asyncio.wait_for(first, LONG_S)).split(b"MQTT", 1)
-    assert int.from_bytes(behind[2:4]) == 10  # after version and flags
+        _, header = (await asyncio.wait_for(first, LONG_S)).split(b"MQTT", 1)
+    assert int.from_bytes(header[2:4]) == 10  # after version and flags
 
 
-async def test_a_broker_that_stands_still_gets_its_states_when_it_goes_on(broker: Broker) -> None:
-    async with Listener(broker) as live, Sink(broker.url, **dial(broker.url)) as sink:
+async def test_frozen_broker_receives_all_states_after_thawing(broker: Broker) -> None:
+    async with Listener(broker) as live, Sink(broker.url, **connect_options(broker.url)) as sink:
         with structlog.testing.capture_logs() as logs:
             for number in range(10):
                 sink.mqtt.publish(state(number))
@@ -153,23 +153,23 @@ async def test_a_broker_that_stands_still_gets_its_states_when_it_goes_on(broker
     assert any("no answer within" in line.get("reason", "") for line in logs)
 
 
-async def test_a_broker_that_accepts_and_says_nothing_is_passed_over(broker: Broker, other: Broker) -> None:
+async def test_frozen_broker_is_skipped(broker: Broker, other: Broker) -> None:
     urls = (broker.url, other.url)
     broker.freeze()
     with structlog.testing.capture_logs() as logs:
-        async with Listener(other) as live, Sink(urls, **dial(urls)):
+        async with Listener(other) as live, Sink(urls, **connect_options(urls)):
             assert await live.wait("bms/pack/availability") == b"online"
     broker.thaw()
-    said = [(line["event"], line["url"]) for line in logs if "url" in line]
-    assert said[:2] == [("broker not reachable", broker.url), ("broker connected", other.url)]
+    events = [(line["event"], line["url"]) for line in logs if "url" in line]
+    assert events[:2] == [("broker not reachable", broker.url), ("broker connected", other.url)]
 
 
-async def test_an_attempt_that_was_given_up_does_not_end_the_connection_that_came_after(
+async def test_abandoned_attempt_does_not_close_the_next_connection(
     broker: Broker, caplog: pytest.LogCaptureFixture
 ) -> None:
     broker.freeze()
     with structlog.testing.capture_logs() as logs:
-        async with Sink(broker.url, **dial(broker.url)) as sink:
+        async with Sink(broker.url, **connect_options(broker.url)) as sink:
             await until(lambda: any(line["event"] == "broker not reachable" for line in logs))
             broker.thaw()
             async with Listener(broker) as live:
@@ -179,12 +179,12 @@ async def test_an_attempt_that_was_given_up_does_not_end_the_connection_that_cam
                 await live.wait_json(STATE, lambda s: s["frames_received"] == 19)
                 await until(lambda: sink.delivery.waiting == 0)
     assert not [line for line in logs if line["event"] == "broker lost"]
-    assert not [record for record in caplog.records if record.name == "asyncio"], "nothing is left that fails later"
+    assert not [record for record in caplog.records if record.name == "asyncio"], "no task is left that fails later"
 
 
 @pytest.fixture
-def deaf_broker(tmp_path: Path) -> Iterator[Broker]:
-    """Takes all but states."""
+def state_denying_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Start a broker that rejects states."""
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     (tmp_path / "acl").write_text(f"topic deny {STATE}\ntopic readwrite #\n")
@@ -193,9 +193,9 @@ def deaf_broker(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-async def test_states_that_the_broker_refuses_are_named_counted_and_stop_nothing(deaf_broker: Broker) -> None:
+async def test_rejected_states_are_counted_and_do_not_block_others(state_denying_broker: Broker) -> None:
     with structlog.testing.capture_logs() as logs:
-        async with Listener(deaf_broker) as live, Sink(deaf_broker.url, most_kept=1000) as sink:
+        async with Listener(state_denying_broker) as live, Sink(state_denying_broker.url, most_kept=1000) as sink:
             for number in range(100):
                 sink.mqtt.publish(state(number))
             await until(lambda: sink.delivery.waiting == 0)

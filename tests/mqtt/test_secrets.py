@@ -1,4 +1,4 @@
-"""A password in the wrong place is not shown."""
+"""Error messages do not show passwords."""
 
 from pathlib import Path
 from typing import Any
@@ -28,9 +28,7 @@ URLS = [
 
 
 @pytest.mark.parametrize("form", ['"{}"', '["mqtt://host", "{}"]', '["{}", "mqtt://host"]', '["{}", 5]'])
-def test_of_a_url_with_a_password_the_error_shows_the_rest(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
-) -> None:
+def test_error_on_a_url_hides_the_password(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
     pack = tmp_path / "pack.toml"
     for url in URLS:
         pack.write_text(f"[mqtt]\nurl = {form.format(url)}\n")
@@ -39,7 +37,7 @@ def test_of_a_url_with_a_password_the_error_shows_the_rest(
             assert (code, "mqtt.url" in err, SECRET in out + err) == (2, True, False), url
 
 
-def test_a_url_on_the_command_line_is_not_repeated_either(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_on_a_command_line_url_hides_the_password(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text("")
     for url in URLS:
@@ -48,13 +46,13 @@ def test_a_url_on_the_command_line_is_not_repeated_either(tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize("url", [*URLS, ("mqtt://host", URLS[0])])
-def test_the_model_s_own_error_shows_nothing_of_it(url: Any) -> None:
-    with pytest.raises(ValidationError) as refused:
+def test_validation_error_hides_the_password(url: Any) -> None:
+    with pytest.raises(ValidationError) as error:
         MqttSettings(url=url)
-    assert SECRET not in str(refused.value)
+    assert SECRET not in str(error.value)
 
 
-def test_of_a_password_that_is_no_text_the_error_shows_no_byte(tmp_path: Path) -> None:
+def test_error_on_a_non_utf8_password_hides_its_bytes(tmp_path: Path) -> None:
     (tmp_path / "password").write_bytes(SECRET.encode() + b"\xff")
     with pytest.raises(UserError, match=r"mqtt\.password_file = .*: cannot be read: not UTF-8 text$"):
         check(MqttSettings(password_file=tmp_path / "password"))

@@ -1,4 +1,4 @@
-"""A subscriber with a real broker: its stored messages, and its report when the broker is gone."""
+"""Subscriber with a real broker: stored messages, and reports of lost connections."""
 
 import asyncio
 import json
@@ -20,56 +20,56 @@ from tests.sinks.snapshots import ONE
 
 
 class Watch:
-    """A subscriber whose callbacks wake waiting tests."""
+    """Subscriber whose callbacks wake waiting tests."""
 
     def __init__(self, url: str, **options: Any) -> None:
-        self.heard: list[DeviceMessage] = []
+        self.received: list[DeviceMessage] = []
         self.links: list[float | None] = []
-        self._news = asyncio.Event()
+        self._changed = asyncio.Event()
         settings = MqttSettings(url=url, **options)
-        self.subscriber = Subscriber(settings, self._hear, self._link, first_delay_s=0.1)
+        self.subscriber = Subscriber(settings, self._on_message, self._on_link_change, first_delay_s=0.1)
 
-    def _hear(self, heard: DeviceMessage) -> None:
-        self.heard.append(heard)
-        self._news.set()
+    def _on_message(self, message: DeviceMessage) -> None:
+        self.received.append(message)
+        self._changed.set()
 
-    def _link(self) -> None:
+    def _on_link_change(self) -> None:
         self.links.append(self.subscriber.lost_since)
-        self._news.set()
+        self._changed.set()
 
     async def until(self, condition: Any) -> None:
         async with asyncio.timeout(LONG_S):
             while not condition():
-                self._news.clear()
-                await self._news.wait()
+                self._changed.clear()
+                await self._changed.wait()
 
-    def kept(self, device: str, topic: str) -> Any:
-        found = self.subscriber.devices.get(device)
-        return found.topics.get(topic) if found else None
+    def stored(self, device: str, topic: str) -> Any:
+        entry = self.subscriber.devices.get(device)
+        return entry.topics.get(topic) if entry else None
 
 
-@pytest.mark.parametrize("knows_5", [True, False], ids=["MQTT 5", "MQTT 3.1.1"])
-async def test_what_a_pack_publishes_is_kept_and_told(broker: Broker, *, knows_5: bool) -> None:
-    async with Proxy(broker.port, knows_5=knows_5) as proxy, Sink(broker.url) as sink:
+@pytest.mark.parametrize("supports_5", [True, False], ids=["MQTT 5", "MQTT 3.1.1"])
+async def test_published_messages_are_stored_and_passed_to_the_callback(broker: Broker, *, supports_5: bool) -> None:
+    async with Proxy(broker.port, supports_5=supports_5) as proxy, Sink(broker.url) as sink:
         sink.mqtt.publish(ONE)
         watch = Watch(proxy.url)
         async with watch.subscriber:
-            await watch.until(lambda: watch.kept("pack", "health") and watch.kept("pack", "schema"))
+            await watch.until(lambda: watch.stored("pack", "health") and watch.stored("pack", "schema"))
             assert watch.subscriber.lost_since is None
             sink.mqtt.publish(ONE)
-            await watch.until(lambda: watch.kept("pack", "state"))
+            await watch.until(lambda: watch.stored("pack", "state"))
             assert ONE.estimate
-            assert watch.kept("pack", "state") == ONE.estimate.model_dump(mode="json")
-            assert watch.kept("pack", "availability") == "online"
-            assert DeviceMessage("pack", "availability", "online") in watch.heard
+            assert watch.stored("pack", "state") == ONE.estimate.model_dump(mode="json")
+            assert watch.stored("pack", "availability") == "online"
+            assert DeviceMessage("pack", "availability", "online") in watch.received
             await sink.mqtt.__aexit__(None, None, None)
-            await watch.until(lambda: watch.kept("pack", "availability") == "offline")
+            await watch.until(lambda: watch.stored("pack", "availability") == "offline")
     assert watch.subscriber.lost_messages == 0
     assert watch.links[0] is None
     assert watch.links[-1] is not None
 
 
-async def test_garbage_is_kept_from_nobody_else_and_ends_nothing(broker: Broker) -> None:
+async def test_invalid_messages_do_not_end_the_subscriber(broker: Broker) -> None:
     watch = Watch(broker.url)
     async with watch.subscriber, Listener(broker) as other:
         await watch.until(lambda: watch.links)
@@ -77,35 +77,35 @@ async def test_garbage_is_kept_from_nobody_else_and_ends_nothing(broker: Broker)
         await other.publish("bms/no device/state", b"1", qos=1)
         await other.publish("bms/pack/info", bytes(2 * MAX_BYTES), qos=1)
         await other.publish("bms/pack/health", json.dumps({"uptime_s": 1}), qos=1)
-        await watch.until(lambda: watch.kept("pack", "health"))
-        assert "no json" in watch.kept("pack", "state")
+        await watch.until(lambda: watch.stored("pack", "health"))
+        assert "no json" in watch.stored("pack", "state")
         assert list(watch.subscriber.devices) == ["pack"]
-        assert watch.kept("pack", "info") is None
+        assert watch.stored("pack", "info") is None
 
 
-async def test_a_broker_that_is_killed_and_comes_back(broker: Broker) -> None:
+async def test_reconnects_to_a_restarted_broker(broker: Broker) -> None:
     watch = Watch(broker.url)
     async with watch.subscriber:
         await watch.until(lambda: watch.links == [None])
         async with Listener(broker) as other:
             await other.publish("bms/pack/state", b"1", qos=1)
-        await watch.until(lambda: watch.kept("pack", "state") == 1)
+        await watch.until(lambda: watch.stored("pack", "state") == 1)
         broker.stop()
         await watch.until(lambda: len(watch.links) == 2)
         lost_since = watch.links[1]
         assert lost_since is not None
         await until(lambda: watch.subscriber.trouble)
         assert watch.subscriber.lost_since == lost_since
-        assert watch.kept("pack", "state") == 1
+        assert watch.stored("pack", "state") == 1
         broker.start()
         await watch.until(lambda: len(watch.links) == 3)
         assert watch.subscriber.lost_since is None
         async with Listener(broker) as other:
             await other.publish("bms/pack/state", b"2", qos=1)
-        await watch.until(lambda: watch.kept("pack", "state") == 2)
+        await watch.until(lambda: watch.stored("pack", "state") == 2)
 
 
-async def test_before_there_is_a_broker_it_is_lost_since_the_start(broker: Broker) -> None:
+async def test_lost_since_start_until_the_first_connection(broker: Broker) -> None:
     broker.stop()
     watch = Watch(broker.url)
     async with watch.subscriber:
@@ -117,7 +117,7 @@ async def test_before_there_is_a_broker_it_is_lost_since_the_start(broker: Broke
         await watch.until(lambda: watch.links == [None])
 
 
-async def test_a_fault_of_who_is_called_is_seen(broker: Broker) -> None:
+async def test_exception_of_the_callback_is_raised(broker: Broker) -> None:
     def fail(_: DeviceMessage) -> None:
         raise ZeroDivisionError
 
@@ -138,7 +138,7 @@ def broker_with_passwords(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-async def test_a_broker_that_refuses_is_named_with_the_reason(broker_with_passwords: Broker) -> None:
+async def test_rejected_connection_is_reported_with_the_reason(broker_with_passwords: Broker) -> None:
     watch = Watch(broker_with_passwords.url)
     async with watch.subscriber:
         await until(lambda: watch.subscriber.trouble)
@@ -147,26 +147,26 @@ async def test_a_broker_that_refuses_is_named_with_the_reason(broker_with_passwo
 
 
 async def test_long_messages_are_dropped_with_one_log_line(broker: Broker) -> None:
-    """A broker of MQTT 5 holds them back; one of MQTT 3.1.1 cannot."""
+    """An MQTT 5 broker withholds long messages; an MQTT 3.1.1 broker cannot."""
     with structlog.testing.capture_logs() as lines:
-        async with Proxy(broker.port, knows_5=False) as proxy, Listener(broker) as live:
+        async with Proxy(broker.port, supports_5=False) as proxy, Listener(broker) as live:
             watch = Watch(proxy.url)
             async with watch.subscriber:
                 await watch.until(lambda: watch.subscriber.lost_since is None)
                 for number in range(5):
                     await live.publish(f"bms/pack/t{number}", b"x" * (MAX_BYTES + 1), qos=1)
                 await live.publish("bms/pack/state", b"1", qos=1)
-                await watch.until(lambda: watch.kept("pack", "state"))
+                await watch.until(lambda: watch.stored("pack", "state"))
                 assert watch.subscriber.lost_messages == 5
     assert [line["reason"] for line in lines if line["event"] == "messages are dropped"] == ["longer than 65536 bytes"]
 
 
-async def test_a_retained_payload_of_16_mib_does_not_arrive(broker: Broker) -> None:
+async def test_retained_payload_of_16_mib_is_withheld(broker: Broker) -> None:
     async with Listener(broker, "other/#") as live:
         await live.publish("bms/pack/info", bytes(16 * 2**20), qos=1, retain=True)
         await live.publish("bms/pack/state", b"1", qos=1, retain=True)
         watch = Watch(broker.url)
         async with watch.subscriber:
-            await watch.until(lambda: watch.kept("pack", "state"))
-            assert watch.kept("pack", "info") is None
+            await watch.until(lambda: watch.stored("pack", "state"))
+            assert watch.stored("pack", "info") is None
             assert watch.subscriber.lost_since is None

@@ -13,13 +13,13 @@ from bms_estimator.mqtt.topic_cache import (
     SILENT_S,
     DeviceMessage,
     TopicCache,
-    parsed,
+    parse_payload,
 )
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.sinks.snapshots import NOW, ONE
 
 
-def test_all_that_a_pack_publishes_is_kept_by_device_and_topic():
+def test_all_published_messages_are_stored_by_device_and_topic():
     published = TopicCache("site/bms")
     messages = MessageBuilder("site/bms", "pack")
     for message in (
@@ -38,16 +38,16 @@ def test_all_that_a_pack_publishes_is_kept_by_device_and_topic():
     assert set(device.heard_s.values()) == {NOW}
 
 
-def test_what_is_no_json_is_text_and_no_number_is_infinite():
-    assert parsed(b"online") == "online"
-    assert parsed(b'{"a": NaN}') == '{"a": NaN}'
-    assert parsed(b'{"a": 1e999}') == '{"a": 1e999}'
-    assert parsed(b"[" * 100_000) == "[" * 100_000
-    assert parsed(b"\xff\x00") == "\ufffd\0"
-    assert parsed(b'{"a": 1.5}') == {"a": 1.5}
+def test_invalid_json_is_returned_as_text():
+    assert parse_payload(b"online") == "online"
+    assert parse_payload(b'{"a": NaN}') == '{"a": NaN}'
+    assert parse_payload(b'{"a": 1e999}') == '{"a": 1e999}'
+    assert parse_payload(b"[" * 100_000) == "[" * 100_000
+    assert parse_payload(b"\xff\x00") == "\ufffd\0"
+    assert parse_payload(b'{"a": 1.5}') == {"a": 1.5}
 
 
-def test_a_topic_that_is_emptied_is_gone_and_with_its_last_the_device():
+def test_cleared_topics_are_removed_and_with_the_last_one_the_device():
     published = TopicCache("bms")
     published.take("bms/pack/state", b"1", NOW)
     published.take("bms/pack/info", b"2", NOW)
@@ -58,7 +58,7 @@ def test_a_topic_that_is_emptied_is_gone_and_with_its_last_the_device():
     assert published.devices == {}
 
 
-def test_what_is_of_no_device_is_not_looked_at():
+def test_topics_without_a_device_are_ignored():
     published = TopicCache("bms")
     for topic in ("bms", "bms/", "bms/pack", "bms/pack/", "bms//state", "other/pack/state", "bms/a b/state"):
         assert published.take(topic, b"1", NOW) is None, topic
@@ -77,7 +77,7 @@ def test_devices_topics_and_bytes_are_bounded_and_known_devices_are_updated() ->
     assert len(published.devices["d0"].topics) == MAX_TOPICS
     quarter = json.dumps("x" * (MAX_DEVICE_BYTES // 4)).encode()
     taken = [published.take(f"bms/d1/t{number}", quarter, NOW) for number in range(10)]
-    assert sum(heard is not None for heard in taken) == 3
+    assert sum(message is not None for message in taken) == 3
     assert published.take("bms/d1/state", b"2", NOW + 1.0) == DeviceMessage("d1", "state", 2)
     published.take("bms/d1/t0", b"", NOW)
     assert published.take("bms/d1/t9", quarter, NOW) is not None
@@ -97,7 +97,7 @@ def test_a_new_device_replaces_the_one_that_has_been_silent_longest() -> None:
     assert {"new", "d0"} <= published.devices.keys()
 
 
-def test_a_raised_alarm_finds_room_at_once_and_its_device_is_kept() -> None:
+def test_device_with_a_raised_alarm_is_stored_at_once_and_not_replaced() -> None:
     published = TopicCache("bms")
     for number in range(2 * MAX_DEVICES):
         published.take(f"bms/d{number}/state", b"1", NOW)
@@ -120,7 +120,7 @@ def test_raised_alarms_of_new_devices_do_not_replace_a_device_with_a_raised_alar
 
 
 @given(st.text(string.printable), st.binary(max_size=200))
-def test_nothing_that_comes_raises(topic, payload):
+def test_no_message_raises(topic, payload):
     published = TopicCache("bms")
     for full in (topic, f"bms/{topic}", f"bms/pack/{topic}"):
         published.take(full, payload, NOW)

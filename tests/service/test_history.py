@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, LATER, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_LATER_FILES, CheckpointFile, RunCounters
 from bms_estimator.model.payloads import Totals
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.service import checkpoint_writer
@@ -20,7 +20,16 @@ from bms_estimator.service.live_loop import new_estimator, run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import gap_lengths
-from tests.checkpoint.test_checkpoint import CELL, NEW, SETTINGS, a_used_pack, edited, often, ran, saved_as
+from tests.checkpoint.test_checkpoint import (
+    CELL,
+    NEW,
+    SETTINGS,
+    edit,
+    learned_estimator,
+    run_samples,
+    run_with_frequent_saves,
+    save_as,
+)
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
@@ -61,7 +70,7 @@ async def test_charge_and_energy_survive_restarts(tmp_path: Path) -> None:
     hour = [(float(s), 2.0, 3.8) for s in range(3601)]
     _, discharged = await run_at(0.0, tmp_path, *hour)
     _, charged = await run_at(2.0, tmp_path, *((s, -1.0, v) for s, _, v in hour))
-    async with often(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(4.0))) as (source, sink, _):
+    async with run_with_frequent_saves(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(4.0))) as (source, sink, _):
         source.give(hour[0])
         told = (await sink.until(lambda s: s.estimate is not None)).estimate
     assert ChargeEnergy.of(discharged.health.total) == pytest.approx((2.0, 0.0, 7.6e-3, 0.0))
@@ -82,15 +91,15 @@ async def test_charge_and_energy_are_published_once_saved_so_that_a_kill_does_no
             super().save(state, ledger)
 
     file = SlowDisk(tmp_path, SETTINGS, CELL)
-    async with often(file) as (source, sink, _):
+    async with run_with_frequent_saves(file) as (source, sink, _):
         source.give(*((float(s), 2.0, 3.8) for s in range(1801)))
         last = await sink.until(lambda s: s.health.total.charge_out_ah > 0.9)
         told = [s.estimate.charge_out_ah for s in sink.snapshots if s.estimate]
-        kept = CheckpointFile(tmp_path, SETTINGS, CELL).load().ledger.total.charge_out_ah
+        kept = CheckpointFile(tmp_path, SETTINGS, CELL).load().counters.total.charge_out_ah
         release.set()
     assert last.health.samples["samples"] == 1801
     assert set(told) == {kept} == {0.0}
-    assert file.load().ledger.total.charge_out_ah == pytest.approx(1.0)
+    assert file.load().counters.total.charge_out_ah == pytest.approx(1.0)
 
 
 async def test_a_run_without_samples_changes_neither_counters_nor_the_age_of_the_state(tmp_path: Path) -> None:
@@ -98,8 +107,8 @@ async def test_a_run_without_samples_changes_neither_counters_nor_the_age_of_the
     await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))
     found = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(2.0)).load()
     assert found.unseen_s == pytest.approx(7200.0)
-    assert found.ledger.restarts == 2
-    assert found.ledger.total.samples["dropped_range"] == 1
+    assert found.counters.restarts == 2
+    assert found.counters.total.samples["dropped_range"] == 1
 
 
 async def killed(folder: Path, *, with_a_sample: bool) -> None:
@@ -112,7 +121,7 @@ async def killed(folder: Path, *, with_a_sample: bool) -> None:
                 written.set()
 
     written = threading.Event()
-    async with often(Killed(folder, SETTINGS, CELL)) as (source, _, _):
+    async with run_with_frequent_saves(Killed(folder, SETTINGS, CELL)) as (source, _, _):
         if with_a_sample:
             source.give((0.0, 0.1, 3.8))
         assert await asyncio.to_thread(written.wait, LONG_S)
@@ -120,21 +129,21 @@ async def killed(folder: Path, *, with_a_sample: bool) -> None:
 
 async def test_a_start_after_an_unclean_end_counts_as_a_crash(tmp_path: Path) -> None:
     counted = []
-    await ran(tmp_path, samples=1)
+    await run_samples(tmp_path, samples=1)
     for with_a_sample in (True, False):
-        counted.append((await ran(tmp_path, samples=1)).health.total.crashes)
+        counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
         await killed(tmp_path, with_a_sample=with_a_sample)
-    counted.append((await ran(tmp_path, samples=1)).health.total.crashes)
-    counted.append((await ran(tmp_path, samples=1)).health.total.crashes)
+    counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
+    counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
     assert counted == [0, 1, 2, 2]
 
 
 async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: Path) -> None:
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(a_used_pack().record, NEW)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(learned_estimator().record, NEW)
     for hours, settings, reason in (
         (24 * 400.0, SETTINGS, ""),
-        (47.0, edited("state", longest_days=2.0), ""),
-        (49.0, edited("state", longest_days=2.0), "refused: it is 2.0 days old, state.longest_days is 2"),
+        (47.0, edit("state", longest_days=2.0), ""),
+        (49.0, edit("state", longest_days=2.0), "refused: it is 2.0 days old, state.longest_days is 2"),
     ):
         assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: at(hours)).load().reason == reason
 
@@ -146,8 +155,8 @@ COUNTED = RunCounters(
 
 async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0))
-    file.save(a_used_pack().record, COUNTED)
-    _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edited("state", longest_days=2.0))
+    file.save(learned_estimator().record, COUNTED)
+    _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edit("state", longest_days=2.0))
     assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
 
 
@@ -157,33 +166,33 @@ async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_co
     """A version is tried, and left again, more often than files are kept; the first are those that have learned most."""
     file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
-    for attempt in range(LATER + 1):
+    for attempt in range(MAX_LATER_FILES + 1):
         counted = dataclasses.replace(COUNTED, restarts=6 + attempt)
-        saved_as(FORMAT + 1, file, a_used_pack(), monkeypatch, counted)
+        save_as(FORMAT + 1, file, learned_estimator(), monkeypatch, counted)
         inodes.append(file.path.stat().st_ino)
-        health = (await ran(tmp_path, samples=1)).health
-        kept = min(attempt + 1, LATER)
+        health = (await run_samples(tmp_path, samples=1)).health
+        kept = min(attempt + 1, MAX_LATER_FILES)
         assert f"reads {FORMAT}; set aside as pack.later-{kept}.npz; once the version" in health.checkpoint
         assert (health.restarts, health.total.crashes, health.total.unseen_s) == (7 + attempt, 2, 30.0)
-    kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, LATER + 1)]
-    assert kept_inodes == [*inodes[: LATER - 1], inodes[LATER]]
+    kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, MAX_LATER_FILES + 1)]
+    assert kept_inodes == [*inodes[: MAX_LATER_FILES - 1], inodes[MAX_LATER_FILES]]
     assert (tmp_path / "pack.refused.npz").read_bytes() == b"an older one"
 
 
 async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after_the_logged_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, learned = tmp_path / "a folder", a_used_pack()
+    folder, learned = tmp_path / "a folder", learned_estimator()
     folder.mkdir()
-    saved_as(FORMAT + 1, CheckpointFile(folder, SETTINGS, CELL), learned, monkeypatch)
+    save_as(FORMAT + 1, CheckpointFile(folder, SETTINGS, CELL), learned, monkeypatch)
     with capture_logs() as lines:
-        said = (await ran(folder, samples=1)).health.checkpoint
+        said = (await run_samples(folder, samples=1)).health.checkpoint
     assert [line["log_level"] for line in lines if line.get("outcome") == said] == ["warning"]
     before, command, _ = said.split("`")
     assert before.endswith("is installed again, stop the service and ")
     subprocess.run(command, shell=True, check=True)  # noqa: ASYNC221 - as a person would
     monkeypatch.setattr("bms_estimator.checkpoint.checkpoint_file.FORMAT", FORMAT + 1)
-    restored = (await ran(folder, samples=1)).health.checkpoint
+    restored = (await run_samples(folder, samples=1)).health.checkpoint
     assert restored == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
 
@@ -199,11 +208,11 @@ async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after
     ids=str,
 )
 async def test_implausible_counters_are_reset_and_the_state_is_restored(tmp_path: Path, wrong: dict[str, Any]) -> None:
-    learned = a_used_pack()
+    learned = learned_estimator()
     total = COUNTED.total.model_copy(update=wrong)
     CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTED, total=total))
     with capture_logs() as lines:
-        health = (await ran(tmp_path, samples=1)).health
+        health = (await run_samples(tmp_path, samples=1)).health
     assert "counting begins anew" in lines[0]["event"]
     assert health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
     assert (health.restarts, health.total.crashes) == (1, 0)
@@ -213,7 +222,7 @@ async def test_implausible_counters_are_reset_and_the_state_is_restored(tmp_path
 
 async def test_a_deleted_state_folder_is_recreated_with_access_for_the_owner_only(tmp_path: Path) -> None:
     folder = tmp_path / "state"
-    async with often(CheckpointFile(folder, SETTINGS, CELL)) as (source, sink, _):
+    async with run_with_frequent_saves(CheckpointFile(folder, SETTINGS, CELL)) as (source, sink, _):
         for second in range(3):
             seen = len(sink.snapshots)
             source.give((float(second), 0.1, 3.8))
@@ -246,7 +255,7 @@ async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
 
 async def stopped_by_nothing(hung: CheckpointFile) -> None:
     """A run on a disk that hangs."""
-    async with often(hung) as (source, sink, task):
+    async with run_with_frequent_saves(hung) as (source, sink, task):
         source.give((0.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs")
         source.give((1.0, 0.1, 3.8))

@@ -1,4 +1,4 @@
-"""The database when its disk, its file or its folder fails: said once, gone on without, back by itself."""
+"""Database with a failing disk, file or folder: one log line, operation in memory, recovery."""
 
 import asyncio
 import os
@@ -40,7 +40,7 @@ def numbers(connection: sqlite3.Connection) -> list[int]:
     return [number for (number,) in connection.execute("SELECT number FROM outbox ORDER BY number")]
 
 
-async def test_its_files_are_for_their_owner_alone_whoever_made_them(path):
+async def test_files_are_readable_only_by_their_owner(path):
     path.touch(mode=0o644)
     async with Database(path) as database:
         await database.call(put(1))
@@ -48,7 +48,7 @@ async def test_its_files_are_for_their_owner_alone_whoever_made_them(path):
         assert {stat.S_IMODE(each.stat().st_mode) for each in path.parent.iterdir()} == {0o600}
 
 
-async def test_a_transaction_that_fails_leaves_nothing(path):
+async def test_failed_transaction_is_rolled_back(path):
     def half(connection: sqlite3.Connection) -> None:
         put(1)(connection)
         raise sqlite3.OperationalError("half way")
@@ -60,7 +60,7 @@ async def test_a_transaction_that_fails_leaves_nothing(path):
 
 
 @pytest.mark.parametrize("suffix", ["", "-wal", "-shm"])
-async def test_a_planted_link_is_not_followed(path, suffix):
+async def test_symlink_is_not_followed(path, suffix):
     target = path.with_name("target")
     target.write_bytes(b"precious")
     path.with_name(path.name + suffix).symlink_to(target)
@@ -70,7 +70,7 @@ async def test_a_planted_link_is_not_followed(path, suffix):
     assert target.read_bytes() == b"precious"
 
 
-async def test_a_file_that_is_no_database_is_set_aside_and_a_new_one_begun(path):
+async def test_file_that_is_no_database_is_quarantined_and_replaced(path):
     path.write_bytes(os.urandom(10_000))
     damaged = path.read_bytes()
     with structlog.testing.capture_logs() as logs:
@@ -80,7 +80,7 @@ async def test_a_file_that_is_no_database_is_set_aside_and_a_new_one_begun(path)
     assert [line["event"] for line in logs] == ["database set aside, a new one is begun"]
 
 
-async def test_a_database_that_is_damaged_inside_is_set_aside_too(path):
+async def test_damaged_database_is_quarantined(path):
     async with Database(path) as database:
         for number in range(50):
             await database.call(put(number))
@@ -92,7 +92,7 @@ async def test_a_database_that_is_damaged_inside_is_set_aside_too(path):
     assert path.with_name("pack.refused.sqlite").exists()
 
 
-async def test_a_database_of_a_later_version_is_kept_aside_whole(path):
+async def test_database_of_a_later_version_is_quarantined_unchanged(path):
     with sqlite3.connect(path) as connection:
         connection.execute("PRAGMA user_version = 99")
     connection.close()
@@ -103,7 +103,7 @@ async def test_a_database_of_a_later_version_is_kept_aside_whole(path):
     connection.close()
 
 
-def made_otherwise(path: Path, script: str) -> None:
+def modify(path: Path, script: str) -> None:
     with sqlite3.connect(path) as connection:
         connection.executescript(script)
     connection.close()
@@ -112,17 +112,16 @@ def made_otherwise(path: Path, script: str) -> None:
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda path: made_otherwise(path, "PRAGMA user_version = 0"),
-        lambda path: made_otherwise(path, "ALTER TABLE outbox RENAME COLUMN topic TO tooic"),
-        lambda path: made_otherwise(path, "DROP TABLE minute"),
+        lambda path: modify(path, "PRAGMA user_version = 0"),
+        lambda path: modify(path, "ALTER TABLE outbox RENAME COLUMN topic TO tooic"),
+        lambda path: modify(path, "DROP TABLE minute"),
         lambda path: path.write_bytes(path.read_bytes().replace(b"TABLE minute", b"TABLE\xffminute")),
-        lambda path: path.write_bytes(path.read_bytes()[:18] + b"\x42" + path.read_bytes()[19:]),  # nobody may write
-        lambda path: path.write_bytes(
-            path.read_bytes()[:47] + b"\x44" + path.read_bytes()[48:]
-        ),  # format of the schema
+        # offset 18: a write version that makes the file read-only; offset 47: schema format
+        lambda path: path.write_bytes(path.read_bytes()[:18] + b"\x42" + path.read_bytes()[19:]),
+        lambda path: path.write_bytes(path.read_bytes()[:47] + b"\x44" + path.read_bytes()[48:]),
     ],
 )
-async def test_a_database_that_is_not_as_it_was_made_is_set_aside(path, damage):
+async def test_database_with_another_schema_is_quarantined(path, damage):
     async with Database(path) as database:
         await database.call(put(1))
     damage(path)
@@ -132,7 +131,7 @@ async def test_a_database_that_is_not_as_it_was_made_is_set_aside(path, damage):
     assert path.with_name("pack.refused.sqlite").exists()
 
 
-async def test_a_full_disk_is_said_once_and_used_again_when_it_has_room(full_disk):
+async def test_full_disk_is_logged_once_and_used_again_later(full_disk):
     with structlog.testing.capture_logs() as logs:
         async with Database(full_disk / "pack.sqlite", retry_s=0.0) as database:
             for _ in range(3):
@@ -145,23 +144,22 @@ async def test_a_full_disk_is_said_once_and_used_again_when_it_has_room(full_dis
     assert [line["log_level"] for line in logs] == ["warning", "info"]
 
 
-async def test_a_disk_that_failed_is_not_asked_again_at_once(path):
-    path.parent.joinpath("asked").touch()
-    asked = 0
+async def test_failed_disk_is_not_retried_immediately(path):
+    calls = 0
 
     def fail(_: sqlite3.Connection) -> None:
-        nonlocal asked
-        asked += 1
+        nonlocal calls
+        calls += 1
         raise sqlite3.OperationalError("broken")
 
     async with Database(path, retry_s=1e6) as database:
         for _ in range(3):
             with pytest.raises(StoreError, match="broken"):
                 await database.call(fail)
-    assert asked == 1
+    assert calls == 1
 
 
-async def test_a_folder_that_is_deleted_is_made_anew(tmp_path):
+async def test_deleted_folder_is_recreated(tmp_path):
     path = tmp_path / "state" / "pack.sqlite"
     async with Database(path) as database:
         await database.call(put(1))
@@ -171,13 +169,13 @@ async def test_a_folder_that_is_deleted_is_made_anew(tmp_path):
     assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
 
 
-async def test_a_disk_that_hangs_stops_nothing_and_is_used_again(path):
+async def test_hung_disk_does_not_block_and_is_used_again_later(path):
     gate = threading.Event()
     async with Database(path, hang_s=0.05, retry_s=0.0) as database:
         with pytest.raises(StoreError, match="has not answered"):
             await database.call(lambda _: gate.wait(LONG_S))
         with pytest.raises(StoreError, match="has not answered"):
-            await database.call(numbers)  # at once: it is not even asked
+            await database.call(numbers)  # fails at once, without a disk access
         gate.set()
         async with asyncio.timeout(LONG_S):
             while database.reason:
@@ -187,8 +185,8 @@ async def test_a_disk_that_hangs_stops_nothing_and_is_used_again(path):
                     await asyncio.sleep(0.01)
 
 
-async def test_a_disk_that_hangs_at_the_end_has_one_deadline_for_all_that_is_written(path, monkeypatch):
-    monkeypatch.setattr(database_module, "ENDING_S", 0.05)
+async def test_shutdown_with_a_hung_disk_has_one_deadline_for_all_writes(path, monkeypatch):
+    monkeypatch.setattr(database_module, "SHUTDOWN_TIMEOUT_S", 0.05)
     gate = threading.Event()
     async with asyncio.timeout(LONG_S):
         async with Database(path, hang_s=10 * LONG_S) as database:
@@ -201,14 +199,14 @@ async def test_a_disk_that_hangs_at_the_end_has_one_deadline_for_all_that_is_wri
     gate.set()
 
 
-async def test_a_fault_of_ours_is_raised(path):
+async def test_internal_error_is_raised(path):
     async with Database(path) as database:
         with pytest.raises(KeyError):
             await database.call(lambda _: {}["x"])
         assert await database.call(numbers) == []
 
 
-async def test_room_that_is_free_goes_back_to_the_file_system(path):
+async def test_free_pages_are_returned_to_the_file_system(path):
     async with Database(path) as database:
         for number in range(400):
             await database.call(put(number))
@@ -218,7 +216,7 @@ async def test_room_that_is_free_goes_back_to_the_file_system(path):
     assert path.stat().st_size <= 4096 * (FREE_PAGES + 100)
 
 
-HUNG = """
+HUNG_DISK_SCRIPT = """
 import asyncio, pathlib, sys, threading
 from bms_estimator.store.database import Database, StoreError
 
@@ -233,6 +231,8 @@ asyncio.run(main())
 """
 
 
-def test_a_process_ends_though_its_disk_hangs(path):
-    ended = subprocess.run([sys.executable, "-c", HUNG, path], timeout=LONG_S, capture_output=True, check=True)
+def test_process_ends_although_the_disk_hangs(path):
+    ended = subprocess.run(
+        [sys.executable, "-c", HUNG_DISK_SCRIPT, path], timeout=LONG_S, capture_output=True, check=True
+    )
     assert b"has not answered" in ended.stdout

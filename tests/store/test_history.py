@@ -1,4 +1,4 @@
-"""Minutes of a pack: what they hold, that a restart goes on with one, that they can be read meanwhile."""
+"""One-minute rows: content, restart within a minute, reading while the service writes."""
 
 import asyncio
 import sqlite3
@@ -22,23 +22,23 @@ from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE
 
 BEGIN_S = 1_700_000_040
-"""Of a minute."""
+"""Start of a minute [s since 1970]."""
 
 
 def at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, **changes: object) -> Snapshot:
-    """A publication ``second`` seconds after ``BEGIN_S``."""
+    """Return a publication ``second`` seconds after ``BEGIN_S``."""
     assert ONE.estimate
-    told = {
+    measured = {
         "time": iso_utc(BEGIN_S + second),
         "board_time_s": second,
         "current_a": current_a,
         "voltage_v": voltage_v,
         "power_w": current_a * voltage_v,
     }
-    return ONE._replace(estimate=ONE.estimate.model_copy(update=told | changes))
+    return ONE._replace(estimate=ONE.estimate.model_copy(update=measured | changes))
 
 
-async def keep(path: Path, snapshots: list[Snapshot], days: int = 366) -> None:
+async def record(path: Path, snapshots: list[Snapshot], days: int = 366) -> None:
     async with Database(path) as database, History(database, days=days) as history:
         for each in snapshots:
             history.publish(each)
@@ -57,9 +57,9 @@ def past_events(path: Path) -> list[PastEvent]:
     return HistoryFile(path).events(0.0, 2e10)
 
 
-async def test_a_minute_has_means_extremes_and_sums_of_what_was_published(path):
+async def test_row_has_means_extremes_and_sums_of_the_publications(path):
     currents = [3.6] * 30 + [-7.2] * 30
-    await keep(path, [at(float(s), a, soc=0.5 + s / 1000, temperature_c=None) for s, a in enumerate(currents)])
+    await record(path, [at(float(s), a, soc=0.5 + s / 1000, temperature_c=None) for s, a in enumerate(currents)])
     [row] = rows(path)
     assert (row.time_s, row.publications, row.seen_s) == (BEGIN_S, 60, 59.0)
     assert (row.current_a, row.current_min_a, row.current_max_a) == (pytest.approx(-1.8), -7.2, 3.6)
@@ -68,51 +68,52 @@ async def test_a_minute_has_means_extremes_and_sums_of_what_was_published(path):
     assert (row.soc, row.temperature_c) == (pytest.approx(0.559), None)
 
 
-async def test_a_gap_counts_no_charge(path):
-    await keep(path, [at(0.0), at(1.0), at(3000.0), at(3001.0)])
+async def test_no_charge_is_counted_over_a_gap(path):
+    await record(path, [at(0.0), at(1.0), at(3000.0), at(3001.0)])
     assert sum(row.seen_s for row in rows(path)) == 2.0
 
 
-async def test_a_source_that_tells_once_in_a_minute_makes_no_gaps(path):
-    await keep(path, [at(60.0 * i, 6.0) for i in range(11)])
-    assert sum(row.charge_out_ah for row in rows(path)) == pytest.approx(0.9)  # the first step cannot be told from one
+async def test_source_with_a_period_of_one_minute_has_no_gaps(path):
+    await record(path, [at(60.0 * i, 6.0) for i in range(11)])
+    assert sum(row.charge_out_ah for row in rows(path)) == pytest.approx(0.9)  # the first interval counts as a gap
 
 
-async def test_a_service_started_again_goes_on_with_its_minute(path):
+async def test_restarted_service_merges_rows_of_one_minute(path):
     whole = [
         at(float(s), s / 10, 3.0 + s / 100, soc_std=s / 1e3, temperature_c=20.0 + s if s % 2 else None)
         for s in range(60)
     ]
-    await keep(path.with_name("whole.sqlite"), whole)
-    await keep(path, whole[:25])
-    await keep(path, whole[25:])
-    [row], [wanted] = rows(path), rows(path.with_name("whole.sqlite"))
-    unseen = 2.5 / 3600  # Ah; nobody saw the second from one run to the other
-    assert row.temperature_c == pytest.approx(wanted.temperature_c, abs=0.5)  # runs weigh by all that they published
+    await record(path.with_name("whole.sqlite"), whole)
+    await record(path, whole[:25])
+    await record(path, whole[25:])
+    [row], [expected] = rows(path), rows(path.with_name("whole.sqlite"))
+    lost_ah = 2.5 / 3600  # of the second between the two runs
+    # means are weighted by all publications of a run, also by those without a temperature
+    assert row.temperature_c == pytest.approx(expected.temperature_c, abs=0.5)
     assert row._replace(temperature_c=None) == pytest.approx(
-        wanted._replace(
+        expected._replace(
             temperature_c=None,
-            seen_s=wanted.seen_s - 1.0,
-            charge_out_ah=wanted.charge_out_ah - unseen,
-            energy_out_wh=wanted.energy_out_wh - unseen * 3.25,
+            seen_s=expected.seen_s - 1.0,
+            charge_out_ah=expected.charge_out_ah - lost_ah,
+            energy_out_wh=expected.energy_out_wh - lost_ah * 3.25,
         )
     )
 
 
-async def test_a_clock_that_is_set_back_does_not_merge_different_minutes(path):
+async def test_minutes_repeated_by_a_clock_set_back_are_not_merged(path):
     once = [at(float(s), 10.0) for s in range(300)]
     again = [at(float(s), -10.0, board_time_s=300.0 + s) for s in range(300)]
-    await keep(path, once + again)
-    kept = rows(path)
-    assert len(kept) == 10
-    assert max(row.seen_s for row in kept) <= 60.0
-    assert [row.current_a for row in kept] == [10.0, -10.0] * 5
+    await record(path, once + again)
+    stored = rows(path)
+    assert len(stored) == 10
+    assert max(row.seen_s for row in stored) <= 60.0
+    assert [row.current_a for row in stored] == [10.0, -10.0] * 5
     [whole] = rows(path, 86400)
     assert (whole.charge_out_ah, whole.charge_in_ah) == (pytest.approx(299 / 360), pytest.approx(300 / 360))
 
 
-async def test_longer_steps_put_minutes_together(path):
-    await keep(path, [at(float(s), s / 60, 3.0, soc=1.0 - s / 7200) for s in range(0, 7200, 10)])
+async def test_longer_steps_aggregate_minutes(path):
+    await record(path, [at(float(s), s / 60, 3.0, soc=1.0 - s / 7200) for s in range(0, 7200, 10)])
     minutes, [first, second, last] = rows(path), rows(path, 3600)
     assert len(minutes) == 120
     assert sum(row.charge_out_ah for row in (first, second, last)) == pytest.approx(
@@ -123,27 +124,27 @@ async def test_longer_steps_put_minutes_together(path):
     assert first.time_s % 3600 == 0
 
 
-async def test_only_the_newest_days_are_kept_and_a_clock_that_jumps_ahead_costs_none(path):
-    await keep(path, [at(60.0 * minute) for minute in range(1500)])
-    await keep(path, [at(1e9)], days=1)
-    kept = rows(path)
-    assert len(kept) == 1440
-    assert [row.time_s for row in kept[:2]] == [BEGIN_S + 60 * 61, BEGIN_S + 60 * 62]
+async def test_newest_rows_are_kept_even_if_the_clock_jumps_ahead(path):
+    await record(path, [at(60.0 * minute) for minute in range(1500)])
+    await record(path, [at(1e9)], days=1)
+    stored = rows(path)
+    assert len(stored) == 1440
+    assert [row.time_s for row in stored[:2]] == [BEGIN_S + 60 * 61, BEGIN_S + 60 * 62]
 
 
-async def test_events_are_kept_and_read_in_order(path):
+async def test_events_are_stored_in_order(path):
     lost = at(1.0)._replace(health=ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "no board"}))
-    await keep(path, [at(0.0), lost])
+    await record(path, [at(0.0), lost])
     names = [event.name for event in past_events(path)]
     assert names == ["start", "sensor_online", "sensor_offline"]
 
 
-async def test_an_event_is_written_at_once(path, monkeypatch):
+async def test_event_is_written_immediately(path, monkeypatch):
     monkeypatch.setattr(history_module, "MINUTE_S", 3600)  # no minute ends
     async with Database(path) as database, History(database, days=366) as history:
         history.publish(at(0.0))
         async with asyncio.timeout(LONG_S):
-            while not await asyncio.to_thread(read_or_nothing, lambda: past_events(path)):  # noqa: ASYNC110 - of a file
+            while not await asyncio.to_thread(read_or_nothing, lambda: past_events(path)):  # noqa: ASYNC110 - a file
                 await asyncio.sleep(0.01)
         assert rows(path) == []
 
@@ -161,14 +162,14 @@ def read_or_nothing(read: Callable[[], list[Any]]) -> list[Any]:
     try:
         return read()
     except UserError:
-        return []  # the table is being made
+        return []  # the table does not exist yet
 
 
-async def test_rows_wait_for_a_disk_that_fails(path):
+async def test_rows_wait_while_the_disk_fails(path):
     path.mkdir()
     (path / "file").touch()
     async with Database(path, retry_s=0.0) as database, History(database, days=366) as history:
-        database._file._refuse_planted = refuse  # type: ignore[method-assign]
+        database._file._quarantine_symlink = leave_in_place  # type: ignore[method-assign]
         history.publish(at(0.0))
         history.publish(at(60.0))
         async with asyncio.timeout(LONG_S):
@@ -179,11 +180,11 @@ async def test_rows_wait_for_a_disk_that_fails(path):
     assert [row.time_s for row in rows(path)] == [BEGIN_S, BEGIN_S + 60]
 
 
-def refuse(_: Path) -> None:
-    """Leave what is there: here it is to be in the way."""
+def leave_in_place(_: Path) -> None:
+    """Leave the folder at the database's path, so that the database cannot be opened."""
 
 
-def test_what_cannot_be_read_is_said(path):
+def test_unreadable_history_raises_an_error(path):
     with pytest.raises(UserError, match="no history there"):
         rows(path)
     with sqlite3.connect(path) as connection:
@@ -196,32 +197,32 @@ def test_what_cannot_be_read_is_said(path):
         rows(path)
 
 
-class Late(Database):
-    """A disk that writes the first transactions though nobody hears of it."""
+class LostResults(Database):
+    """Database that commits its first transactions but reports a failure."""
 
-    unheard = 0
+    remaining = 0
 
     async def call(self, work: Callable[[sqlite3.Connection], Any]) -> Any:
         result = await super().call(work)
-        if self.unheard:
-            self.unheard -= 1
-            raise StoreError("nobody knows")
+        if self.remaining:
+            self.remaining -= 1
+            raise StoreError("unknown result")
         return result
 
 
-async def test_what_was_written_though_nobody_heard_is_not_written_again(path):
-    async with Late(path, retry_s=0.0) as database, History(database, days=366) as history:
-        database.unheard = 2
+async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path):
+    async with LostResults(path, retry_s=0.0) as database, History(database, days=366) as history:
+        database.remaining = 2
         for second in range(0, 190, 10):
             history.publish(at(float(second)))
             async with asyncio.timeout(LONG_S):
-                while database.unheard > max(2 - second // 60, 0):  # noqa: ASYNC110 - it has no event
+                while database.remaining > max(2 - second // 60, 0):  # noqa: ASYNC110 - it has no event
                     await asyncio.sleep(0.001)
     assert [(row.publications, row.seen_s) for row in rows(path)] == [(6, 50.0), (6, 60.0), (6, 60.0), (1, 10.0)]
     assert len(past_events(path)) == 2
 
 
-async def test_an_end_while_a_minute_is_being_written_writes_it_once(path):
+async def test_shutdown_during_a_write_writes_each_row_once(path):
     gate = threading.Event()
     async with Database(path) as database, History(database, days=366) as history:
         history.publish(at(0.0))
@@ -229,13 +230,13 @@ async def test_an_end_while_a_minute_is_being_written_writes_it_once(path):
         await asyncio.sleep(0)
         history.publish(at(60.0))
         await asyncio.sleep(0)
-        await asyncio.sleep(0)  # its write waits behind the other one
+        await asyncio.sleep(0)  # the write waits for the blocked transaction
         asyncio.get_running_loop().call_soon(gate.set)
     await busy
     assert [row.publications for row in rows(path)] == [1, 1]
 
 
-async def test_room_that_cannot_be_given_back_does_not_undo_what_is_written(path, monkeypatch):
+async def test_failed_vacuum_does_not_undo_a_transaction(path, monkeypatch):
     def fail(_: sqlite3.Connection) -> None:
         raise sqlite3.OperationalError("disk I/O error")
 
@@ -246,13 +247,13 @@ async def test_room_that_cannot_be_given_back_does_not_undo_what_is_written(path
 
 
 class Faulty(Database):
-    """One with a fault of ours."""
+    """Database with an internal error."""
 
     async def call(self, _: Callable[[sqlite3.Connection], Any]) -> Any:
-        raise KeyError("ours")
+        raise KeyError("internal")
 
 
-async def publish_for_ever(history: History) -> None:
+async def publish_forever(history: History) -> None:
     async with asyncio.timeout(LONG_S):
         while True:
             history.publish(at(0.0))
@@ -260,7 +261,7 @@ async def publish_for_ever(history: History) -> None:
             await asyncio.sleep(0)
 
 
-async def test_a_fault_of_ours_is_seen_and_does_not_end_history_in_silence(path):
+async def test_internal_error_of_the_writing_task_is_raised(path):
     history = await History(Faulty(path), days=366).__aenter__()
-    with pytest.raises(KeyError, match="ours"):
-        await publish_for_ever(history)
+    with pytest.raises(KeyError, match="internal"):
+        await publish_forever(history)

@@ -1,4 +1,4 @@
-"""The real program while the broker is away: what it had estimated comes later, over a kill, in order and once."""
+"""Service during a broker outage: its states arrive later, in order and once, even after a kill."""
 
 import asyncio
 import json
@@ -15,16 +15,16 @@ TOPICS = ("bms/pack/state", "bms/pack/event")
 
 
 def on_disk(path: Path) -> list[tuple[str, str]]:
-    """Topic and time of what waits in the database."""
+    """Return topic and time of the messages in the database."""
     try:
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
             rows = connection.execute("SELECT topic, payload FROM outbox ORDER BY number").fetchall()
     except sqlite3.Error:
-        return []  # not there yet
+        return []  # the file does not exist yet
     return [(topic, json.loads(payload)["time"]) for topic, payload in rows]
 
 
-async def test_states_of_an_outage_outlive_a_kill_and_come_first_in_order_and_once(
+async def test_states_of_an_outage_survive_a_kill_and_arrive_first_in_order_and_once(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
     broker.stop()
@@ -36,15 +36,15 @@ async def test_states_of_an_outage_outlive_a_kill_and_come_first_in_order_and_on
             while len(on_disk(tmp_path / "pack.sqlite")) < 25:  # noqa: ASYNC110 - a file has no event
                 await asyncio.sleep(0.05)
         process.kill()
-    kept = on_disk(tmp_path / "pack.sqlite")
+    stored = on_disk(tmp_path / "pack.sqlite")
     await asyncio.to_thread(broker.start)
     async with Listener(broker) as live, service(pack) as process:
-        await live.wait_json("bms/pack/state", lambda state: state["time"] > kept[-1][1])
+        await live.wait_json("bms/pack/state", lambda state: state["time"] > stored[-1][1])
         await live.wait_json("bms/pack/event", lambda event: event["name"] == "unseen")
         await ended(process)
-        heard = [(topic, json.loads(payload)["time"]) for topic, payload, _ in live.messages if topic in TOPICS]
+        received = [(topic, json.loads(payload)["time"]) for topic, payload, _ in live.messages if topic in TOPICS]
     board.cancel()
-    assert heard[: len(kept)] == kept
-    states = [time for topic, time in heard if topic == TOPICS[0]]
+    assert received[: len(stored)] == stored
+    states = [time for topic, time in received if topic == TOPICS[0]]
     assert states == sorted(set(states))
     assert on_disk(tmp_path / "pack.sqlite") == []

@@ -1,4 +1,4 @@
-"""The outbox against what it promises: in order, nothing lost but what found no room."""
+"""Outbox: order, and no loss except from a full queue."""
 
 import asyncio
 import sqlite3
@@ -16,7 +16,7 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.store import outbox as outbox_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
-from bms_estimator.store.outbox_queue import MEMORY_MOST
+from bms_estimator.store.outbox_queue import MAX_TAIL
 from tests.patience import LONG_S
 
 
@@ -36,14 +36,14 @@ async def taken(outbox: Outbox, most: int) -> list[int]:
         return [int(waiting.message.payload) for waiting in await outbox.take(most)]
 
 
-async def test_messages_are_handed_out_once_and_in_order():
+async def test_messages_are_taken_once_and_in_order():
     outbox = filled(5)
     assert await taken(outbox, 2) == [0, 1]
     assert await taken(outbox, 9) == [2, 3, 4]
     assert outbox.waiting == 5
 
 
-async def test_what_was_not_acknowledged_is_handed_out_again_before_newer_ones():
+async def test_unacknowledged_messages_are_taken_again_before_newer_ones():
     outbox = filled(3)
     first, *_ = await outbox.take(3)
     outbox.sent(first.number)
@@ -53,7 +53,7 @@ async def test_what_was_not_acknowledged_is_handed_out_again_before_newer_ones()
     assert outbox.waiting == 3
 
 
-async def test_who_takes_waits_for_a_message():
+async def test_take_waits_for_a_message():
     outbox = filled(0)
     task = asyncio.create_task(taken(outbox, 1))
     await asyncio.sleep(0)
@@ -62,7 +62,7 @@ async def test_who_takes_waits_for_a_message():
     assert await task == [7]
 
 
-async def test_without_room_the_oldest_goes_that_is_not_on_its_way_and_is_counted():
+async def test_full_queue_drops_and_counts_the_oldest_message_not_in_flight():
     outbox = filled(3, most=3)
     assert await taken(outbox, 1) == [0]
     outbox.put(message(3))
@@ -74,7 +74,7 @@ async def test_without_room_the_oldest_goes_that_is_not_on_its_way_and_is_counte
 
 
 class Counting(Database):
-    """Counts its transactions."""
+    """Database that counts its transactions."""
 
     calls = 0
 
@@ -85,7 +85,7 @@ class Counting(Database):
 
 @pytest.fixture
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of a database that is written a hundred times a second."""
+    """Return the path of a database to which the outbox writes each 10 ms."""
     monkeypatch.setattr(outbox_module, "FLUSH_S", 0.01)
     return tmp_path / "pack.sqlite"
 
@@ -102,22 +102,22 @@ def on_disk(path: Path) -> list[int]:
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
             return [int(payload) for (payload,) in connection.execute("SELECT payload FROM outbox ORDER BY number")]
     except sqlite3.Error:
-        return []  # the table is being made
+        return []  # the table does not exist yet
 
 
-async def test_nothing_is_written_while_the_broker_takes_what_comes(path):
+async def test_nothing_is_written_while_the_broker_acknowledges(path):
     async with Counting(path) as database, Outbox(database, most=100) as outbox:
         outbox.connected = True
         for number in range(50):
             outbox.put(message(number))
             [waiting] = await outbox.take(9)
             outbox.sent(waiting.number)
-            await until(lambda number=number: number + 1 in outbox._seen)
-    assert database.calls == 1, "the look at what an earlier run left"
+            await until(lambda number=number: number + 1 in outbox._next_numbers)
+    assert database.calls == 1, "the backlog of an earlier run is read"
     assert on_disk(path) == []
 
 
-async def test_what_a_connected_broker_does_not_acknowledge_is_written_too(path):
+async def test_messages_that_a_connected_broker_does_not_acknowledge_are_written(path):
     async with Database(path) as database, Outbox(database, most=100) as outbox:
         outbox.connected = True
         outbox.put(message(0))
@@ -125,7 +125,7 @@ async def test_what_a_connected_broker_does_not_acknowledge_is_written_too(path)
         await until(lambda: on_disk(path) == [0])
 
 
-async def test_messages_outlive_a_clean_end_and_come_before_newer_ones(path):
+async def test_messages_of_an_earlier_run_precede_newer_ones(path):
     async with Database(path) as database, Outbox(database, most=100) as outbox:
         for number in range(5):
             outbox.put(message(number))
@@ -139,8 +139,8 @@ async def test_messages_outlive_a_clean_end_and_come_before_newer_ones(path):
     assert got == [1, 2, 3, 4, 5]
 
 
-async def test_more_than_memory_holds_comes_back_from_disk_in_order(path):
-    count = 3 * MEMORY_MOST
+async def test_backlog_beyond_memory_is_read_from_disk_in_order(path):
+    count = 3 * MAX_TAIL
     got: list[int] = []
     async with Database(path) as database, Outbox(database, most=10 * count) as outbox:
         for number in range(count):
@@ -158,10 +158,10 @@ async def test_more_than_memory_holds_comes_back_from_disk_in_order(path):
     assert (outbox.dropped, outbox.waiting) == (0, 0)
 
 
-async def test_a_disk_that_hangs_stops_no_message(path):
+async def test_hung_disk_does_not_block_messages(path):
     gate = threading.Event()
     async with Database(path, hang_s=0.05, retry_s=0.0) as database, Outbox(database, most=100) as outbox:
-        await until(lambda: outbox._opened)
+        await until(lambda: outbox._backlog_read)
         hung = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
         for number in range(5):
             outbox.put(message(number))
@@ -172,7 +172,7 @@ async def test_a_disk_that_hangs_stops_no_message(path):
         await until(lambda: on_disk(path) == [0, 1, 2, 3, 4])
 
 
-async def test_a_start_on_a_disk_that_hangs_sends_what_comes(path):
+async def test_start_with_a_hung_disk_sends_new_messages(path):
     gate = threading.Event()
     async with Database(path, hang_s=0.05, retry_s=0.0) as database:
         hung = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
@@ -184,7 +184,7 @@ async def test_a_start_on_a_disk_that_hangs_sends_what_comes(path):
                 await hung
 
 
-async def test_a_database_that_is_deleted_costs_only_what_was_on_disk_alone_and_that_is_counted(path):
+async def test_deleted_database_loses_and_counts_only_messages_on_disk_alone(path):
     async with Database(path) as database, Outbox(database, most=10_000) as outbox:
         for number in range(1500):
             outbox.put(message(number))
@@ -198,23 +198,23 @@ async def test_a_database_that_is_deleted_costs_only_what_was_on_disk_alone_and_
 
 
 class Faulty(Database):
-    """One with a fault of ours."""
+    """Database with an internal error."""
 
     async def call(self, _: Callable[[sqlite3.Connection], Any]) -> Any:
-        raise KeyError("ours")
+        raise KeyError("internal")
 
 
-async def put_for_ever(outbox: Outbox) -> None:
+async def put_forever(outbox: Outbox) -> None:
     async with asyncio.timeout(LONG_S):
         while True:
             outbox.put(message(0))
             await asyncio.sleep(0)
 
 
-async def test_a_fault_of_ours_is_seen_and_does_not_end_the_writing_in_silence(path):
+async def test_internal_error_of_the_writing_task_is_raised(path):
     outbox = await Outbox(Faulty(path), most=100).__aenter__()
-    with pytest.raises(KeyError, match="ours"):
-        await put_for_ever(outbox)
+    with pytest.raises(KeyError, match="internal"):
+        await put_forever(outbox)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ async def test_a_fault_of_ours_is_seen_and_does_not_end_the_writing_in_silence(p
         ("number", "-9223372036854775807 - 1"),
     ],
 )
-async def test_a_row_that_is_damaged_is_left_out_and_counted(path, column, value):
+async def test_damaged_row_is_skipped_and_counted(path, column, value):
     async with Database(path) as database, Outbox(database, most=100) as outbox:
         for number in range(3):
             outbox.put(message(number))
@@ -250,26 +250,26 @@ async def test_a_row_that_is_damaged_is_left_out_and_counted(path, column, value
     assert on_disk(path) == [0, 2, 3]
 
 
-async def test_a_disk_that_fails_for_long_costs_no_memory(path):
+async def test_memory_is_bounded_while_the_disk_fails(path):
     async with Database(path, retry_s=0.0) as database:
         outbox = Outbox(database, most=100_000)
-        await outbox._settle(write=False)
+        await outbox._sync(write=False)
         path.unlink()
         path.mkdir()
         (path / "file").touch()
-        database._file._refuse_planted = lambda _: None  # type: ignore[method-assign]
-        for number in range(3 * MEMORY_MOST):
+        database._file._quarantine_symlink = lambda _: None  # type: ignore[method-assign]
+        for number in range(3 * MAX_TAIL):
             outbox.put(message(number))
             if number % 1000 == 0:
-                await outbox._settle(write=True)
-        assert outbox.dropped == 2 * MEMORY_MOST
-        assert len(outbox._queue._written) <= MEMORY_MOST
+                await outbox._sync(write=True)
+        assert outbox.dropped == 2 * MAX_TAIL
+        assert len(outbox._queue._written) <= MAX_TAIL
         assert len(outbox._queue.gaps()) == 1
         (path / "file").unlink()
         path.rmdir()
 
 
-KILLED = """
+PUBLISHER = """
 import asyncio, sys
 from pathlib import Path
 from bms_estimator.sinks.mqtt.messages import Message
@@ -287,15 +287,15 @@ asyncio.run(main())
 """
 
 
-def test_kill_9_costs_what_was_not_yet_written_and_nothing_before(tmp_path):
+def test_kill_9_loses_only_unwritten_messages(tmp_path):
     path = tmp_path / "pack.sqlite"
-    with subprocess.Popen([sys.executable, "-c", KILLED, path], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([sys.executable, "-c", PUBLISHER, path], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         seen: list[int] = []
-        while len(seen) < 2:  # as somebody else sees it
+        while len(seen) < 2:
             process.stdout.readline()
             seen = on_disk(path)
         process.kill()
-    kept = on_disk(path)
-    assert kept == list(range(len(kept)))
-    assert len(kept) >= len(seen)
+    stored = on_disk(path)
+    assert stored == list(range(len(stored)))
+    assert len(stored) >= len(seen)

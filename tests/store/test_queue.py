@@ -1,47 +1,47 @@
-"""The order of what waits, without a disk."""
+"""Order of queued messages, without a disk."""
 
 from bms_estimator.mqtt.message import Message
-from bms_estimator.store.outbox_queue import LOWEST, PAGE, Queue
+from bms_estimator.store.outbox_queue import LOWEST, PAGE, OutboxQueue
 
 
-def filled(count: int) -> Queue:
-    """So many messages, all of them written."""
-    queue = Queue(most=10 * PAGE)
+def filled(count: int) -> OutboxQueue:
+    """Return a queue with ``count`` written messages."""
+    queue = OutboxQueue(most=10 * PAGE)
     for number in range(count):
         queue.put(Message("t", str(number).encode(), 1, retain=False))
-    queue.writing(queue.unwritten())
-    queue.wrote()
+    queue.mark_writing(queue.unwritten())
+    queue.mark_written()
     return queue
 
 
-def numbers(queue: Queue, most: int) -> list[int]:
+def numbers(queue: OutboxQueue, most: int) -> list[int]:
     return [int(waiting.message.payload) for waiting in queue.take_next(most)]
 
 
-def test_after_a_lost_connection_what_was_on_its_way_goes_before_what_was_ready():
+def test_messages_in_flight_precede_ready_ones_after_a_rewind():
     queue = filled(5)
     assert numbers(queue, 2) == [0, 1]
     queue.rewind()
     assert numbers(queue, 5) == [0, 1, 2, 3, 4]
 
 
-def test_memory_keeps_a_page_of_what_is_written_and_nothing_newer_passes_what_is_on_disk():
+def test_memory_holds_one_page_and_newer_messages_wait_for_stored_ones():
     queue = filled(PAGE + 7)
     assert list(queue.stored) == [range(PAGE, PAGE + 7)]
     queue.put(Message("t", b"9999", 1, retain=False))
     assert numbers(queue, 2 * PAGE) == list(range(PAGE))
-    assert not queue.can_hand_out
+    assert not queue.can_take
     assert queue.needs_page
     queue.skip_disk = True
     assert numbers(queue, 5) == [9999]
 
 
-def test_what_is_acknowledged_is_removed_from_disk_if_it_ever_was_there():
+def test_acknowledged_messages_are_deleted_only_if_written():
     queue = filled(2)
     queue.put(Message("t", b"2", 1, retain=False))
     _, second, third = queue.take_next(3)
     queue.sent(third.number)
-    assert not queue.stale, "it never was there"
+    assert not queue.stale, "it was never written"
     queue.sent(second.number)
     assert queue.stale
     assert queue.gaps() == [(LOWEST, 0), (1, 3)]

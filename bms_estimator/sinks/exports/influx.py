@@ -1,6 +1,6 @@
-"""The InfluxDB sink: line protocol over HTTP, in batches.
+"""InfluxDB sink: line protocol over HTTP, in batches.
 
-``publish`` puts lines in a queue; a task takes them from there to a thread that waits for the server. The loop never waits.
+``publish`` queues lines. A task sends them in a thread, so that the event loop never waits for the server.
 """
 
 import asyncio
@@ -27,31 +27,31 @@ from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.line_protocol import lines
 
 MAX_WAITING = 10_000
-"""Lines that wait for a server that is away, hours of states at one a second; beyond it the oldest is dropped."""
+"""Maximum number of queued lines, hours of states at one a second; beyond it the oldest is dropped."""
 BATCH = 1000
-"""Lines in one request, a megabyte at most."""
-ANSWER_S = 10.0
+"""Maximum number of lines in a request, about a megabyte."""
+RESPONSE_TIMEOUT_S = 10.0
 """Timeout of a server response [s]."""
 CLOSING_S = 3.0
 """Timeout of the last request [s]."""
-NEVER = (400, 413, 422)
-"""Answers to what will never be taken: the lines are given up. All others may pass."""
-MAX_SHOWN = 200
+PERMANENT_ERRORS = (400, 413, 422)
+"""HTTP status codes of lines that the server will never accept. After any other code the lines are retried."""
+MAX_LOGGED = 200
 """Maximum length of a response in the log [characters]."""
 
 log = structlog.get_logger(__name__)
 
 
 class RefusedError(Exception):
-    """The server's no, in words."""
+    """The server did not accept the lines."""
 
-    def __init__(self, why: str, *, for_now: bool) -> None:
-        super().__init__(why)
-        self.for_now = for_now
+    def __init__(self, reason: str, *, is_retryable: bool) -> None:
+        super().__init__(reason)
+        self.is_retryable = is_retryable
 
 
 class Target(NamedTuple):
-    """Destination of the lines, with all files read."""
+    """Destination of the lines, with credentials read from their files."""
 
     url: str
     headers: dict[str, str]
@@ -62,8 +62,8 @@ class InfluxSink:
     """Writes states and alarms of one pack.
 
     Args:
-        settings: The server.
-        first_delay_s: Delay before a server that is away is retried; it grows as in ``Backoff`` [s].
+        settings: Settings of the server.
+        first_delay_s: Delay before an unavailable server is retried; it grows as in ``Backoff`` [s].
 
     Raises:
         UserError: A file of ``settings`` cannot be used.
@@ -72,24 +72,24 @@ class InfluxSink:
     def __init__(self, settings: InfluxSettings, *, first_delay_s: float = FIRST_DELAY_S) -> None:
         target(settings)  # unusable settings are reported at start
         self._settings = settings
-        self._pauses = Backoff(first_delay_s)
+        self._backoff = Backoff(first_delay_s)
         self._waiting: deque[str] = deque()
-        self._batch: list[str] = []  # on its way
+        self._batch: list[str] = []  # lines of the current request
         self._before: Snapshot | None = None
         self._full, self._closing = asyncio.Event(), asyncio.Event()
-        self._said = ""
+        self._failure = ""  # reason for the last failed request; empty after a success
         self._thread = DiskThread("influx")
         self._task: asyncio.Task[None] | None = None
         self.dropped = 0
-        """Lines that found no room, or that the server will never take."""
+        """Number of lines dropped from a full queue or permanently rejected by the server."""
 
     @property
     def waiting(self) -> int:
-        """Lines that the server has not taken yet."""
+        """Number of lines that the server has not accepted yet."""
         return len(self._waiting) + len(self._batch)
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Take a snapshot; returns at once."""
+        """Queue the lines of a snapshot without waiting."""
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
         self._waiting.extend(lines(self._before, snapshot))
@@ -101,12 +101,12 @@ class InfluxSink:
             self._full.set()
 
     async def __aenter__(self) -> Self:
-        """Start."""
+        """Start the sending task."""
         self._task = asyncio.create_task(self._run(), name="influx")
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Write what waits, in a bounded time."""
+        """Send the queued lines within ``CLOSING_S``."""
         if self._task is None:
             return
         self._closing.set()
@@ -118,18 +118,18 @@ class InfluxSink:
             await self._task
 
     async def _run(self) -> None:
-        """Write queued points every ``every_s``, sooner when a batch is full.
+        """Send queued lines every ``every_s``, or sooner if a batch is full.
 
-        After a failure wait longer each time.
+        After a failure, wait for the backoff delay.
         """
         delay_s = self._settings.every_s
         while True:
-            await self._wait(self._closing if self._said else self._full, delay_s)
+            await self._wait(self._closing if self._failure else self._full, delay_s)
             self._full.clear()
-            well = await self._write()
+            succeeded = await self._write()
             if self._closing.is_set():
                 return
-            delay_s = self._settings.every_s if well else self._pauses.next_s()
+            delay_s = self._settings.every_s if succeeded else self._backoff.next_s()
 
     async def _wait(self, event: asyncio.Event, delay_s: float) -> None:
         with contextlib.suppress(TimeoutError):
@@ -137,7 +137,7 @@ class InfluxSink:
                 await event.wait()
 
     async def _write(self) -> bool:
-        """Batch after batch until nothing waits; False: the server is to be tried again."""
+        """Send batches until the queue is empty. Return False if the server must be retried."""
         loop = asyncio.get_running_loop()
         while self.waiting:
             while self._waiting and len(self._batch) < BATCH:
@@ -145,30 +145,30 @@ class InfluxSink:
             try:
                 await loop.run_in_executor(self._thread, partial(_post, self._settings, "\n".join(self._batch)))
             except RefusedError as error:
-                self._log(str(error))
-                if error.for_now:
+                self._log_failure(str(error))
+                if error.is_retryable:
                     return False
                 self.dropped += len(self._batch)
             else:
-                self._well()
+                self._record_success()
             self._batch = []
         return True
 
-    def _log(self, why: str) -> None:
-        """Log a reason, once."""
-        if why != self._said:
-            self._said = why
-            log.warning("influxdb takes nothing", url=self._settings.url, reason=why, lines_waiting=self.waiting)
+    def _log_failure(self, reason: str) -> None:
+        """Log a reason if it has changed."""
+        if reason != self._failure:
+            self._failure = reason
+            log.warning("influxdb rejects lines", url=self._settings.url, reason=reason, lines_waiting=self.waiting)
 
-    def _well(self) -> None:
-        if self._said:
-            log.info("influxdb takes lines again", url=self._settings.url, lines_lost=self.dropped)
-            self._said = ""
-        self._pauses.reset()
+    def _record_success(self) -> None:
+        if self._failure:
+            log.info("influxdb accepts lines again", url=self._settings.url, lines_lost=self.dropped)
+            self._failure = ""
+        self._backoff.reset()
 
 
 def target(settings: InfluxSettings) -> Target:
-    """Return the destination of the lines; files are reloaded each time, so that they can be replaced.
+    """Return the destination of the lines. Files are reloaded each time, because they may have been replaced.
 
     Raises:
         UserError: A file cannot be used.
@@ -183,7 +183,7 @@ def target(settings: InfluxSettings) -> Target:
     if settings.url.startswith("https:"):
         try:
             context = ssl.create_default_context(cafile=settings.ca_file)
-        except OSError as error:  # ssl.SSLError is one
+        except OSError as error:  # includes ssl.SSLError
             raise UserError(f"influx.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     headers = {"Content-Type": "text/plain; charset=utf-8"} | authorization
     return Target(f"{settings.url.rstrip('/')}{url}?{urllib.parse.urlencode(query)}", headers, context)
@@ -194,7 +194,7 @@ def _token(settings: InfluxSettings) -> dict[str, str]:
         return {}
     token = _secret("token_file", settings.token_file)
     if not token.isascii():
-        raise UserError(f"influx.token_file = {settings.token_file}: must hold ASCII: no header can hold the rest")
+        raise UserError(f"influx.token_file = {settings.token_file}: must be ASCII, because it is sent in a header")
     return {"Authorization": f"Token {token}"}
 
 
@@ -210,13 +210,13 @@ def _secret(key: str, path: Path) -> str:
     """Read the single line of a file.
 
     Raises:
-        UserError: It cannot be read, or is no line of text.
+        UserError: The file cannot be read, or is not one line of text.
     """
     try:
         secret = credential(path).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise UserError(f"influx.{key} = {path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:  # whose text contains the bytes
+    except UnicodeDecodeError:  # its text would show bytes of the secret
         raise UserError(f"influx.{key} = {path}: cannot be read: not UTF-8 text") from None
     if not secret.isprintable():
         raise UserError(f"influx.{key} = {path}: must hold one line of text")
@@ -224,7 +224,7 @@ def _secret(key: str, path: Path) -> str:
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    """A redirected POST would become a GET, which writes nothing and succeeds."""
+    """Handler that rejects redirects: a redirected POST would become a GET, which succeeds and writes nothing."""
 
     def redirect_request(self, *_: Any) -> None:
         return None
@@ -234,32 +234,32 @@ def _post(settings: InfluxSettings, body: str) -> None:
     """Write lines.
 
     Raises:
-        RefusedError: The server has not taken them.
+        RefusedError: The server has not accepted the lines.
     """
     try:
         url, headers, context = target(settings)
         request = urllib.request.Request(url, body.encode(), headers, method="POST")  # noqa: S310 - http or https, as the settings check
         opener = urllib.request.build_opener(_NoRedirect, urllib.request.HTTPSHandler(context=context))
-        with opener.open(request, timeout=ANSWER_S):
+        with opener.open(request, timeout=RESPONSE_TIMEOUT_S):
             return
     except urllib.error.HTTPError as error:
-        why = f"{error.code} {error.reason}: {_shown(_answer(error))}"
-        raise RefusedError(why, for_now=error.code not in NEVER) from None
+        reason = f"{error.code} {error.reason}: {_printable(_response_start(error))}"
+        raise RefusedError(reason, is_retryable=error.code not in PERMANENT_ERRORS) from None
     except urllib.error.URLError as error:
-        raise RefusedError(str(error.reason), for_now=True) from None
-    except (OSError, http.client.HTTPException, UnicodeError, UserError) as error:  # Unicode: of a host that cannot be
-        raise RefusedError(str(error) or type(error).__name__, for_now=True) from None
+        raise RefusedError(str(error.reason), is_retryable=True) from None
+    except (OSError, http.client.HTTPException, UnicodeError, UserError) as error:  # UnicodeError: invalid host name
+        raise RefusedError(str(error) or type(error).__name__, is_retryable=True) from None
 
 
-def _answer(error: urllib.error.HTTPError) -> bytes:
+def _response_start(error: urllib.error.HTTPError) -> bytes:
     """Return the start of the server's response; empty without one."""
     try:
         with error:
-            return error.read(MAX_SHOWN * 4)
+            return error.read(MAX_LOGGED * 4)
     except (OSError, http.client.HTTPException):
         return b""
 
 
-def _shown(answer: bytes) -> str:
-    """Return the part of a response to log."""
-    return "".join(c for c in answer.decode(errors="replace") if c.isprintable())[:MAX_SHOWN]
+def _printable(response: bytes) -> str:
+    """Return the printable start of a response, for the log."""
+    return "".join(c for c in response.decode(errors="replace") if c.isprintable())[:MAX_LOGGED]

@@ -1,4 +1,4 @@
-"""A snapshot as lines of InfluxDB's protocol, named as a Telegraf that reads MQTT names them. Pure."""
+"""Conversion of snapshots to InfluxDB's line protocol, with the names that Telegraf gives MQTT payloads. Pure."""
 
 from collections.abc import Iterator, Mapping
 from datetime import datetime
@@ -6,21 +6,21 @@ from datetime import datetime
 from bms_estimator.model.payloads import Alarm, Estimate, Snapshot
 
 STATE, ALARM = "bms_state", "bms_alarm"
-"""Measurements; the tag ``device`` is the pack."""
+"""Names of the measurements. Their tag ``device`` is the pack."""
 
 
 def lines(before: Snapshot | None, snapshot: Snapshot) -> list[str]:
-    """Return the state, if there is one, and the changed alarms as lines; times in milliseconds.
+    """Return lines of the state, if there is one, and of changed alarms, with times in milliseconds.
 
     Args:
-        before: The snapshot before; None of the first.
-        snapshot: The snapshot.
+        before: Previous snapshot; None for the first one.
+        snapshot: Snapshot to convert.
     """
     device = snapshot.info.device
-    told = [_state(device, snapshot.estimate)] if snapshot.estimate else []
-    known = {alarm.name: alarm for alarm in before.alarms} if before else {}
-    changed = [alarm for alarm in snapshot.alarms if known.get(alarm.name) != alarm]
-    return told + [_alarm(device, alarm, snapshot.health.publish_time) for alarm in changed]
+    state = [_state(device, snapshot.estimate)] if snapshot.estimate else []
+    previous = {alarm.name: alarm for alarm in before.alarms} if before else {}
+    changed = [alarm for alarm in snapshot.alarms if previous.get(alarm.name) != alarm]
+    return state + [_alarm(device, alarm, snapshot.health.publish_time) for alarm in changed]
 
 
 def _state(device: str, estimate: Estimate) -> str:
@@ -31,19 +31,22 @@ def _state(device: str, estimate: Estimate) -> str:
 
 def _alarm(device: str, alarm: Alarm, time: str) -> str:
     fields = {"active": alarm.active, "watched": alarm.watched, "value": alarm.value, "limit": alarm.limit}
-    told = [*_fields(fields), f"text={_quoted(alarm.text)}"]
-    return f"{ALARM},device={device},name={alarm.name},severity={alarm.severity} {','.join(told)} {_ms(time)}"
+    items = [*_fields(fields), f"text={_quoted(alarm.text)}"]
+    return f"{ALARM},device={device},name={alarm.name},severity={alarm.severity} {','.join(items)} {_ms(time)}"
 
 
 def _fields(values: Mapping[str, object]) -> Iterator[str]:
-    """Numbers, all as floats so that no field changes its type, and truth values; a list by its places from 0."""
+    """Yield Booleans and numbers as fields, and list items as fields numbered from 0.
+
+    All numbers become floats, because a field must not change its type.
+    """
     for name, value in values.items():
         if isinstance(value, bool):
             yield f"{name}={'true' if value else 'false'}"
         elif isinstance(value, int | float):
             yield f"{name}={float(value)!r}"
         elif isinstance(value, list):
-            yield from _fields({f"{name}_{place}": item for place, item in enumerate(value)})
+            yield from _fields({f"{name}_{index}": item for index, item in enumerate(value)})
 
 
 def _quoted(text: str) -> str:

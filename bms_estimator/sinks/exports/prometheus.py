@@ -1,4 +1,4 @@
-"""The Prometheus sink: the last snapshot, for whoever fetches it. Needs prometheus-client."""
+"""Prometheus sink: serves metrics of the last snapshot. Needs prometheus-client."""
 
 import contextlib
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ class PrometheusSink(Collector):
     """Serves metrics on its own address, in the event loop.
 
     Args:
-        settings: The address.
+        settings: Listening address.
     """
 
     def __init__(self, settings: PrometheusSettings) -> None:
@@ -35,7 +35,7 @@ class PrometheusSink(Collector):
         self._stack = contextlib.AsyncExitStack()
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Take a snapshot; returns at once."""
+        """Store a snapshot for the next scrape."""
         self._last = snapshot
 
     def collect(self) -> Iterable[Metric]:
@@ -43,10 +43,10 @@ class PrometheusSink(Collector):
         return metrics(self._last) if self._last is not None else ()
 
     async def __aenter__(self) -> Self:
-        """Listen.
+        """Start listening.
 
         Raises:
-            UserError: The address cannot be listened on.
+            UserError: The address cannot be used.
         """
         server = web.Server(self._answer)
         listener = Listener(server)

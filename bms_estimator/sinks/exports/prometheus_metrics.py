@@ -1,4 +1,4 @@
-"""Prometheus metrics of a pack: names of the payloads' fields with the base unit of Prometheus at the end.
+"""Prometheus metrics of a pack, named by the payloads' fields with Prometheus' base unit as suffix.
 
 ``voltage_v`` is ``bms_voltage_volts``, ``energy_out_kwh`` is ``bms_energy_out_joules_total``. Needs prometheus-client.
 """
@@ -12,7 +12,7 @@ from bms_estimator.model.payloads import Estimate, Health, Snapshot
 
 
 class Unit(NamedTuple):
-    """A unit of Prometheus."""
+    """Base unit of Prometheus."""
 
     name: str
     factor: float = 1.0
@@ -33,9 +33,9 @@ UNITS = {
     "wh": Unit("joules", 3600.0),
     "kwh": Unit("joules", 3.6e6),
 }
-"""Last part of a field's name -> its unit."""
+"""Units by the last part of a field's name."""
 RATIOS = ("soc", "soc_std", "soc_coulomb", "soc_ocv", "delta_1", "delta_2", "stability_margin")
-"""Shares of 1."""
+"""Fields from 0 to 1."""
 COUNTERS = (
     "frames_received",
     "frames_lost",
@@ -52,17 +52,17 @@ COUNTERS = (
     "broker_losses",
     "availability_corrections",
 )
-"""Fields that only grow."""
+"""Fields that never decrease, except after a restart."""
 LEFT_OUT = ("soc_percent", "board_time_s")
 """Fields that repeat another one, or a clock with an arbitrary origin."""
-KINDS = {"line": "what the line counted", "samples": "samples by what became of them", "requests": "requests by kind"}
-"""Fields of the health payload that count by kind -> their help text."""
-OWN_NAMES = {"cells_v": "cell"}
-"""Lists -> what one of them is."""
+KINDS = {"line": "counters of the link", "samples": "samples by result", "requests": "requests by result"}
+"""Help texts of the health payload's counters by kind."""
+LIST_ITEMS = {"cells_v": "cell"}
+"""Names of an item by list field."""
 
 
 def metrics(snapshot: Snapshot) -> Iterator[Metric]:
-    """All there is of a pack; the state only while values are fresh."""
+    """Yield all metrics of a pack; those of the state only while values are fresh."""
     device, health = snapshot.info.device, snapshot.health
     if snapshot.estimate is not None and health.sensor_online:
         yield from _fields(device, snapshot.estimate, Estimate)
@@ -72,31 +72,31 @@ def metrics(snapshot: Snapshot) -> Iterator[Metric]:
     yield _elements(device, snapshot)
     yield _alarms(device, snapshot)
     yield _watched(device, snapshot)
-    info = GaugeMetricFamily("bms_info", "what this is; always 1", labels=["device", "cell", "version"])
+    info = GaugeMetricFamily("bms_info", "cell and version; always 1", labels=["device", "cell", "version"])
     info.add_metric([device, snapshot.info.cell, snapshot.info.version], 1.0)
     yield info
 
 
 def _fields(device: str, report: Estimate | Health, model: type[Estimate | Health]) -> Iterator[Metric]:
-    """Numbers and truth values of a payload."""
+    """Yield metrics of the numbers and Booleans of a payload."""
     for name, field in model.model_fields.items():
-        value, said = getattr(report, name), field.description or name
+        value, help_text = getattr(report, name), field.description or name
         if name in LEFT_OUT:
             continue
         if isinstance(value, bool | int | float):
-            full, factor = named(name)
+            metric_name, factor = name_and_factor(name)
             family = CounterMetricFamily if name in COUNTERS else GaugeMetricFamily
-            metric = family(full, said, labels=["device"])
+            metric = family(metric_name, help_text, labels=["device"])
             metric.add_metric([device], value * factor)
             yield metric
-        elif isinstance(value, list) and name in OWN_NAMES:
-            yield _places(device, name, said, value)
+        elif isinstance(value, list) and name in LIST_ITEMS:
+            yield _list_metric(device, name, help_text, value)
 
 
-def _places(device: str, name: str, said: str, values: Iterable[float | None]) -> Metric:
-    """Yield the metrics of a list, numbered from 1."""
-    full, factor = named(f"{OWN_NAMES[name]}_{name.rsplit('_', 1)[-1]}")
-    metric = GaugeMetricFamily(full, said, labels=["device", OWN_NAMES[name]])
+def _list_metric(device: str, name: str, help_text: str, values: Iterable[float | None]) -> Metric:
+    """Return the metric of a list, with items numbered from 1."""
+    metric_name, factor = name_and_factor(f"{LIST_ITEMS[name]}_{name.rsplit('_', 1)[-1]}")
+    metric = GaugeMetricFamily(metric_name, help_text, labels=["device", LIST_ITEMS[name]])
     for number, value in enumerate(values, start=1):
         if value is not None:
             metric.add_metric([device, str(number)], value * factor)
@@ -111,8 +111,10 @@ def _by_kind(device: str, name: str, meaning: str, counts: Mapping[str, int]) ->
 
 
 def _elements(device: str, snapshot: Snapshot) -> Metric:
-    """Learned parameters that may be relied on, in the unit of their names."""
-    metric = GaugeMetricFamily("bms_element", "in the SI unit of its name", labels=["device", "element"])
+    """Return the metric of valid learned parameters."""
+    metric = GaugeMetricFamily(
+        "bms_element", "learned parameter, in the unit of its name", labels=["device", "element"]
+    )
     for name, parameter in snapshot.parameters.elements.items():
         if parameter.valid and parameter.value is not None:
             metric.add_metric([device, name], parameter.value)
@@ -120,21 +122,21 @@ def _elements(device: str, snapshot: Snapshot) -> Metric:
 
 
 def _alarms(device: str, snapshot: Snapshot) -> Metric:
-    metric = GaugeMetricFamily("bms_alarm", "1 while it is raised", labels=["device", "name", "severity"])
+    metric = GaugeMetricFamily("bms_alarm", "1 while the alarm is raised", labels=["device", "name", "severity"])
     for alarm in snapshot.alarms:
         metric.add_metric([device, alarm.name, alarm.severity], float(alarm.active))
     return metric
 
 
 def _watched(device: str, snapshot: Snapshot) -> Metric:
-    meaning = "0 while what the alarm needs is missing, so that it cannot be raised"
+    meaning = "0 while a quantity that the alarm needs is missing, so that it cannot be raised"
     metric = GaugeMetricFamily("bms_alarm_watched", meaning, labels=["device", "name", "severity"])
     for alarm in snapshot.alarms:
         metric.add_metric([device, alarm.name, alarm.severity], float(alarm.watched))
     return metric
 
 
-def named(field: str) -> tuple[str, float]:
+def name_and_factor(field: str) -> tuple[str, float]:
     """Return a field's metric name without ``_total``, and its scale factor."""
     if field in RATIOS:
         return f"bms_{field}_ratio", 1.0

@@ -1,4 +1,4 @@
-"""Home Assistant's device discovery: one retained message that describes all entities of one pack."""
+"""Device discovery of Home Assistant: one retained message that describes all entities of a pack."""
 
 import math
 from collections.abc import Mapping
@@ -11,21 +11,29 @@ from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.mqtt import Command
 from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
-from bms_estimator.sinks.home_assistant.entities import BATTERY, CELL, FUEL_CELL, OF_CELLS, Entity, cell_key, entities
+from bms_estimator.sinks.home_assistant.entities import (
+    BATTERY,
+    CELL,
+    CELL_VOLTAGES,
+    FUEL_CELL,
+    Entity,
+    cell_key,
+    entities,
+)
 
 VALUES = "home_assistant"
-"""Topic below the device's."""
+"""Topic of the values, below the device's."""
 MIN_EXPIRY_S = 30
-"""Home Assistant calls no value unavailable that is younger than this [s]."""
+"""Minimum age at which Home Assistant shows a value as unavailable [s]."""
 _ALARM_CLASSES: Mapping[str, str] = {name: kind.device_class for name, kind in ALARM_KINDS.items()}
-_SEES = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
-"""A raised alarm stays on, although its quantity may be lost later."""
-NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
-"""All that ``[home_assistant.names]`` may name."""
+_ALARM_AVAILABILITY = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
+"""Template of an alarm's availability. A raised alarm stays available even if its quantity is lost later."""
+NAMEABLE = {*BATTERY, *FUEL_CELL, *CELL_VOLTAGES, CELL, *ALARMS, *get_args(Command)}
+"""Entities that ``[home_assistant.names]`` may rename."""
 
 
 class DiscoveryInputs(NamedTuple):
-    """On what depends which entities there are."""
+    """Data that determine the entities of a pack."""
 
     info: Info
     cells: int = 0
@@ -34,15 +42,19 @@ class DiscoveryInputs(NamedTuple):
     commands: tuple[str, ...] = ()
     """Allowed commands."""
     unwatched: tuple[str, ...] = ()
-    """Alarms that are not monitored; other settings may have had them."""
+    """Alarms that are not monitored; an earlier configuration may have monitored them."""
 
 
 def check_names(settings: HomeAssistantSettings) -> None:
-    """Check the entity names of the settings; raises UserError for an unknown entity."""
-    unknown = sorted(set(settings.names) - NAMED)
+    """Check the entity names of the settings.
+
+    Raises:
+        UserError: An entity is unknown.
+    """
+    unknown = sorted(set(settings.names) - NAMEABLE)
     if unknown:
         raise UserError(
-            f"home_assistant.names.{unknown[0]}: there is no such entity; there are {', '.join(sorted(NAMED))}"
+            f"home_assistant.names.{unknown[0]}: there is no such entity; there are {', '.join(sorted(NAMEABLE))}"
         )
 
 
@@ -63,7 +75,7 @@ def discovery(
 
     Args:
         settings: Settings of Home Assistant.
-        described: What there is of it.
+        described: Data that determine the entities.
         root: Topic of the device, ``bms/<device>``.
         sample_period_s: Sample period [s].
     """
@@ -106,9 +118,11 @@ def discovery(
 
 
 def _removed(described: DiscoveryInputs) -> dict[str, dict[str, str]]:
-    """Return components that an earlier configuration may have had; a component with only a platform is removed."""
+    """Return components that an earlier configuration may have had. Only a platform makes Home Assistant remove them."""
     platforms = {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
-    platforms |= {name: made("")["platform"] for name, made in _COMMANDS.items() if name not in described.commands}
+    platforms |= {
+        name: control("")["platform"] for name, control in _COMMANDS.items() if name not in described.commands
+    }
     return {key: {"platform": platform} for key, platform in platforms.items()}
 
 
@@ -124,9 +138,9 @@ def _named(names: Mapping[str, str], key: str) -> dict[str, str]:
 
 
 def _identity(device: str, key: str, platform: str) -> dict[str, str]:
-    """Return an entity id that does not depend on the name, so that a dashboard fits any language.
+    """Return an entity id that does not depend on the name, so that a dashboard works in any language.
 
-    Before 2025.10 the key was ``object_id``, which later versions ignore beside the new one.
+    Home Assistant before 2025.10 reads ``object_id``; later versions ignore it beside ``default_entity_id``.
     """
     entity = f"{device_id(device)}_{key}"
     return {"unique_id": entity, "default_entity_id": f"{platform}.{entity}", "object_id": entity}
@@ -157,7 +171,7 @@ def _sign(root: str, positive: str) -> dict[str, str]:
 
 
 def _alarm(name: str, root: str) -> dict[str, Any]:
-    """On while it is active; unavailable, and never off, while it cannot be watched."""
+    """Return the sensor of an alarm: on while raised, unavailable instead of off while it cannot be monitored."""
     topic = f"{root}/alarm/{name}"
     return {
         "platform": "binary_sensor",
@@ -166,14 +180,17 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
         "value_template": "{{ 'ON' if value_json.active else 'OFF' }}",
         "json_attributes_topic": topic,
         "json_attributes_template": "{{ {'reason': value_json.text, 'severity': value_json.severity} | tojson }}",
-        "availability": [{"topic": f"{root}/availability"}, {"topic": topic, "value_template": _SEES}],
+        "availability": [{"topic": f"{root}/availability"}, {"topic": topic, "value_template": _ALARM_AVAILABILITY}],
         "availability_mode": "all",
         "device_class": _ALARM_CLASSES[name],
     }
 
 
 def _set_soc(root: str) -> dict[str, Any]:
-    """Return the control that sets the SOC. It shows the last set value, because the live SOC would add a row per change."""
+    """Return the control that sets the SOC.
+
+    It shows the last set value, because the live SOC would add a row to the recorder with each change.
+    """
     return {
         "platform": "number",
         "name": "Set state of charge",
@@ -193,7 +210,7 @@ def _current_zero(root: str) -> dict[str, Any]:
 
 
 def _acknowledge(root: str) -> dict[str, Any]:
-    """All alarms at once."""
+    """Return the button that acknowledges all alarms."""
     availability = {"availability": [{"topic": f"{root}/availability"}]}
     return _button("Acknowledge alarms", f"{root}/request/acknowledge_alarm") | availability
 

@@ -1,7 +1,7 @@
-"""The numbers that Home Assistant shows of a pack.
+"""Numeric entities of a pack in Home Assistant.
 
-Home Assistant keeps a row for each change of each entity. So it gets topics of its own, rounded and slow
-(``entity_values``); what only a researcher looks at is there but disabled until he enables it.
+Home Assistant's recorder stores a row for each change of each entity. Its values therefore have a separate topic, on
+which they are rounded and published rarely (``entity_values``). Entities for research are disabled by default.
 """
 
 import math
@@ -9,34 +9,34 @@ from typing import NamedTuple
 
 from bms_estimator.model.payloads import Info
 
-QUICK_S = 15.0
-"""Minimum interval of a value that the load moves all the time [s]: four rows a minute."""
-SLOW_S = 60.0
-"""All other values [s]."""
+FAST_INTERVAL_S = 15.0
+"""Minimum interval between two rows of a value that follows the load [s]."""
+SLOW_INTERVAL_S = 60.0
+"""Minimum interval between two rows of any other value [s]."""
 
 
 class Entity(NamedTuple):
-    """A number that Home Assistant shows."""
+    """Numeric entity of Home Assistant."""
 
     name: str | None
-    """Name; None: Home Assistant names it by its device class, in the user's language."""
+    """Name; None: Home Assistant's name of the device class, in the user's language."""
     unit: str | None
     decimals: int
-    """Decimals to which it is rounded."""
+    """Number of decimals of a published value."""
     step: float
-    """Minimum change of a published value, in its unit, above its noise."""
+    """Minimum change that is published, in the entity's unit; it exceeds the noise."""
     device_class: str | None = None
-    min_interval_s: float = SLOW_S
-    """Nor more often than this [s]."""
+    min_interval_s: float = SLOW_INTERVAL_S
+    """Minimum interval between two published changes [s]."""
     is_primary: bool = False
     """True for a primary entity; others are listed as diagnostics."""
     enabled: bool = True
     """True if enabled by default."""
     state_class: str | None = "measurement"
     signed: bool = False
-    """True if its sign is that of the current."""
+    """True if the sign depends on the configured direction of positive current."""
     immediate_step: float = math.inf
-    """Change that is published at once, because a user has set the value."""
+    """Minimum change that is published at once, as after a user has set the SOC."""
 
 
 def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
@@ -45,20 +45,20 @@ def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = 
 
 
 def _total(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
-    """Total over all runs."""
+    """Return the entity of a total over all runs."""
     step = 10.0**-decimals
     return Entity(name, unit, decimals, step, device_class, is_primary=True, state_class="total_increasing")
 
 
 def _count(name: str) -> Entity:
-    """Count since start."""
+    """Return the entity of a counter since start."""
     return Entity(name, None, 0, 1.0, enabled=False, state_class="total_increasing")
 
 
 ESTIMATE = {
-    "voltage_v": Entity(None, "V", 2, 0.02, "voltage", QUICK_S, is_primary=True),
-    "current_a": Entity(None, "A", 2, 0.05, "current", QUICK_S, is_primary=True, signed=True),
-    "power_w": Entity(None, "W", 1, 0.5, "power", QUICK_S, is_primary=True, signed=True),
+    "voltage_v": Entity(None, "V", 2, 0.02, "voltage", FAST_INTERVAL_S, is_primary=True),
+    "current_a": Entity(None, "A", 2, 0.05, "current", FAST_INTERVAL_S, is_primary=True, signed=True),
+    "power_w": Entity(None, "W", 1, 0.5, "power", FAST_INTERVAL_S, is_primary=True, signed=True),
     "temperature_c": Entity(None, "°C", 1, 0.3, "temperature", is_primary=True),
     "energy_out_kwh": _total("Energy out", "kWh", 3, "energy"),
     "energy_in_kwh": _total("Energy in", "kWh", 3, "energy"),
@@ -72,7 +72,7 @@ ESTIMATE = {
     "adaptation_gain_hz": _raw("Adaptation gain", "1/s", 4),
     "sample_rate_hz": _raw("Sample rate", "Hz", 1, "frequency"),
 }
-OF_CHARGE = {
+CHARGE_STATE = {
     "soc_percent": Entity(None, "%", 1, 0.2, "battery", is_primary=True, immediate_step=2.0),
     "soc_std_percent": Entity("State of charge, standard deviation", "%", 1, 0.2, is_primary=True),
     "remaining_capacity_ah": Entity("Remaining capacity", "Ah", 2, 0.02, is_primary=True),
@@ -88,26 +88,25 @@ OF_CHARGE = {
     "delta_2": _raw("delta 2", None, 4),
     "nussbaum_gain": _raw("Nussbaum gain", None, 3),
 }
-"""Entities that a fuel cell does not have."""
-OF_CELLS = {
+"""Entities of a battery that a fuel cell does not have."""
+CELL_VOLTAGES = {
     "cell_lowest": Entity("Weakest cell", None, 0, 1.0, state_class=None),
     "cell_lowest_v": Entity("Weakest cell, voltage", "V", 3, 0.005, "voltage"),
     "cell_highest": Entity("Highest cell", None, 0, 1.0, enabled=False, state_class=None),
     "cell_highest_v": _raw("Highest cell, voltage", "V", 3, "voltage"),
 }
-"""Entities of packs with cell voltages."""
+"""Entities of packs with measured cell voltages."""
 CELL = "cell_v"
-"""Names all single cells, with their number behind."""
+"""Key in ``[home_assistant.names]`` that renames the voltages of all single cells; each name ends in the number."""
 ELEMENTS = {
-    # by element of the parameters
     "r_s_ohm": Entity("R_s", "Ω", 4, 0.0005),
     "r_ts_ohm": _raw("R_ts", "Ω", 4),
     "r_tl_ohm": _raw("R_tl", "Ω", 4),
     "c_ts_farad": _raw("C_ts", "F", 0),
     "c_tl_farad": _raw("C_tl", "F", 0),
 }
+"""Entities of a battery's learned parameters, by element of ``ParameterReport``."""
 STACK = {
-    # by element of the parameters of a fuel cell
     "r_ohm": Entity("Resistance", "Ω", 4, 0.0005),
     "tafel_slope_v": _raw("Tafel slope", "V", 4),
     "exchange_current_a": _raw("Exchange current", "A", 9),
@@ -116,18 +115,19 @@ STACK = {
     "limiting_current_a": _raw("Limiting current", "A", 2),
     "internal_current_a": _raw("Internal current", "A", 4),
 }
-BATTERY = ESTIMATE | OF_CHARGE | ELEMENTS
+"""Entities of a fuel cell's learned parameters, by element of ``ParameterReport``."""
+BATTERY = ESTIMATE | CHARGE_STATE | ELEMENTS
 FUEL_CELL = ESTIMATE | STACK
 
 
 def cell_key(number: int) -> str:
-    """Entity of the voltage of a single cell, numbers from 1."""
+    """Return the key of a single cell's voltage; numbers start from 1."""
     return f"cell_{number}_v"
 
 
 def entities(info: Info, cells: int) -> dict[str, Entity]:
-    """Return the numeric entities of a pack by key; ``cells`` of its cells are measured."""
-    shown = FUEL_CELL if info.capacity_ah is None else BATTERY
+    """Return the numeric entities of a pack with ``cells`` measured cells, by key."""
+    common = FUEL_CELL if info.capacity_ah is None else BATTERY
     if not cells:
-        return shown
-    return shown | OF_CELLS | {cell_key(n): _raw(f"Cell {n}", "V", 3, "voltage") for n in range(1, cells + 1)}
+        return common
+    return common | CELL_VOLTAGES | {cell_key(n): _raw(f"Cell {n}", "V", 3, "voltage") for n in range(1, cells + 1)}

@@ -1,6 +1,7 @@
-"""Values for Home Assistant: a value is published when it has moved and enough time has passed.
+"""Values for Home Assistant: a value is published if it has changed enough and its minimum interval has passed.
 
-Its recorder writes a row for each. If all entities change constantly, those that were unchanged longest come first.
+Home Assistant's recorder writes a row for each published value, so that the number of rows a minute is limited. If more
+entities change, those published longest ago come first.
 """
 
 import math
@@ -12,20 +13,21 @@ from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs
 from bms_estimator.sinks.home_assistant.entities import Entity, cell_key, entities
 
 MAX_ROWS = 18
-"""Maximum number of default-enabled values published in a minute; two more are reserved for alarms."""
+"""Maximum number of published values of default-enabled entities in a minute, so that two of 20 are left for alarms."""
 MINUTE_S = 60.0
-PAUSE_S = 5.0
-"""Interval between two messages with values [s]."""
+MESSAGE_INTERVAL_S = 5.0
+"""Minimum interval between two messages with values [s]."""
 HEARTBEAT_S = 10.0
 """Interval at which unchanged values are repeated, so that they do not expire [s]."""
 
 
 class EntityStates(NamedTuple):
-    """Values that Home Assistant has. Times are on a monotonic clock [s]."""
+    """Values published to Home Assistant. Times are on a monotonic clock [s]."""
 
     values: Mapping[str, float | None] = {}
     changed_s: Mapping[str, float] = {}
-    told_s: float = -math.inf
+    published_s: float = -math.inf
+    """Time of the last message."""
     rows_s: tuple[float, ...] = ()
     """Times at which values were published in the last minute."""
 
@@ -37,46 +39,48 @@ def values_to_publish(
 
     Args:
         shown: Values published last.
-        snapshot: The snapshot.
-        described: Data of the existing entities.
+        snapshot: Snapshot with the current values.
+        described: Data that determine the entities.
         now_s: Monotonic clock [s].
-        sign: -1: charging is positive for current and power.
+        sign: Factor of signed values; -1 if charging is positive.
     """
-    waited_s = now_s - shown.told_s
-    if snapshot.estimate is None or waited_s < PAUSE_S:
+    elapsed_s = now_s - shown.published_s
+    if snapshot.estimate is None or elapsed_s < MESSAGE_INTERVAL_S:
         return shown
-    shows = entities(described.info, described.cells)
-    moved = {k: v for k, v in _rounded(snapshot, shows, sign).items() if _moved(shown, k, v, shows[k], now_s)}
+    existing = entities(described.info, described.cells)
+    values = _rounded(snapshot, existing, sign)
+    changed = {key: value for key, value in values.items() if _is_due(shown, key, value, existing[key], now_s)}
     recent_s = tuple(at_s for at_s in shown.rows_s if now_s - at_s < MINUTE_S)
-    rows = [key for key in moved if shows[key].enabled and key in shown.values]
+    rows = [key for key in changed if existing[key].enabled and key in shown.values]
     rows.sort(key=lambda key: shown.changed_s[key])
-    for late in rows[MAX_ROWS - len(recent_s) :]:
-        del moved[late]
-    if not moved and waited_s < HEARTBEAT_S:
+    for postponed in rows[MAX_ROWS - len(recent_s) :]:
+        del changed[postponed]
+    if not changed and elapsed_s < HEARTBEAT_S:
         return shown
     return shown._replace(
-        values={**shown.values, **moved},
-        changed_s={**shown.changed_s, **dict.fromkeys(moved, now_s)},
-        told_s=now_s,
-        rows_s=(*recent_s, *[now_s for key in rows if key in moved]),
+        values={**shown.values, **changed},
+        changed_s={**shown.changed_s, **dict.fromkeys(changed, now_s)},
+        published_s=now_s,
+        rows_s=(*recent_s, *[now_s for key in rows if key in changed]),
     )
 
 
-def _rounded(snapshot: Snapshot, shows: Mapping[str, Entity], sign: float) -> dict[str, float | None]:
+def _rounded(snapshot: Snapshot, existing: Mapping[str, Entity], sign: float) -> dict[str, float | None]:
     """Return the rounded value of each entity; None without a value."""
     values, rounded = _values(snapshot), dict[str, float | None]()
-    for key, entity in shows.items():
+    for key, entity in existing.items():
         value = values.get(key)
         if value is not None and entity.signed:
             value *= sign
-        rounded[key] = None if value is None else round(value, entity.decimals or None) or 0  # an integer, and no -0.0
+        # `or None` makes round() return an integer, `or 0` replaces -0.0
+        rounded[key] = None if value is None else round(value, entity.decimals or None) or 0
     return rounded
 
 
 def _values(snapshot: Snapshot) -> dict[str, float | None]:
-    """All that a snapshot has, by the keys of the entities."""
+    """Return all values of a snapshot by the keys of the entities."""
     estimate, parameters = snapshot.estimate, snapshot.parameters
-    assert estimate is not None  # noqa: S101 - for the type checker: nothing is published without
+    assert estimate is not None  # noqa: S101 - for the type checker: the caller has checked it
     health = parameters.state_of_health.get("capacity")
     return {
         **vars(estimate),
@@ -94,11 +98,12 @@ def _times(factor: float, value: float | None) -> float | None:
     return None if value is None else factor * value
 
 
-def _moved(shown: EntityStates, key: str, value: float | None, entity: Entity, now_s: float) -> bool:
+def _is_due(shown: EntityStates, key: str, value: float | None, entity: Entity, now_s: float) -> bool:
     """Return True if a value should be published again."""
     if key not in shown.values:
         return True
-    before, rested = shown.values[key], now_s - shown.changed_s[key] >= entity.min_interval_s
+    before, interval_passed = shown.values[key], now_s - shown.changed_s[key] >= entity.min_interval_s
     if value is None or before is None:
-        return rested and value is not before
-    return round(abs(value - before), entity.decimals) >= (entity.step if rested else entity.immediate_step)
+        return interval_passed and value is not before
+    min_change = entity.step if interval_passed else entity.immediate_step
+    return round(abs(value - before), entity.decimals) >= min_change

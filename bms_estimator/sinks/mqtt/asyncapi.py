@@ -1,4 +1,4 @@
-"""All topics as an AsyncAPI 3 document, made from the models. Pure."""
+"""AsyncAPI 3 document of all topics, generated from the payload models. Pure."""
 
 from typing import Any
 
@@ -14,31 +14,31 @@ from bms_estimator.version import __version__
 Document = dict[str, Any]
 
 ADDRESSES = {"alarm": "alarm/{alarm}"}
-"""Addresses below the device's topic that differ from the name."""
+"""Topics below the device's that differ from the channel's name."""
 PARAMETERS = {
     "device": f"pack.name of the pack file, as {DEVICE_NAME}",
     "alarm": "as in [alarms] of the pack file",
 }
 AVAILABILITIES = {
-    AVAILABILITY: "whether the service lives; its last will",
-    SENSOR_AVAILABILITY: "whether values are fresh",
+    AVAILABILITY: "online while the service runs; also its last will",
+    SENSOR_AVAILABILITY: "online while values are fresh",
 }
 TRANSACTION = {"type": ["string", "integer", "null"], "description": "repeated in the response"}
 ARGUMENTS: dict[str, Document] = {
     "set_soc": {"soc": {"type": "number", "minimum": 0, "maximum": 1, "description": "state of charge"}},
     "current_zero": {},
-    "acknowledge_alarm": {"name": {"type": ["string", "null"], "description": "of an alarm; all when left out"}},
+    "acknowledge_alarm": {"name": {"type": ["string", "null"], "description": "name of an alarm; default: all"}},
     "publish_rate": {"rate_hz": {"type": "number", "minimum": MIN_RATE_HZ, "maximum": MAX_RATE_HZ}},
 }
 """Fields of each command."""
 OPTIONAL = ("name",)
-"""Fields that may be left out."""
+"""Optional fields of commands."""
 RESPONSE = {
     "type": "object",
     "properties": {
         "status": {"enum": ["ok", "error"]},
         "data": {"type": ["object", "null"]},
-        "error": {"type": ["string", "null"], "description": "why not, for people"},
+        "error": {"type": ["string", "null"], "description": "reason for an error, for people"},
         "transaction": TRANSACTION,
     },
     "required": ["status", "data", "error", "transaction"],
@@ -55,32 +55,32 @@ def document(base_topic: str) -> Document:
     operations: Document = {}
     messages: Document = {}
 
-    def channel(name: str, address: str, *of: str) -> None:
+    def add_channel(name: str, address: str, *message_names: str) -> None:
         used = [parameter for parameter in PARAMETERS if f"{{{parameter}}}" in f"{base_topic}/{{device}}/{address}"]
         channels[name] = {
             "address": f"{base_topic}/{{device}}/{address}",
-            "messages": {message: _ref("messages", message) for message in of},
+            "messages": {message: _ref("messages", message) for message in message_names},
             "parameters": {parameter: {"description": PARAMETERS[parameter]} for parameter in used},
         }
 
-    def sent(name: str, when: str, qos: int, *, retain: bool) -> None:
+    def add_send_operation(name: str, when: str, qos: int, *, retain: bool) -> None:
         binding = {"mqtt": {"qos": qos, "retain": retain, "bindingVersion": "0.2.0"}}
         operations[f"send_{name}"] = {"action": "send", "channel": _channel(name), "summary": when, "bindings": binding}
 
     for name, topic in TOPICS.items():
-        channel(name, ADDRESSES.get(name, name), name)
-        sent(name, topic.when, topic.qos, retain=topic.retain)
+        add_channel(name, ADDRESSES.get(name, name), name)
+        add_send_operation(name, topic.when, topic.qos, retain=topic.retain)
         messages[name] = {"contentType": "application/json", "payload": _ref("schemas", topic.model.__name__)}
     for address, meaning in AVAILABILITIES.items():
         name = address.replace("/", "_")
-        channel(name, address, name)
-        sent(name, meaning, 1, retain=True)
+        add_channel(name, address, name)
+        add_send_operation(name, meaning, 1, retain=True)
         messages[name] = {"contentType": "text/plain", "payload": {"type": "string", "enum": ["online", "offline"]}}
     messages["response"] = {"contentType": "application/json", "payload": RESPONSE}
     for name in NAMES:
         request, response = f"request_{name}", f"response_{name}"
-        channel(request, f"request/{name}", request)
-        channel(response, f"response/{name}", "response")
+        add_channel(request, f"request/{name}", request)
+        add_channel(response, f"response/{name}", "response")
         messages[request] = {"contentType": "application/json", "payload": _arguments(name)}
         operations[f"answer_{name}"] = {
             "action": "receive",
@@ -92,8 +92,8 @@ def document(base_topic: str) -> Document:
         "info": {
             "title": "bms_estimator",
             "version": f"{PAYLOAD_VERSION}.0.0",
-            "description": f"What bms_estimator {__version__} publishes of each pack, and may be asked. "
-            "Current and power are positive on discharge; what is not known is null.",
+            "description": f"Topics that bms_estimator {__version__} publishes for each pack, and its requests. "
+            "Current and power are positive on discharge. Unknown values are null.",
             "license": {"name": "MIT"},
         },
         "defaultContentType": "application/json",
@@ -105,21 +105,21 @@ def document(base_topic: str) -> Document:
 
 
 def _schemas() -> Document:
-    """JSON schemas of all models and their parts."""
+    """Return the JSON schemas of all payload models and of the models that they contain."""
     models = [(topic.model, "serialization") for topic in TOPICS.values()]
-    _, made = models_json_schema(models, ref_template="#/components/schemas/{model}")  # type: ignore[arg-type]  # a literal
-    schemas: Document = made["$defs"]
+    _, definitions = models_json_schema(models, ref_template="#/components/schemas/{model}")  # type: ignore[arg-type]  # a literal
+    schemas: Document = definitions["$defs"]
     return schemas
 
 
 def _arguments(name: str) -> Document:
-    """Return the arguments of a request."""
+    """Return the JSON schema of a request's arguments."""
     own = ARGUMENTS.get(name, {})
     return {
         "type": "object",
         "properties": own | {"transaction": TRANSACTION},
         "required": [field for field in own if field not in OPTIONAL],
-        "description": f"at most {MAX_PAYLOAD_BYTES} bytes; may be empty where nothing is required",
+        "description": f"at most {MAX_PAYLOAD_BYTES} bytes; may be empty if no field is required",
     }
 
 

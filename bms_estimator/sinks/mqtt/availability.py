@@ -1,4 +1,4 @@
-"""The two availabilities: whether they hold what we wrote there, and putting them right where they do not."""
+"""Monitor of the two availability topics: detects and corrects messages of other clients on them."""
 
 import asyncio
 import math
@@ -13,21 +13,21 @@ from bms_estimator.mqtt.message import Message
 CORRECTION_S = 5.0
 """Minimum interval between two corrections of an availability that another client wrote [s]."""
 BURST_S = 60.0
-"""Corrections closer than this are one burst, of which one line is logged [s]."""
+"""Maximum interval between corrections of one burst, for which one line is logged [s]."""
 ECHO_S = 10.0
-"""A broker that has not given back ``online`` by then denies it [s]."""
+"""Time after which a broker that has not returned ``online`` counts as denying the topic [s]."""
 
 log = structlog.get_logger(__name__)
 
 
 class AvailabilityMonitor:
-    """Receives the own messages back from the broker.
+    """Compares the availability messages that the broker returns with those that the service has published.
 
     Args:
-        own: What the availabilities must hold now; the service's own first.
-        delivery: Corrections are counted there.
-        refusals: Reports an ``online`` that does not come back.
-        wake: Called when it is time to ``correct``.
+        own: Returns the correct messages, first that of the service itself.
+        delivery: Statistics in which corrections are counted.
+        denied: Denied topics, to which a missing echo is reported.
+        wake: Called when ``correct`` is due.
         echo_s: Time within which a broker must return ``online`` [s].
     """
 
@@ -35,55 +35,55 @@ class AvailabilityMonitor:
         self,
         own: Callable[[], Sequence[Message]],
         delivery: DeliveryStats,
-        refusals: DeniedTopics,
+        denied: DeniedTopics,
         wake: Callable[[], object],
         echo_s: float = ECHO_S,
     ) -> None:
-        self._own, self._delivery, self._refusals = own, delivery, refusals
+        self._own, self._delivery, self._denied = own, delivery, denied
         self._wake, self._echo_s = wake, echo_s
         self._echoed = asyncio.Event()
-        self._forged = False  # another client wrote there
+        self._is_wrong = False  # another client has overwritten an availability
         self._corrected_s = -math.inf
 
     def begin(self) -> None:
-        """Publish both availabilities again over a new connection, because the broker may hold nothing."""
+        """Reset for a new connection, over which both availabilities are published again."""
         self._echoed.clear()
-        self._forged = False
+        self._is_wrong = False
 
     def record_published(self) -> None:
-        """Note that all messages were just sent."""
-        self._forged = False
+        """Record that all messages, including the availabilities, were just published."""
+        self._is_wrong = False
 
     def on_message(self, topic: str, payload: bytes) -> None:
         """Handle a received availability: our own echo, or another client's."""
-        right = {own.topic: own.payload for own in self._own()}
-        if right.get(topic, payload) == payload:
+        correct = {own.topic: own.payload for own in self._own()}
+        if correct.get(topic, payload) == payload:
             self._echoed.set()
-        elif not self._forged:
-            self._forged = True
+        elif not self._is_wrong:
+            self._is_wrong = True
             loop = asyncio.get_running_loop()
             loop.call_at(max(self._corrected_s + CORRECTION_S, loop.time()), self._wake)
 
     async def correct(self, publish: Callable[[Sequence[Message]], Awaitable[None]]) -> None:
-        """Put the availabilities right, if it is time.
+        """Publish the correct availabilities if one is wrong and ``CORRECTION_S`` has passed.
 
-        Counted when the broker has acknowledged it, because a broker that ends publishes the will and acknowledges
-        nothing.
+        The correction is counted only after the broker's acknowledgment. A broker that shuts down publishes the will,
+        which looks like another client's message, and acknowledges nothing.
         """
         now_s = asyncio.get_running_loop().time()
         since_s = now_s - self._corrected_s
-        if not self._forged or since_s < CORRECTION_S:
+        if not self._is_wrong or since_s < CORRECTION_S:
             return
-        self._forged, self._corrected_s = False, now_s
+        self._is_wrong, self._corrected_s = False, now_s
         await publish(self._own())
         self._delivery.corrections += 1
         if since_s > BURST_S:
             log.warning(
-                "somebody else wrote an availability of this pack: put right", so_far=self._delivery.corrections
+                "another client wrote an availability of this pack; corrected", so_far=self._delivery.corrections
             )
 
     async def expect_echo(self) -> None:
-        """Find out a broker that denies us without a word, as Mosquitto does with what may not be read."""
+        """Detect a broker that denies the topic silently, as Mosquitto does with topics that may not be read."""
         topic = self._own()[0].topic
         try:
             async with asyncio.timeout(self._echo_s):
@@ -91,6 +91,6 @@ class AvailabilityMonitor:
         except TimeoutError:
             if topic in self._delivery.refused_topics:
                 return
-            self._refusals.deny(topic, "it does not come back: not allowed to read it, or the broker is slow")
+            self._denied.deny(topic, "it is not returned: not allowed to read it, or the broker is slow")
             await self._echoed.wait()
-            self._refusals.allow(topic)
+            self._denied.allow(topic)

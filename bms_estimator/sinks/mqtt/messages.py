@@ -1,4 +1,4 @@
-"""Messages from a snapshot and the published state. Pure: no connection, no clock."""
+"""Builder of MQTT messages from a snapshot and the state already published. Pure: no connection, no clock."""
 
 import json
 from collections.abc import Collection, Mapping
@@ -25,21 +25,21 @@ AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
 
 
 class PublishedState(NamedTuple):
-    """State that the broker has; empty at first."""
+    """State that the broker has; initially empty."""
 
     snapshot: Snapshot | None = None
     shown: EntityStates = EntityStates()
     described: DiscoveryInputs | None = None
-    """Discovery data that Home Assistant has."""
+    """Data of the last discovery message."""
 
 
 class MessageBuilder:
-    """The messages of one pack.
+    """Builder of the messages of one pack.
 
     Args:
         base_topic: First part of all topics.
         device: Name of the pack.
-        sample_period_s: Sample period, where that may be longer than the publish period [s].
+        sample_period_s: Sample period, if it may exceed the publish period [s].
         home_assistant: Settings of Home Assistant.
         alarms: Monitored alarms; retained messages of others are removed.
 
@@ -48,7 +48,7 @@ class MessageBuilder:
         commands: Allowed commands.
 
     Raises:
-        UserError: ``home_assistant`` names what there is not.
+        UserError: ``home_assistant`` names an unknown entity.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class MessageBuilder:
         self._home = home_assistant or HomeAssistantSettings()
         check_names(self._home)
         self._device, self._sample_period_s = device, sample_period_s
-        self._schema = _schema()  # takes milliseconds, and here nothing waits yet
+        self._schema = _schema()  # takes milliseconds, which would delay the event loop later
 
     def birth_messages(self) -> list[Message]:
         """Return the first messages of a connection."""
@@ -82,19 +82,19 @@ class MessageBuilder:
         return [self._retained(AVAILABILITY, b"online"), *sensor]
 
     def must_deliver(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
-        """Return the messages of a snapshot that must reach the broker, late if necessary; each has its own time.
+        """Return the messages of a snapshot that must reach the broker, late if necessary, with their own timestamps.
 
         Args:
-            before: The snapshot before this one; None of the first.
-            snapshot: The snapshot.
+            before: Previous snapshot; None for the first one.
+            snapshot: Snapshot to publish.
         """
-        happened = [self._queued("event", event) for event in events(before, snapshot)]
-        return happened + ([self._queued("state", snapshot.estimate)] if snapshot.estimate else [])
+        event_messages = [self._queued("event", event) for event in events(before, snapshot)]
+        return event_messages + ([self._queued("state", snapshot.estimate)] if snapshot.estimate else [])
 
     def live_messages(
         self, sent: PublishedState, snapshot: Snapshot, now_s: float
     ) -> tuple[list[Message], PublishedState]:
-        """Return the other messages of a snapshot with content that the broker does not have yet.
+        """Return those other messages of a snapshot that the broker does not have yet.
 
         Args:
             sent: State that the broker has.
@@ -102,12 +102,12 @@ class MessageBuilder:
             now_s: Monotonic clock [s].
 
         Returns:
-            The messages, and what the broker has got after them.
+            The messages, and the state that the broker has after them.
         """
         _, parameters, health, info, alarms = snapshot
         before, messages = sent.snapshot, []
-        known = bool(parameters.elements)  # not before the first sample
-        if known and (before is None or before.parameters is not parameters):
+        has_sample = bool(parameters.elements)
+        if has_sample and (before is None or before.parameters is not parameters):
             messages.append(self._live("parameters", parameters.json_bytes))
         if before is None or before.health.sensor_online != health.sensor_online:
             messages.append(self._sensor(health))
@@ -126,11 +126,11 @@ class MessageBuilder:
         return messages + values, PublishedState(snapshot, shown, described)
 
     def _described(self, sent: PublishedState, snapshot: Snapshot) -> DiscoveryInputs:
-        """Cells that were measured once stay."""
+        """Return the discovery data of a snapshot. The number of cells never decreases."""
         cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
-        known = sent.described.cells if sent.described else 0
+        known_cells = sent.described.cells if sent.described else 0
         alarms = tuple(alarm.name for alarm in snapshot.alarms)
-        return DiscoveryInputs(snapshot.info, max(cells, known), alarms, self.commands, self._unwatched)
+        return DiscoveryInputs(snapshot.info, max(cells, known_cells), alarms, self.commands, self._unwatched)
 
     def _home_assistant(
         self, before: EntityStates, snapshot: Snapshot, described: DiscoveryInputs, now_s: float
@@ -145,7 +145,7 @@ class MessageBuilder:
         return self._retained(SENSOR_AVAILABILITY, b"online" if health.sensor_online else b"offline")
 
     def _discovery(self, described: DiscoveryInputs) -> bytes:
-        """Empty, which removes the device, if discovery is disabled."""
+        """Return the discovery payload. It is empty, which removes the device, if discovery is disabled."""
         return _json(discovery(self._home, described, self.root, self._sample_period_s)) if self._home.enabled else b""
 
     def _queued(self, topic: str, report: Payload) -> Message:

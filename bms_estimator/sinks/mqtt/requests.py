@@ -1,7 +1,8 @@
-"""Requests that people and dashboards may make of a running service: bytes in, bytes out, over any transport.
+"""Requests to a running service from people and dashboards: bytes in, bytes out, over any transport.
 
-Any client of the transport may send requests, so everything is bounded: names are listed, payloads have a maximum
-size, requests and log lines a maximum rate; a command needs the owner's leave; no handler's fault gets out.
+Any client of the transport may send requests. Names are therefore listed, the size of payloads and the rates of
+requests and log lines are limited, commands need a permission in the pack file, and no handler's exception ends the
+service.
 """
 
 import json
@@ -19,19 +20,19 @@ from bms_estimator.settings.mqtt import Command
 
 COMMANDS = get_args(Command)
 NAMES = ("state", "parameters", "health", *COMMANDS)
-"""All requests that there are."""
+"""Names of all requests."""
 MAX_PAYLOAD_BYTES = 4096
 READS_PER_MIN = 120.0
 """Rate limit of read requests of all clients together; the same number may arrive at once [1/min]."""
 COMMANDS_PER_MIN = 6.0
-"""Requests that change something, granted or not [1/min]."""
+"""Rate limit of commands, granted or not [1/min]."""
 LOG_S = 60.0
-"""Minimum interval between two log lines for each kind of refusal [s]; all are counted."""
+"""Minimum interval between two log lines for each kind of rejection [s]; all rejections are counted."""
 MAX_SHOWN = 40
 """Maximum length of a foreign name in the log [characters]."""
 
 Handler = Callable[[Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
-"""Takes the request's arguments, returns the response's data. Raises UserError when it cannot be granted."""
+"""Function from the request's arguments to the response's data. Raises UserError if the request cannot be granted."""
 log = structlog.get_logger(__name__)
 
 
@@ -39,7 +40,7 @@ class RequestDispatcher:
     """Handlers by name, with permissions and rate limits.
 
     Args:
-        delivery: Requests are counted there, by what became of them.
+        delivery: Statistics in which requests are counted by result.
         commands: Allowed commands.
         monotonic: Monotonic clock [s].
     """
@@ -57,7 +58,7 @@ class RequestDispatcher:
         self._logged_s: dict[str, float] = {}
 
     def register(self, name: str, handler: Handler) -> None:
-        """Make a request of ``NAMES`` answerable."""
+        """Register the handler of a request of ``NAMES``."""
         self._handlers[name] = handler
 
     @property
@@ -69,7 +70,7 @@ class RequestDispatcher:
         """Respond to one request: JSON of status, data, error, transaction.
 
         Returns:
-            None where no response is due: to a name that does not exist, and beyond the rate.
+            The response; None for an unknown name and beyond the rate limit.
         """
         if name not in NAMES:
             self.count_refusal("unknown", name[:MAX_SHOWN])
@@ -85,7 +86,7 @@ class RequestDispatcher:
         except UserError as error:
             self.count_refusal("refused", name, reason=str(error))
             return _response("error", None, str(error), transaction)
-        except Exception as error:  # noqa: BLE001  counted and logged: who asks must not be able to end the service
+        except Exception as error:  # noqa: BLE001  counted and logged: a request must not end the service
             self.count_refusal("failed", name, exc_info=error)
             return _response("error", None, "a fault of the service's own, which its log describes", transaction)
         self._counts["granted"] += 1
@@ -109,7 +110,7 @@ class RequestDispatcher:
         """Return the handler of a request.
 
         Raises:
-            UserError: It is not allowed, or not offered here.
+            UserError: The command is not allowed, or the request has no handler.
         """
         if name in COMMANDS and name not in self._allowed:
             raise UserError(f"{name}: not allowed; the pack file's mqtt.commands names what is")
@@ -145,7 +146,7 @@ def number(arguments: Mapping[str, Any], name: str, low: float, high: float) -> 
     """Return the number ``name`` of a request's arguments.
 
     Raises:
-        UserError: It is missing, no number, or outside ``low``..``high``.
+        UserError: The argument is missing, not a number, or outside ``low``..``high``.
     """
     value = arguments.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
@@ -162,7 +163,7 @@ def _arguments(payload: bytes) -> Mapping[str, Any]:
     """Parse a request's payload: a JSON object of finite numbers, or empty.
 
     Raises:
-        UserError: It is something else, or too long.
+        UserError: The payload is something else, or too long.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise UserError(f"a request's payload must not be longer than {MAX_PAYLOAD_BYTES} bytes")
@@ -181,7 +182,7 @@ def _finite(token: str) -> float:
     """Parse a number of a request; Python's JSON accepts NaN, and reads 1e999 as infinity.
 
     Raises:
-        UserError: It is not finite.
+        UserError: The number is not finite.
     """
     number = float(token)
     if not math.isfinite(number):
@@ -193,7 +194,7 @@ def _transaction(arguments: Mapping[str, Any]) -> str | int | None:
     """Return the transaction, which the response repeats so that the client can match it.
 
     Raises:
-        UserError: It is neither a string nor an integer.
+        UserError: The transaction is neither a string nor an integer.
     """
     transaction = arguments.get("transaction")
     if transaction is not None and (isinstance(transaction, bool) or not isinstance(transaction, str | int)):

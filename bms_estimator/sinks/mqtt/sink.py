@@ -1,8 +1,8 @@
-"""The MQTT sink: publishes a pack to a broker that may be away, and receives requests.
+"""MQTT sink: publishes the snapshots of a pack, also over outages of the broker, and answers requests.
 
-``publish`` puts what must reach the broker in the outbox, and the snapshot in a slot for one; tasks take them from
-there when the broker does. The loop never waits. ``messages`` builds the messages, ``requests`` handles requests,
-``link`` connects.
+``publish`` queues states and events in the outbox and keeps the last snapshot; tasks send both, so that the event loop
+never waits for the broker. ``messages`` builds the messages, ``requests`` handles requests, ``mqtt.reconnect_loop``
+connects.
 """
 
 import asyncio
@@ -32,11 +32,11 @@ from bms_estimator.sinks.mqtt.requests import MAX_SHOWN, RequestDispatcher
 from bms_estimator.store.outbox import Outbox
 
 BIRTH_DELAY_S = 2.0
-"""Home Assistant publishes its birth message some time before it listens [s]."""
+"""Delay from Home Assistant's birth message to the retained messages [s], because it subscribes some time later."""
 HANDOVER_S = 2.0
-"""Time that waiting messages of the outbox may take at the end [s]."""
+"""Time limit for sending queued messages at shutdown [s]."""
 CLOSING_S = 3.0
-"""Timeout of the last messages together [s]."""
+"""Timeout of the whole shutdown [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -45,16 +45,16 @@ class MqttSink:
     """Publishes snapshots of one pack and answers requests.
 
     Args:
-        settings: The brokers.
+        settings: Brokers and credentials.
         device: Name of the pack in the topics.
-        requests: Answers requests.
+        requests: Dispatcher of requests.
         delivery: Counters of sent messages.
-        outbox: What must reach the broker.
-        connect: Makes a connection; over TCP when left out.
-        sample_period_s: Sample period, where that may be longer than the publish period [s].
+        outbox: Queue of messages that must reach the broker.
+        connect: Opens a connection; default: over TCP.
+        sample_period_s: Sample period, if it may exceed the publish period [s].
         home_assistant: Settings of Home Assistant.
         alarms: Monitored alarms.
-        first_delay_s: Delay before a lost broker, or a temporary rejection, is retried [s].
+        first_delay_s: Delay after a lost connection or a temporary rejection [s].
         birth_delay_s: Delay from Home Assistant's birth message to the retained messages [s].
         echo_s: Time within which a broker must return ``online`` [s].
 
@@ -79,47 +79,50 @@ class MqttSink:
         echo_s: float = ECHO_S,
     ) -> None:
         self._requests, self._delivery = requests, delivery
-        self._refusals = DeniedTopics(delivery, self._republish, first_delay_s)
-        self._backlog = OutboxSender(outbox, delivery, self._refusals, first_delay_s)
+        self._denied = DeniedTopics(delivery, self._republish, first_delay_s)
+        self._outbox_sender = OutboxSender(outbox, delivery, self._denied, first_delay_s)
         self._birth_delay_s = birth_delay_s
         self._messages = MessageBuilder(settings.base_topic, device, sample_period_s, home_assistant, alarms)
         self._birth_topic = (home_assistant or HomeAssistantSettings()).status_topic
         identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.offline_messages()[-1]
-        hello = ConnectOptions(identifier, will, lambda kind, topic: requests.count_refusal(kind, topic[:MAX_SHOWN]))
+        options = ConnectOptions(identifier, will, lambda kind, topic: requests.count_refusal(kind, topic[:MAX_SHOWN]))
         for warning in check(settings):
-            log.warning("a secret that is none", reason=warning)
+            log.warning("secret is readable by other users", reason=warning)
         self._link = ReconnectLoop(
-            brokers(settings), hello, connect or BrokerConnector(settings), self._serve, delivery, first_delay_s
+            brokers(settings), options, connect or BrokerConnector(settings), self._serve, delivery, first_delay_s
         )
-        self._slot: Snapshot | None = None
-        self._before: Snapshot | None = None  # the last one that was taken
-        self._sent = PublishedState()  # only the sending task sets it
-        self._again = True  # the broker may hold nothing: send all of it
+        self._unsent: Snapshot | None = None
+        self._last: Snapshot | None = None
+        self._sent = PublishedState()  # set only by the sending task
+        self._resend_retained = True
         self._wake = asyncio.Event()
         self._availability = AvailabilityMonitor(
-            lambda: self._messages.availability(self._sent), delivery, self._refusals, self._wake.set, echo_s
+            lambda: self._messages.availability(self._sent), delivery, self._denied, self._wake.set, echo_s
         )
         self._task: asyncio.Task[None] | None = None
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Take a snapshot; returns at once."""
+        """Queue a snapshot for publication without waiting."""
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
-        self._backlog.put(self._messages.must_deliver(self._before, snapshot))
-        self._slot = self._before = snapshot
+        self._outbox_sender.put(self._messages.must_deliver(self._last, snapshot))
+        self._unsent = self._last = snapshot
         self._wake.set()
 
     def publish_raw(self, topic: str, payload: bytes) -> None:
-        """Publish a message of another component at QoS 1; it waits for an absent broker, as states do."""
-        self._backlog.put([Message(topic, payload, 1, retain=False)])
+        """Publish a message of another component at QoS 1, queued during an outage like states."""
+        self._outbox_sender.put([Message(topic, payload, 1, retain=False)])
 
     async def __aenter__(self) -> Self:
-        """Start reaching for the broker."""
+        """Start connecting to the broker."""
         self._task = asyncio.create_task(self._link.run(), name="mqtt")
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Publish queued messages and ``offline``, then disconnect; one that does not take it publishes the will."""
+        """Publish queued messages and ``offline``, then disconnect.
+
+        If this takes longer than ``CLOSING_S``, the connection is dropped and the broker publishes the will.
+        """
         if self._task is None:
             return
         self._link.closing.set()
@@ -132,8 +135,8 @@ class MqttSink:
 
     async def _serve(self, connection: Connection) -> None:
         """Send and receive until the connection is lost or the sink closes."""
-        self._again = True
-        self._refusals.begin()
+        self._resend_retained = True  # the broker may have lost them
+        self._denied.begin()
         self._availability.begin()
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -141,13 +144,13 @@ class MqttSink:
                 await self._subscribe(connection)
                 others += [
                     tasks.create_task(self._availability.expect_echo()),
-                    tasks.create_task(self._backlog.send(connection)),
+                    tasks.create_task(self._outbox_sender.send(connection)),
                 ]
                 await self._send(connection)
                 for task in others:
                     task.cancel()
         finally:
-            self._refusals.end()
+            self._denied.end()
 
     async def _subscribe(self, connection: Connection) -> None:
         """Subscribe, and report what the broker denies.
@@ -156,14 +159,14 @@ class MqttSink:
         where it stays at QoS 1.
         """
         availabilities = [self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)]
-        refused = await connection.subscribe(self._topic("request/+"), [*availabilities, self._birth_topic])
-        for topic, why in refused.items():
-            self._refusals.deny(topic, f"not allowed to read it: {why}")
+        rejected = await connection.subscribe(self._topic("request/+"), [*availabilities, self._birth_topic])
+        for topic, reason in rejected.items():
+            self._denied.deny(topic, f"not allowed to read it: {reason}")
 
     async def _publish(self, connection: Connection, messages: Sequence[Message]) -> None:
-        """Publish one after the other."""
+        """Publish messages one after the other."""
         for message in messages:
-            self._refusals.record_result(message, await connection.publish(message))
+            self._denied.record_result(message, await connection.publish(message))
 
     async def _send(self, connection: Connection) -> None:
         """Send live messages until the sink closes, then the offline messages."""
@@ -171,12 +174,12 @@ class MqttSink:
         while True:
             await self._wake.wait()
             self._wake.clear()
-            if self._again:
-                self._again, self._sent = False, PublishedState()
+            if self._resend_retained:
+                self._resend_retained, self._sent = False, PublishedState()
                 self._availability.record_published()
                 await self._publish(connection, self._messages.birth_messages())
             await self._availability.correct(lambda messages: self._publish(connection, messages))
-            snapshot, self._slot = self._slot, None
+            snapshot, self._unsent = self._unsent, None
             if snapshot is not None:
                 now_s = asyncio.get_running_loop().time()
                 self._messages.commands = self._requests.allowed
@@ -185,7 +188,7 @@ class MqttSink:
             if self._link.closing.is_set():
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(HANDOVER_S):
-                        await self._backlog.wait_until_empty()
+                        await self._outbox_sender.wait_until_empty()
                 await self._publish(connection, self._messages.offline_messages())
                 return
 
@@ -197,14 +200,14 @@ class MqttSink:
                 if message.payload == b"online" and not message.retain:
                     asyncio.get_running_loop().call_later(self._birth_delay_s, self._republish)
             elif message.topic in (self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)):
-                if not message.retain:  # retained messages are not news
+                if not message.retain:  # a retained message may have been corrected since
                     self._availability.on_message(message.topic, message.payload)
             else:
                 await self._answer(connection, message)
 
     async def _answer(self, connection: Connection, message: ReceivedMessage) -> None:
         name = message.topic.rsplit("/", 1)[-1]
-        if message.retain:  # it would be granted again with each connection
+        if message.retain:  # a retained request would be executed again with each connection
             self._requests.count_refusal("retained", name[:MAX_SHOWN])
             return
         response = await self._requests.handle(name, message.payload)
@@ -214,28 +217,28 @@ class MqttSink:
 
     def _republish(self) -> None:
         """Send all retained messages again with the next snapshot."""
-        self._again = True
+        self._resend_retained = True
 
     def _topic(self, name: str) -> str:
         return f"{self._messages.root}/{name}"
 
 
 class OutboxSender(QueueSender):
-    """Fills and empties an outbox.
+    """Fills an outbox and sends its messages.
 
     Args:
-        outbox: The outbox.
-        delivery: As ``QueueSender`` has it.
-        refusals: As ``QueueSender`` has it.
-        first_delay_s: As ``QueueSender`` has it [s].
+        outbox: Queue to fill and to empty.
+        delivery: Statistics, as in ``QueueSender``.
+        denied: Denied topics, as in ``QueueSender``.
+        first_delay_s: Delay after a temporary rejection, as in ``QueueSender`` [s].
     """
 
-    def __init__(self, outbox: Outbox, delivery: DeliveryStats, refusals: DeniedTopics, first_delay_s: float) -> None:
-        super().__init__(outbox, delivery, refusals, first_delay_s)
+    def __init__(self, outbox: Outbox, delivery: DeliveryStats, denied: DeniedTopics, first_delay_s: float) -> None:
+        super().__init__(outbox, delivery, denied, first_delay_s)
         self._filled = outbox
 
     def put(self, messages: Iterable[Message]) -> None:
-        """Keep messages until the broker has them; returns at once."""
+        """Queue messages until the broker acknowledges them."""
         for message in messages:
             self._filled.put(message)
-        self._count()
+        self._update_stats()

@@ -2,7 +2,7 @@
 
 ``PAYLOAD_VERSION`` increases by one when a topic or field disappears, or a field gets another type, unit or meaning.
 An addition does not increase it: readers ignore unknown fields.
-``tests/sinks/mqtt/test_payloads.py`` remembers every field and its type.
+``tests/sinks/mqtt/test_payloads.py`` checks that no field changes.
 """
 
 from typing import Any, NamedTuple
@@ -32,6 +32,6 @@ TOPICS = {
 
 
 def schema() -> dict[str, Any]:
-    """Topic ``schema``: the version, and the JSON schema of each topic's payload."""
+    """Return the payload of topic ``schema``: the version, and the JSON schema of each topic's payload."""
     schemas = {name: topic.model.model_json_schema() for name, topic in TOPICS.items()}
     return {"payload_version": PAYLOAD_VERSION} | schemas

@@ -123,10 +123,10 @@ class MqttReports(LineProducer):
     async def _ask(self, connection: Connection) -> None:
         """Have the publisher speak."""
         for topic, payload in self._settings.ask.items():
-            message = Message(self._settings.filled(topic), payload.encode(), 0, retain=False)
+            message = Message(self._settings.substitute(topic), payload.encode(), 0, retain=False)
             refusal = await connection.publish(message)
             if refusal is not None:
-                raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.why}")
+                raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.reason}")
 
     def _log_conflict(self) -> None:
         """Log the first message of a second publisher, and its end."""

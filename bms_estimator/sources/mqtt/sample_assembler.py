@@ -42,11 +42,11 @@ class SampleAssembler:
     def __init__(self, settings: MqttSource) -> None:
         self._settings = settings
         self._ways = [
-            _TopicBinding(quantity, place, settings.filled(place.path), topic, cell_pattern(topic))
+            _TopicBinding(quantity, place, settings.substitute(place.path), topic, cell_pattern(topic))
             for quantity, place in settings.places()
             for topic in settings.topics(place)
         ]
-        self._availability = settings.filled(settings.availability_topic or "")
+        self._availability = settings.substitute(settings.availability_topic or "")
         self._offline = ""  # latest status from the publisher or its last will
         self._told: dict[str, _TimestampedValue] = {}
         self._cells: dict[int, _TimestampedValue] = {}

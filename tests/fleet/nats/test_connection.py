@@ -38,7 +38,7 @@ class Links:
 
 
 def signed_by(authority: Authority) -> Tls:
-    certificate, key = authority.vouch_for("node")
+    certificate, key = authority.sign("node")
     return Tls(certificate, key)
 
 

@@ -45,7 +45,7 @@ def settings_text(authority: Authority, more: str = "", ports: tuple[int, ...] =
     listen, mqtt, monitor = ports or (free_port(), free_port(), free_port())
     certificate, key = authority.certificate.with_name("node.crt"), authority.certificate.with_name("node.key")
     if not certificate.exists():
-        authority.vouch_for("node")
+        authority.sign("node")
     return f"""
 [server]
 listen = "127.0.0.1:{listen}"

@@ -71,8 +71,8 @@ async def test_what_comes_while_the_server_is_away_is_written_when_it_is_back(in
             await asyncio.to_thread(influxdb.start)
             await until(lambda: not writing.waiting)
         events = [entry["event"] for entry in logs]
-        assert events[0] == "influxdb takes nothing"
-        assert events.count("influxdb takes lines again") == 1
+        assert events[0] == "influxdb rejects lines"
+        assert events.count("influxdb accepts lines again") == 1
         rows = await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state WHERE time >= '2024-05-01T12:01:40Z'")
         assert len(rows) == 10
     assert writing.dropped == 0

@@ -22,7 +22,14 @@ pytest.importorskip("prometheus_client", reason="prometheus-client is not instal
 from prometheus_client.parser import text_string_to_metric_families
 
 from bms_estimator.sinks.exports.prometheus import PrometheusSink
-from bms_estimator.sinks.exports.prometheus_metrics import COUNTERS, KINDS, LEFT_OUT, OWN_NAMES, RATIOS, named
+from bms_estimator.sinks.exports.prometheus_metrics import (
+    COUNTERS,
+    KINDS,
+    LEFT_OUT,
+    LIST_ITEMS,
+    RATIOS,
+    name_and_factor,
+)
 
 PROMTOOL = shutil.which("promtool")
 
@@ -98,15 +105,15 @@ async def test_an_address_that_is_taken_is_said() -> None:
 
 def test_the_tables_name_fields_that_there_are() -> None:
     fields = set(Estimate.model_fields) | set(Health.model_fields)
-    assert {*RATIOS, *COUNTERS, *LEFT_OUT, *KINDS, *OWN_NAMES} <= fields
+    assert {*RATIOS, *COUNTERS, *LEFT_OUT, *KINDS, *LIST_ITEMS} <= fields
 
 
 def test_a_field_s_unit_becomes_that_of_prometheus() -> None:
-    assert named("remaining_energy_wh") == ("bms_remaining_energy_joules", 3600.0)
-    assert named("rss_mib") == ("bms_rss_bytes", 1048576.0)
-    assert named("innovation_v") == ("bms_innovation_volts", 1.0)
-    assert named("nussbaum_gain") == ("bms_nussbaum_gain", 1.0)
-    assert named("adaptation_gain_hz") == ("bms_adaptation_gain_hertz", 1.0)
+    assert name_and_factor("remaining_energy_wh") == ("bms_remaining_energy_joules", 3600.0)
+    assert name_and_factor("rss_mib") == ("bms_rss_bytes", 1048576.0)
+    assert name_and_factor("innovation_v") == ("bms_innovation_volts", 1.0)
+    assert name_and_factor("nussbaum_gain") == ("bms_nussbaum_gain", 1.0)
+    assert name_and_factor("adaptation_gain_hz") == ("bms_adaptation_gain_hertz", 1.0)
 
 
 @pytest.mark.parametrize(

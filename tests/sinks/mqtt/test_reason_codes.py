@@ -36,14 +36,14 @@ def locked_broker(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-@pytest.mark.parametrize("knows_5", [True, False])
+@pytest.mark.parametrize("supports_5", [True, False])
 async def test_a_wrong_password_is_called_that_and_is_nowhere_itself(
-    locked_broker: Broker, tmp_path: Path, knows_5: bool
+    locked_broker: Broker, tmp_path: Path, supports_5: bool
 ) -> None:
     (tmp_path / "password").write_text("s3cret")
     (tmp_path / "password").chmod(0o600)
     delivery = DeliveryStats()
-    async with Proxy(locked_broker.port, knows_5=knows_5) as proxy:
+    async with Proxy(locked_broker.port, supports_5=supports_5) as proxy:
         settings = MqttSettings(url=proxy.url, username="meter", password_file=tmp_path / "password")
         with structlog.testing.capture_logs() as logs:
             async with MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, most=4)):
@@ -61,7 +61,7 @@ async def test_a_wrong_password_is_called_that_and_is_nowhere_itself(
         (142, "Session taken over (142): another client has the same name"),
         (139, "Server shutting down (139)"),
         (151, "Quota exceeded (151): the broker allows no more"),
-        (141, "Keep alive timeout (141): it heard nothing from here for too long"),
+        (141, "Keep alive timeout (141): it received nothing from this client for too long"),
     ],
 )
 async def test_a_broker_that_says_why_it_ends_a_connection_is_quoted(broker: Broker, code: int, said: str) -> None:
@@ -120,12 +120,12 @@ async def test_what_is_refused_for_now_comes_later_in_order(broker: Broker, code
             for number in range(50):
                 sink.mqtt.publish(state(number))
             await until(lambda: sink.delivery.waiting == 0)
-            network.refuses = code
+            network.reject_code = code
             for number in range(50, 100):
                 sink.mqtt.publish(state(number))
-            await until(lambda: network.refused.count(STATE) > WINDOW + 2)  # so the oldest alone is tried
+            await until(lambda: network.rejected.count(STATE) > WINDOW + 2)  # so the oldest alone is tried
             assert STATE in sink.delivery.refused_topics
-            network.refuses = 0
+            network.reject_code = 0
             await until(lambda: sink.delivery.waiting == 0)
     assert_all_in_order(numbers(live), 100)
     assert (sink.delivery.drops, sink.delivery.losses) == (0, 0)
@@ -134,11 +134,11 @@ async def test_what_is_refused_for_now_comes_later_in_order(broker: Broker, code
 
 async def test_what_is_retained_and_refused_for_now_is_said_again_after_a_pause(broker: Broker) -> None:
     async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
-        network.refuses = 151
+        network.reject_code = 151
         sink.mqtt.publish(ONE)
         await until(lambda: set(sink.delivery.refused_topics) >= RETAINED)
-        assert set(network.refused) >= RETAINED
-        network.refuses = 0
+        assert set(network.rejected) >= RETAINED
+        network.reject_code = 0
         async with asyncio.timeout(LONG_S):
             while sink.delivery.refused_topics:
                 sink.mqtt.publish(ONE)
@@ -149,12 +149,12 @@ async def test_what_is_retained_and_refused_for_now_is_said_again_after_a_pause(
 
 async def test_what_is_retained_and_refused_for_long_is_not_said_with_each_snapshot(broker: Broker) -> None:
     async with Proxy(broker.port) as network, Sink(network.url, first_delay_s=LONG_S) as sink:
-        network.refuses = 151
+        network.reject_code = 151
         for _ in range(20):
-            before = network.refused.count("bms/pack/health")
+            before = network.rejected.count("bms/pack/health")
             sink.mqtt.publish(snapshot())
-            await until(lambda: network.refused.count("bms/pack/health") > before)  # noqa: B023 - at once
-        assert network.refused.count("bms/pack/info") == network.refused.count("bms/pack/schema") == 1
+            await until(lambda: network.rejected.count("bms/pack/health") > before)  # noqa: B023 - at once
+        assert network.rejected.count("bms/pack/info") == network.rejected.count("bms/pack/schema") == 1
         network.leave()  # or what waits for the pause holds the end up
         await until(lambda: sink.delivery.losses)
 
@@ -163,12 +163,12 @@ async def test_what_is_retained_and_refused_for_long_is_not_said_with_each_snaps
 async def test_what_is_refused_for_good_is_given_up(broker: Broker, code: int) -> None:
     async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
         await live.wait("bms/pack/schema")
-        network.refuses = code
+        network.reject_code = code
         for number in range(50):
             sink.mqtt.publish(state(number))
         await until(lambda: sink.delivery.waiting == 0)
-        assert network.refused.count(STATE) == 50
-        assert sink.delivery.drops == 50 + network.refused.count("bms/pack/event")
+        assert network.rejected.count(STATE) == 50
+        assert sink.delivery.drops == 50 + network.rejected.count("bms/pack/event")
         assert STATE in sink.delivery.refused_topics
 
 

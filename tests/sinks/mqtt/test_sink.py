@@ -14,7 +14,7 @@ from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.client import PATIENCE, Client
+from bms_estimator.mqtt.client import DEFAULT_TIMEOUTS, Client
 from bms_estimator.mqtt.connection import Connection, ConnectOptions
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.message import Message
@@ -37,7 +37,7 @@ MAX_KEPT = 4
 AT_START = len(events(None, ONE))
 RETAINED = ("info", "availability", "sensor/availability", "schema", "health")
 DISCOVERY = "homeassistant/device/bms_pack/config"
-HELLO = ConnectOptions("test", Message("bms/pack/availability", b"offline", 1, retain=True), lambda *_: None)
+OPTIONS = ConnectOptions("test", Message("bms/pack/availability", b"offline", 1, retain=True), lambda *_: None)
 DYNAMIC_SECURITY = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
 
 
@@ -48,7 +48,7 @@ async def never(_: Connection) -> None:
 @pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])
 async def url(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[str]:
     """The broker's, directly or as one that does not know MQTT 5."""
-    async with Proxy(broker.port, knows_5=request.param == "MQTT 5") as proxy:
+    async with Proxy(broker.port, supports_5=request.param == "MQTT 5") as proxy:
         yield proxy.url
 
 
@@ -114,7 +114,7 @@ async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_
 
 async def test_a_connection_that_comes_after_it_was_given_up_leaves_nothing_to_the_loop(broker: Broker) -> None:
     """The thread that connects goes on when its task is cancelled, and a loop may be about to close."""
-    client = Client({"hostname": "127.0.0.1", "port": broker.port}, ProtocolVersion.V5, HELLO, PATIENCE)
+    client = Client({"hostname": "127.0.0.1", "port": broker.port}, ProtocolVersion.V5, OPTIONS, DEFAULT_TIMEOUTS)
     before = asyncio.all_tasks()
     client.abandon()
     await asyncio.to_thread(client._client_connect)
@@ -133,7 +133,7 @@ async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path:
                 self.closing.set()
 
     settings = MqttSettings(url=Broker(tmp_path).url)
-    await Impatient(brokers(settings), HELLO, BrokerConnector(settings), never, DeliveryStats()).run()
+    await Impatient(brokers(settings), OPTIONS, BrokerConnector(settings), never, DeliveryStats()).run()
     assert max(pauses) <= MAX_DELAY_S == 30.0
     assert pauses[0] <= 5.0 < pauses[3]
     assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"
@@ -318,7 +318,7 @@ def mute_broker(tmp_path: Path) -> Iterator[Broker]:
 
 async def test_a_broker_that_denies_everything_without_a_word_is_found_out(mute_broker: Broker) -> None:
     with structlog.testing.capture_logs() as logs:
-        async with Proxy(mute_broker.port, knows_5=False) as proxy, Sink(proxy.url, echo_s=0.5) as sink:
+        async with Proxy(mute_broker.port, supports_5=False) as proxy, Sink(proxy.url, echo_s=0.5) as sink:
             await until(lambda: sink.delivery.refused_topics)
             assert snapshot(delivery=sink.delivery).health.refused_topics == ["bms/pack/availability"]
     assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/availability"]
@@ -370,11 +370,11 @@ def refusing_broker(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-@pytest.mark.parametrize("knows_5", [True, False])
+@pytest.mark.parametrize("supports_5", [True, False])
 async def test_a_topic_that_the_broker_refuses_is_named_in_log_and_health(
-    refusing_broker: Broker, knows_5: bool
+    refusing_broker: Broker, supports_5: bool
 ) -> None:
-    async with Proxy(refusing_broker.port, knows_5=knows_5) as proxy, Listener(refusing_broker) as live:
+    async with Proxy(refusing_broker.port, supports_5=supports_5) as proxy, Listener(refusing_broker) as live:
         with structlog.testing.capture_logs() as logs:
             async with Sink(proxy.url) as sink:
                 await live.wait("bms/pack/availability")

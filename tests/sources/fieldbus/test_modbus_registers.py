@@ -139,8 +139,8 @@ V, I = {"address": 0}, {"address": 1}  # noqa: E741
         ({"voltage": V, "current": I, "host": None, "port": "/dev/x", "framing": "tcp"}, "serial line"),
         ({"voltage": V}, "current"),
         ({"voltage": V | {"scale": 0.0}, "current": I}, "must not be 0"),
-        ({"voltage": {"address": 65535, "type": "int32"}, "current": I}, "behind the last register"),
-        ({"voltage": V, "current": I, "cells": {"address": 65530, "count": 16}}, "behind the last register"),
+        ({"voltage": {"address": 65535, "type": "int32"}, "current": I}, "beyond the last register"),
+        ({"voltage": V, "current": I, "cells": {"address": 65530, "count": 16}}, "beyond the last register"),
     ],
 )
 def test_settings_that_cannot_be_say_why(told: dict[str, object], said: str) -> None:

@@ -308,10 +308,10 @@ def test_it_subscribes_to_nothing_twice() -> None:
 @pytest.mark.parametrize(
     ("table", "said"),
     [
-        ({}, "voltage: missing; tell where it is found, or a profile: batmon-ha"),
+        ({}, "voltage: missing; give its path, or a profile: batmon-ha"),
         ({"profile": "venus"}, "profile venus: prefix: missing (VRM portal ID"),
         ({"profile": "tasmota"}, "profile tasmota: prefix: missing (Topic of the device"),
-        ({"voltage": "u", "current": "i"}, "voltage.topic: missing, and there is no topic for all of them"),
+        ({"voltage": "u", "current": "i"}, "voltage.topic: missing, and source.topic is not set"),
         (
             {"topic": "t", "voltage": {"path": "u", "unit": "A"}, "current": "i"},
             "voltage.unit = A: must be one of V, mV",

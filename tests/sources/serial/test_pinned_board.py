@@ -394,7 +394,7 @@ def test_the_settings_name_a_board_as_the_board_command_shows_it() -> None:
     for wrong in ("42", "0000002A", 42):
         with pytest.raises(ValidationError):
             SensorSettings.model_validate({"serial": wrong})
-    with pytest.raises(ValidationError, match="only a binary board tells its number"):
+    with pytest.raises(ValidationError, match="only a binary board reports its serial number"):
         SensorSettings(serial="0000002a", protocol="text")
 
 

@@ -1,4 +1,4 @@
-"""The outbox against a list: whatever is done to it and its disk, nothing is lost, out of order or doubled unasked."""
+"""Outbox against a list as model: under all operations and disk faults nothing is lost, reordered or repeated."""
 
 import asyncio
 import random
@@ -21,11 +21,11 @@ from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
 
 PAGE = 4
-MEANWHILE = st.lists(st.sampled_from(["put", "take", "first", "last", "rewind"]), max_size=5)
+OPERATIONS = st.lists(st.sampled_from(["put", "take", "first", "last", "rewind"]), max_size=5)
 
 
 class FaultyDatabase(Database):
-    """One that can be told to fail, before or after it has written, and at which something happens meanwhile."""
+    """Database that can fail before or after a commit, and that runs callbacks before and after a transaction."""
 
     fails: str | None = None
     before: Callable[[], None] = staticmethod(lambda: None)
@@ -38,19 +38,25 @@ class FaultyDatabase(Database):
         result = await super().call(work)
         self.after()
         if self.fails == "after":
-            raise StoreError("nobody knows")
+            raise StoreError("unknown result")
         return result
 
 
-class Promises(RuleBasedStateMachine):
-    """Numbers are put; ``pending`` is what the broker must still get, ``out`` is on its way, ``safe`` was on disk at last."""
+class OutboxMachine(RuleBasedStateMachine):
+    """Outbox whose messages are numbers.
+
+    Attributes:
+        pending: Numbers that the broker must still receive.
+        out: Numbers in flight, with their queue numbers.
+        safe: Numbers on disk after the last write.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.patch = pytest.MonkeyPatch()
         self.patch.setattr(queue_module, "PAGE", PAGE)
         self.patch.setattr(outbox_module, "PAGE", PAGE)
-        self.patch.setattr(outbox_module, "FLUSH_S", 1e6)  # when it is written is for the rules to say
+        self.patch.setattr(outbox_module, "FLUSH_S", 1e6)  # the rules decide when it is written
         self.loop = asyncio.new_event_loop()
         self.folder = tempfile.TemporaryDirectory(prefix="store-")
         self.next, self.dropped = 0, 0
@@ -69,10 +75,10 @@ class Promises(RuleBasedStateMachine):
         self.database = FaultyDatabase(Path(self.folder.name) / "pack.sqlite", retry_s=0.0)
         self.outbox = Outbox(self.database, most=self.most)
         self.dropped = 0
-        self.settle(write=False)
+        self.sync(write=False)
 
-    def settle(self, *, write: bool) -> None:
-        self.loop.run_until_complete(self.outbox._settle(write=write))
+    def sync(self, *, write: bool) -> None:
+        self.loop.run_until_complete(self.outbox._sync(write=write))
 
     @rule(count=st.integers(1, 9))
     def put(self, count: int) -> None:
@@ -87,20 +93,20 @@ class Promises(RuleBasedStateMachine):
     @precondition(lambda self: len(self.pending) > len(self.out) and len(self.out) < 5)
     @rule(most=st.integers(1, 3))
     def take(self, most: int) -> None:
-        self.settle(write=False)  # the page that it may wait for
-        assert self.outbox._queue.can_hand_out or not self.strict
-        self.hand_out(most)
+        self.sync(write=False)  # reads a missing page
+        assert self.outbox._queue.can_take or not self.strict
+        self.take_from_queue(most)
 
-    def hand_out(self, most: int) -> None:
-        if not self.outbox._queue.can_hand_out:
+    def take_from_queue(self, most: int) -> None:
+        if not self.outbox._queue.can_take:
             return
         taken = self.outbox._queue.take_next(most)
         numbers = [int(waiting.message.payload) for waiting in taken]
-        ahead = [number for number in self.pending if number not in self.out]
+        expected = [number for number in self.pending if number not in self.out]
         assert numbers
-        assert set(numbers) <= set(ahead)
+        assert set(numbers) <= set(expected)
         if self.strict:
-            assert numbers == ahead[: len(numbers)]
+            assert numbers == expected[: len(numbers)]
         self.out |= {int(waiting.message.payload): waiting.number for waiting in taken}
 
     @precondition(lambda self: self.out)
@@ -120,36 +126,36 @@ class Promises(RuleBasedStateMachine):
 
     @rule()
     def write(self) -> None:
-        self.settle(write=True)
+        self.sync(write=True)
         if self.database.fails is None:
             self.safe = set(self.pending)
 
-    @rule(before=MEANWHILE, after=MEANWHILE, write=st.booleans())
-    def meanwhile(self, before: list[str], after: list[str], *, write: bool) -> None:
-        """While the disk is at work all else goes on."""
+    @rule(before=OPERATIONS, after=OPERATIONS, write=st.booleans())
+    def operate_during_transaction(self, before: list[str], after: list[str], *, write: bool) -> None:
+        """Operate on the queue during a transaction."""
         safe = set(self.pending)
-        self.database.before, self.database.after = partial(self.go_on, before), partial(self.go_on, after)
-        self.settle(write=write)
+        self.database.before, self.database.after = partial(self.operate, before), partial(self.operate, after)
+        self.sync(write=write)
         del self.database.before, self.database.after
         if write and self.database.fails is None:
             self.safe = safe
 
-    def go_on(self, steps: list[str]) -> None:
+    def operate(self, steps: list[str]) -> None:
         for step in steps:
             if step == "put":
                 self.put(3)
             elif step == "take" and len(self.out) < 5:
-                self.hand_out(2)
+                self.take_from_queue(2)
             elif step in ("first", "last") and self.out:
                 self.acknowledge(min(self.out) if step == "first" else max(self.out))
             elif step == "rewind":
                 self.rewind()
-            self.counted()
+            self.counts_agree()
 
     @precondition(lambda self: self.most == 10_000)
     @rule(fails=st.sampled_from(["before", "after"]))
     def fail(self, fails: str) -> None:
-        """What came last goes first while older ones cannot be read."""
+        """Fail the disk; newer messages then overtake those that cannot be read."""
         self.database.fails, self.strict = fails, False
 
     @rule()
@@ -158,26 +164,26 @@ class Promises(RuleBasedStateMachine):
 
     @rule(clean=st.booleans())
     def reopen(self, clean: bool) -> None:
-        """End in good order, or by a kill; at most what was not on disk is missing, and what was doubled was acknowledged."""
+        """Restart after a clean shutdown or a kill: only numbers that were not on disk may be missing."""
         if clean and self.database.fails is None:
             self.outbox.rewind()
-            self.settle(write=True)
+            self.sync(write=True)
             self.safe = set(self.pending)
         self.loop.run_until_complete(self.database.__aexit__())
         with sqlite3.connect(Path(self.folder.name) / "pack.sqlite") as connection:
-            there = [int(payload) for (payload,) in connection.execute("SELECT payload FROM outbox ORDER BY number")]
+            stored = [int(payload) for (payload,) in connection.execute("SELECT payload FROM outbox ORDER BY number")]
         connection.close()
-        assert len(set(there)) == len(there)
-        assert self.safe & set(self.pending) <= set(there)
+        assert len(set(stored)) == len(stored)
+        assert self.safe & set(self.pending) <= set(stored)
         if clean and self.database.fails is None:
-            assert set(there) == set(self.pending)
+            assert set(stored) == set(self.pending)
         if self.strict:
-            assert [number for number in there if number in self.pending] == [n for n in self.pending if n in there]
-        self.pending, self.safe, self.out, self.strict = there, set(there), {}, True
+            assert [number for number in stored if number in self.pending] == [n for n in self.pending if n in stored]
+        self.pending, self.safe, self.out, self.strict = stored, set(stored), {}, True
         self.open()
 
     @invariant()
-    def counted(self) -> None:
+    def counts_agree(self) -> None:
         if hasattr(self, "outbox") and self.strict:
             assert self.outbox.waiting == len(self.pending)
             assert self.outbox.dropped == self.dropped
@@ -190,13 +196,13 @@ class Promises(RuleBasedStateMachine):
             got: list[int] = []
             rounds = self.outbox.waiting + 10
             while self.outbox.waiting and (rounds := rounds - 1):
-                self.settle(write=False)
+                self.sync(write=False)
                 for waiting in self.outbox._queue.take_next(PAGE):
                     got.append(int(waiting.message.payload))
                     self.outbox.sent(waiting.number)
             assert sorted(got) == sorted(self.pending)
             assert not self.strict or got == self.pending
-            self.settle(write=True)
+            self.sync(write=True)
             self.loop.run_until_complete(self.database.__aexit__())
             with sqlite3.connect(Path(self.folder.name) / "pack.sqlite") as connection:
                 assert connection.execute("SELECT count(*) FROM outbox").fetchone() == (0,)
@@ -206,21 +212,21 @@ class Promises(RuleBasedStateMachine):
         self.patch.undo()
 
 
-TestPromises = Promises.TestCase
-TestPromises.settings = settings(max_examples=15, stateful_step_count=40, deadline=None)
+TestOutbox = OutboxMachine.TestCase
+TestOutbox.settings = settings(max_examples=15, stateful_step_count=40, deadline=None)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_full_outbox_at_a_slow_disk_keeps_them_over_a_long_walk(seed: int) -> None:
-    """What hypothesis rarely comes to: pages that are read while the oldest of them are dropped."""
-    dice, machine = random.Random(seed), Promises()
+def test_invariants_hold_for_a_full_outbox_with_a_slow_disk(seed: int) -> None:
+    """Read pages while their oldest messages are dropped, which hypothesis rarely generates."""
+    dice, machine = random.Random(seed), OutboxMachine()
     machine.begin(12)
 
     def steps() -> list[str]:
         return dice.choices(["put", "take", "first", "last", "rewind"], [5, 2, 1, 1, 1], k=dice.randint(0, 3))
 
     for _ in range(60):
-        machine.go_on(steps())
-        machine.meanwhile(steps(), steps(), write=dice.random() < 0.6)
+        machine.operate(steps())
+        machine.operate_during_transaction(steps(), steps(), write=dice.random() < 0.6)
     machine.reopen(clean=True)
     machine.teardown()

@@ -1,0 +1,39 @@
+"""``NumberRanges`` against a set of numbers."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bms_estimator.store.number_ranges import NumberRanges
+
+NUMBERS = st.sets(st.integers(-5, 30))
+
+
+def ranges_of(numbers: set[int]) -> NumberRanges:
+    ranges = NumberRanges()
+    for number in sorted(numbers):
+        ranges.add(number)
+    return ranges
+
+
+def numbers(ranges: NumberRanges) -> set[int]:
+    listed = [number for run in ranges for number in run]
+    assert listed == sorted(set(listed))
+    assert len(ranges) == len(listed)
+    return set(listed)
+
+
+@given(NUMBERS, NUMBERS, st.integers(-6, 31))
+def test_operations_agree_with_those_of_sets(some: set[int], other: set[int], end: int) -> None:
+    assert numbers(ranges_of(some)) == some
+    assert {number for number in range(-6, 32) if number in ranges_of(some)} == some
+    assert numbers(ranges_of(some).intersection(ranges_of(other))) == some & other
+    assert numbers(ranges_of(some).shifted(3)) == {number + 3 for number in some}
+    rest = ranges_of(some)
+    assert numbers(rest.take_before(end)) == {number for number in some if number < end}
+    assert numbers(rest) == {number for number in some if number >= end}
+
+
+def test_pop_returns_the_lowest_number() -> None:
+    ranges = ranges_of({1, 2, 5})
+    assert (ranges.first, ranges.end, [ranges.pop() for _ in range(3)]) == (1, 6, [1, 2, 5])
+    assert not ranges
