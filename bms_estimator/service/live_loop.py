@@ -260,15 +260,6 @@ def _offer(
 ) -> None:
     """Offer the requests that need the loop."""
 
-    async def state(_: Mapping[str, Any]) -> Mapping[str, Any]:
-        return {"estimate": publisher.latest.model_dump() if publisher.latest else None}
-
-    async def parameters(_: Mapping[str, Any]) -> Mapping[str, Any]:
-        return publisher.snapshot.parameters.model_dump()
-
-    async def health(_: Mapping[str, Any]) -> Mapping[str, Any]:
-        return publisher.snapshot.health.model_dump()
-
     async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         soc = number(arguments, "soc", 0.0, 1.0)
         before = _set_soc(estimator, soc)
@@ -290,7 +281,7 @@ def _offer(
         log.info("publish rate set on request", before=before, rate_hz=rate_hz)
         return {"rate_hz": rate_hz, "before": before}
 
-    for handler in (state, parameters, health, set_soc, current_zero, publish_rate):
+    for handler in (set_soc, current_zero, publish_rate):
         requests.register(handler.__name__, handler)
     requests.register("acknowledge_alarm", partial(_acknowledge_alarm, publisher))
 

@@ -9,83 +9,72 @@ from pydantic import Field, model_validator
 from bms_estimator.model.config_file import Strict
 from bms_estimator.settings.polled_source import PolledSource, with_profile
 
-MAX_ID, MAX_EXTENDED_ID = 0x7FF, 0x1FFF_FFFF
-"""Largest identifiers of eleven and of 29 bits."""
-FRAME_BITS = 512
-"""Bits of the longest CAN FD frame."""
 PROFILES: dict[str, dict[str, object]] = {
-    # Frame 0x356 of the battery-to-inverter protocol of Pylontech's low voltage packs, as BMS, inverters and diyBMS
-    # (pylon_canbus.cpp) speak it: three int16, little endian, in 10 mV, 0.1 A and 0.1 degC; 500 kbit/s.
     "pylontech-can": {
         "bitrate": 500_000,
-        "voltage": {"id": 0x356, "start_bit": 0, "bits": 16, "signed": True, "scale": 0.01},
-        "current": {"id": 0x356, "start_bit": 16, "bits": 16, "signed": True, "scale": 0.1},
-        "temperature": {"id": 0x356, "start_bit": 32, "bits": 16, "signed": True, "scale": 0.1},
+        "voltage": {"signal": "PackVoltage"},
+        "current": {"signal": "PackCurrent"},
+        "temperature": {"signal": "PackTemperature"},
     },
 }
-"""Buses with known signals, by name: defaults of ``[source]``. All of them count charge as positive."""
+"""Defaults of ``[source]`` by profile. The package has a DBC file for each. All of them count charge as positive."""
+RESOLUTIONS: dict[str, dict[str, object]] = {
+    "pylontech-can": {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1},
+}
+"""Defaults of ``[sensor]`` by profile: factors of its DBC file."""
+LAYOUT_KEYS = ("id", "extended", "start_bit", "bits", "byte_order", "signed")
+"""Former settings that described the place of a signal in a frame."""
 
 
 class Signal(Strict):
-    """One value on the bus: by its name in the DBC file, or by where it lies in a frame."""
+    """Signal of the DBC file."""
 
-    signal: Annotated[str, Field(min_length=1)] | None = Field(
-        default=None, description="name in the DBC file: Signal, or Message.Signal where several have it"
+    signal: Annotated[str, Field(min_length=1)] = Field(
+        description="name in the DBC file: Signal, or Message.Signal where several have it"
     )
-    id: Annotated[int, Field(ge=0, le=MAX_EXTENDED_ID)] | None = Field(
-        default=None, description="identifier of the frame, such as 0x356"
-    )
-    extended: bool = Field(default=False, description="the identifier has 29 bits")
-    start_bit: Annotated[int, Field(ge=0, lt=FRAME_BITS)] = Field(
-        default=0, description="first bit as a DBC file counts: of a big endian value the highest one"
-    )
-    bits: Annotated[int, Field(ge=1, le=64)] = Field(default=16, description="length")
-    byte_order: Literal["little", "big"] = "little"
-    signed: bool = False
-    scale: float = Field(
-        default=1.0, description="from what is read, or what the DBC file makes of it, to V, A or degC"
-    )
+    scale: float = Field(default=1.0, description="from the DBC file's unit to V, A or degC")
     offset: float = Field(default=0.0, description="added after the scale")
-    absent: int | None = Field(
-        default=None, description="what stands where nothing is measured, before the scale, such as 0x7FFF"
+    absent: float | None = Field(
+        default=None, description="value that marks a missing measurement, in the DBC file's unit, such as 3276.7"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _reject_layout(cls, table: object) -> object:
+        layout = [key for key in LAYOUT_KEYS if key in table] if isinstance(table, dict) else []
+        if layout:
+            raise ValueError(
+                f"{', '.join(layout)}: not supported; describe the signal in a DBC file, set source.dbc to its path, "
+                'and name the signal here: { signal = "PackVoltage" } (example in docs/pack/fieldbus.md)'
+            )
+        return table
 
     @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _scaled(self) -> Self:
         if self.scale == 0.0:
             raise ValueError("scale: must not be 0")
-        if (self.signal is None) == (self.id is None):
-            raise ValueError("give signal, a name in the DBC file, or id, start_bit and bits, and not both")
-        if self.id is not None and self.id > MAX_ID and not self.extended:
-            raise ValueError("id: above 0x7FF it has 29 bits: extended = true")
         return self
 
 
 class CellSignals(Signal):
-    """Cell voltages: consecutive in a frame, or in numbered signals."""
+    """Cell voltages in numbered signals."""
 
     count: Annotated[int, Field(ge=1, le=96)] = Field(
-        default=1, description="so many of the same length follow each other; or numbers from first for {} in signal"
+        default=1, description="number of cells; {} in signal stands for the number of each"
     )
-    first: Annotated[int, Field(ge=0)] = Field(default=1, description="number of the first of them in signal")
+    first: Annotated[int, Field(ge=0)] = Field(default=1, description="number of the first cell in signal")
 
     @model_validator(mode="after")
-    def _counted(self) -> Self:
-        if self.signal is not None and self.count > 1 and "{}" not in self.signal:
+    def _numbered(self) -> Self:
+        if self.count > 1 and "{}" not in self.signal:
             raise ValueError("signal: of several cells it holds {}, which stands for their number")
-        whole_bytes = self.start_bit % 8 == 7 and self.bits % 8 == 0
-        if self.signal is None and self.count > 1 and self.byte_order == "big" and not whole_bytes:
-            raise ValueError("count: big endian values that follow each other are whole bytes; give each by itself")
         return self
 
     def members(self) -> tuple[Signal, ...]:
         """One signal for each cell."""
         one = Signal(**self.model_dump(exclude={"count", "first"}))
-        if self.signal is not None:
-            names = [self.signal.replace("{}", str(self.first + number)) for number in range(self.count)]
-            return tuple(one.model_copy(update={"signal": name}) for name in names)
-        starts = [self.start_bit + number * self.bits for number in range(self.count)]
-        return tuple(one.model_copy(update={"start_bit": start}) for start in starts)
+        names = [self.signal.replace("{}", str(self.first + number)) for number in range(self.count)]
+        return tuple(one.model_copy(update={"signal": name}) for name in names)
 
 
 class CanSource(PolledSource):
@@ -105,13 +94,13 @@ class CanSource(PolledSource):
     options: dict[str, str | int | float | bool] = Field(
         default_factory=dict, description="further arguments of python-can's Bus"
     )
-    dbc: Path | None = Field(default=None, description="DBC file (or KCD, ARXML, SYM) with the signals")
+    dbc: Path | None = Field(
+        default=None, description="DBC file (or KCD, ARXML, SYM) with the signals; default: that of the profile"
+    )
     interval_s: Annotated[float, Field(ge=0.001, le=600)] = Field(
         default=1.0, description="expected sample period on the bus"
     )
-    voltage: Signal = Field(
-        description='pack voltage: { signal = "PackVoltage" }, or { id = 0x356, start_bit = 0, bits = 16, scale = 0.01 }'
-    )
+    voltage: Signal = Field(description='pack voltage, such as { signal = "PackVoltage" }')
     current: Signal = Field(description="as voltage; sensor.current_sign gives the sign")
     temperature: Signal | None = Field(default=None, description="as voltage")
     cells: tuple[CellSignals, ...] = Field(default=(), description="list of such signals, each with its count")
@@ -122,10 +111,9 @@ class CanSource(PolledSource):
         return with_profile(table, PROFILES)
 
     @model_validator(mode="after")
-    def _named_in_a_file(self) -> Self:
-        signals = [self.voltage, self.current, *self.cells, *([self.temperature] if self.temperature else [])]
-        if self.dbc is None and any(signal.signal is not None for signal in signals):
-            raise ValueError("dbc: missing, and signals are named that only a DBC file knows")
+    def _with_dbc(self) -> Self:
+        if self.dbc is None and self.profile is None:
+            raise ValueError("dbc: missing; it describes the signals")
         if sum(cells.count for cells in self.cells) > 96:
             raise ValueError("cells: at most 96 of them")
         return self
@@ -142,8 +130,8 @@ class CanSource(PolledSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The sign of a known bus, and the steps of signals defined by hand."""
-        sign = {"current_sign": "charge_positive"} if self.profile else {}
-        volts = {} if self.voltage.signal else {"voltage_resolution_v": abs(self.voltage.scale)}
-        amperes = {} if self.current.signal else {"current_resolution_a": abs(self.current.scale)}
-        return {**sign, **volts, **amperes}
+        """Return the sign of a profile, and the resolutions of its DBC file."""
+        if self.profile is None:
+            return {}
+        resolutions = RESOLUTIONS[self.profile] if self.dbc is None else {}
+        return {"current_sign": "charge_positive", **resolutions}

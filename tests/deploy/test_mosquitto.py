@@ -128,14 +128,14 @@ async def test_a_pack_writes_nothing_of_another(broker):
 
 
 async def test_a_pack_hears_nothing_of_another(broker):
-    topics = ["bms/shed/request/state", "bms/pack/request/state"]
+    topics = ["bms/shed/request/publish_rate", "bms/pack/request/publish_rate"]
     async with client(broker, "pack") as listening, client(broker, "homeassistant") as asking:
         for topic in ("bms/+/request/+", "bms/pack/request/+"):
             await listening.subscribe(topic)
         for topic in topics:
             await asking.publish(topic, b"{}", qos=1)
         async with asyncio.timeout(LONG_S):
-            assert (await anext(listening.messages)).topic.value == "bms/pack/request/state"
+            assert (await anext(listening.messages)).topic.value == "bms/pack/request/publish_rate"
 
 
 @pytest.fixture
@@ -225,7 +225,7 @@ async def test_a_message_that_would_fill_the_memory_goes_no_further(broker):
         await estimator.subscribe("bms/pack/request/+")
         with contextlib.suppress(aiomqtt.MqttError):
             async with client(broker, "homeassistant") as flooder, asyncio.timeout(LONG_S):
-                sending = asyncio.create_task(flooder.publish("bms/pack/request/state", bytes(5_000_000), qos=1))
+                sending = asyncio.create_task(flooder.publish("bms/pack/request/publish_rate", bytes(5_000_000), qos=1))
                 with pytest.raises(aiomqtt.MqttError):
                     await anext(flooder.messages)  # the broker ends the connection
         sending.cancel()

@@ -10,7 +10,7 @@ from bms_estimator.model.payloads import Snapshot
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.queue_sender import WINDOW
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.sinks.mqtt.requests import NAMES, RequestDispatcher
+from bms_estimator.sinks.mqtt.requests import COMMANDS, RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import Listener
@@ -25,9 +25,9 @@ class Sink:
 
     def __init__(self, url: str | tuple[str, ...], most_kept: int = 4, **options: Any) -> None:
         self.delivery = DeliveryStats()
-        self.requests = RequestDispatcher(self.delivery, ["set_soc", "current_zero"])
+        self.requests = RequestDispatcher(self.delivery, COMMANDS)
         self.asked: list[str] = []
-        for name in NAMES:
+        for name in COMMANDS:
             self.requests.register(name, self._handler(name))
         options = {"first_delay_s": 0.1, "birth_delay_s": 0.1} | options
         outbox = Outbox(None, most=most_kept)

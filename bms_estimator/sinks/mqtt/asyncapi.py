@@ -7,7 +7,7 @@ from pydantic.json_schema import models_json_schema
 from bms_estimator.model.payloads import PAYLOAD_VERSION
 from bms_estimator.settings.pack import DEVICE_NAME, MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
-from bms_estimator.sinks.mqtt.requests import MAX_PAYLOAD_BYTES, NAMES
+from bms_estimator.sinks.mqtt.requests import COMMANDS, MAX_PAYLOAD_BYTES
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from bms_estimator.version import __version__
 
@@ -77,7 +77,7 @@ def document(base_topic: str) -> Document:
         add_send_operation(name, meaning, 1, retain=True)
         messages[name] = {"contentType": "text/plain", "payload": {"type": "string", "enum": ["online", "offline"]}}
     messages["response"] = {"contentType": "application/json", "payload": RESPONSE}
-    for name in NAMES:
+    for name in COMMANDS:
         request, response = f"request_{name}", f"response_{name}"
         add_channel(request, f"request/{name}", request)
         add_channel(response, f"response/{name}", "response")
@@ -114,7 +114,7 @@ def _schemas() -> Document:
 
 def _arguments(name: str) -> Document:
     """Return the JSON schema of a request's arguments."""
-    own = ARGUMENTS.get(name, {})
+    own = ARGUMENTS[name]
     return {
         "type": "object",
         "properties": own | {"transaction": TRANSACTION},

@@ -19,13 +19,11 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.mqtt import Command
 
 COMMANDS = get_args(Command)
-NAMES = ("state", "parameters", "health", *COMMANDS)
-"""Names of all requests."""
+FORMER_READS = ("state", "parameters", "health")
+"""Former requests for payloads that are published on topics of these names."""
 MAX_PAYLOAD_BYTES = 4096
-READS_PER_MIN = 120.0
-"""Rate limit of read requests of all clients together; the same number may arrive at once [1/min]."""
-COMMANDS_PER_MIN = 6.0
-"""Rate limit of commands, granted or not [1/min]."""
+REQUESTS_PER_MIN = 6.0
+"""Rate limit of the requests of all clients together, granted or not; as many may arrive at once [1/min]."""
 LOG_S = 60.0
 """Minimum interval between two log lines for each kind of rejection [s]; all rejections are counted."""
 MAX_SHOWN = 40
@@ -54,11 +52,11 @@ class RequestDispatcher:
     ) -> None:
         self._counts, self._allowed, self._monotonic = delivery.requests, commands, monotonic
         self._handlers: dict[str, Handler] = {}
-        self._reads, self._commands = RateLimiter(READS_PER_MIN, monotonic), RateLimiter(COMMANDS_PER_MIN, monotonic)
+        self._commands, self._former = (RateLimiter(REQUESTS_PER_MIN, monotonic) for _ in range(2))
         self._logged_s: dict[str, float] = {}
 
     def register(self, name: str, handler: Handler) -> None:
-        """Register the handler of a request of ``NAMES``."""
+        """Register the handler of a request of ``COMMANDS``."""
         self._handlers[name] = handler
 
     @property
@@ -66,23 +64,28 @@ class RequestDispatcher:
         """Allowed commands, in the order of ``COMMANDS``."""
         return tuple(command for command in COMMANDS if command in self._allowed)
 
-    async def handle(self, name: str, payload: bytes) -> bytes | None:
+    async def handle(self, name: str, payload: bytes, prefix: str = "") -> bytes | None:
         """Respond to one request: JSON of status, data, error, transaction.
+
+        Args:
+            name: Name of the request.
+            payload: JSON object, or empty.
+            prefix: Prefix of the pack's topics, for the error of a former request.
 
         Returns:
             The response; None for an unknown name and beyond the rate limit.
         """
-        if name not in NAMES:
+        if name not in COMMANDS + FORMER_READS:
             self.count_refusal("unknown", name[:MAX_SHOWN])
             return None
-        if not (self._commands if name in COMMANDS else self._reads).take():
+        if not (self._commands if name in COMMANDS else self._former).take():
             self.count_refusal("too_many", name)
             return None
         transaction = None
         try:
             arguments = _arguments(payload)
             transaction = _transaction(arguments)
-            response = _response("ok", await self._handler(name)(arguments), None, transaction)
+            response = _response("ok", await self._handler(name, prefix)(arguments), None, transaction)
         except UserError as error:
             self.count_refusal("refused", name, reason=str(error))
             return _response("error", None, str(error), transaction)
@@ -106,13 +109,15 @@ class RequestDispatcher:
             self._logged_s[kind] = now_s
             log.warning("request not granted", kind=kind, request=name, so_far=self._counts[kind], **why)
 
-    def _handler(self, name: str) -> Handler:
+    def _handler(self, name: str, prefix: str) -> Handler:
         """Return the handler of a request.
 
         Raises:
-            UserError: The command is not allowed, or the request has no handler.
+            UserError: The request is a former one, is not allowed, or has no handler.
         """
-        if name in COMMANDS and name not in self._allowed:
+        if name in FORMER_READS:
+            raise UserError(f"no such request: subscribe to {prefix}{name}")
+        if name not in self._allowed:
             raise UserError(f"{name}: not allowed; the pack file's mqtt.commands names what is")
         if name not in self._handlers:
             raise UserError(f"{name}: cannot be asked here")

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,47 +35,30 @@ class FrameId(NamedTuple):
         return f"0x{self.id:08X}" if self.extended else f"0x{self.id:03X}"
 
 
-def bits_of(signal: Signal, data: bytes) -> int | None:
-    """Extract the integer of ``signal`` from ``data``; None if the frame is too short."""
-    size = 8 * len(data)
-    if signal.byte_order == "little":
-        shift = signal.start_bit
-        end = signal.start_bit + signal.bits
-    else:  # within a byte a DBC file counts bits from its lowest, and a big endian value continues in the next byte
-        end = 8 * (signal.start_bit // 8) + 7 - signal.start_bit % 8 + signal.bits
-        shift = size - end
-    if end > size:
-        return None
-    raw = int.from_bytes(data, signal.byte_order) >> shift & (1 << signal.bits) - 1
-    return raw - (1 << signal.bits) if signal.signed and raw >> signal.bits - 1 else raw
-
-
 Key = tuple[str, int]
 """Quantity as ``[source]`` calls it, and number of the cell from 0."""
 
 
-@dataclass
-class _Frame:
-    """Wanted signals of one frame."""
+class _Frame(NamedTuple):
+    """Frame with wanted signals."""
 
-    signals: list[tuple[Key, Signal]] = field(default_factory=list)
-    message: Message | None = None
-    """Message of the DBC file, if one of the signals is named."""
+    message: Message
+    signals: list[tuple[Key, Signal]]
 
     def values(self, data: bytes) -> Iterator[tuple[Key, float | None]]:
         """Return values in V, A or C; NaN if absent, None if ``data`` is too short; none of another multiplexer value."""
-        named = _named(self.message, data) if self.message is not None else {}
-        in_turns = bool(named) and self.message is not None and self.message.is_multiplexed()
+        decoded = _decode(self.message, data)
+        is_multiplexed = bool(decoded) and self.message.is_multiplexed()
         for key, signal in self.signals:
-            raw = bits_of(signal, data) if signal.signal is None else named.get(signal.signal.split(".")[-1])
-            if raw is None and in_turns:
+            raw = decoded.get(signal.signal.split(".")[-1])
+            if raw is None and is_multiplexed:
                 continue
             if raw is None:
                 yield key, None
-            elif raw == signal.absent or not math.isfinite(value := raw * signal.scale + signal.offset):
-                yield key, math.nan
-            else:
-                yield key, round(value, DECIMALS)
+                continue
+            is_absent = signal.absent is not None and math.isclose(raw, signal.absent)
+            value = math.nan if is_absent else raw * signal.scale + signal.offset
+            yield key, round(value, DECIMALS) if math.isfinite(value) else math.nan
 
 
 class CanMap:
@@ -92,9 +75,11 @@ class CanMap:
 
     def __init__(self, settings: CanSource) -> None:
         self._frames: dict[FrameId, _Frame] = {}
-        database = _load(settings.dbc) if settings.dbc is not None else None
+        database = _packaged(settings.profile) if settings.dbc is None else _load(settings.dbc)
         for key, signal in _signals(settings):
-            self._want(key, signal, database)
+            message = _message(key[0], signal.signal, database)
+            frame_id = FrameId(message.frame_id, message.is_extended_frame)
+            self._frames.setdefault(frame_id, _Frame(message, [])).signals.append((key, signal))
         self._cells = sum(cells.count for cells in settings.cells)
         self._apart_s = min(APART_PERIODS * settings.interval_s, KEPT_S)
         self._newest: dict[Key, tuple[float, float]] = {}  # arrival [s], value
@@ -148,20 +133,6 @@ class CanMap:
         reading = self._reading(arrival_s)
         return None if math.isnan(reading.voltage_v) or math.isnan(reading.current_a) else reading
 
-    def _want(self, key: Key, signal: Signal, database: Database | None) -> None:
-        """Look at the frame that holds ``signal``.
-
-        Raises:
-            UserError: The DBC file does not contain it, or several times.
-        """
-        if signal.id is not None:
-            self._frames.setdefault(FrameId(signal.id, signal.extended), _Frame()).signals.append((key, signal))
-        elif signal.signal is not None and database is not None:
-            message = _message(key[0], signal.signal, database)
-            frame = self._frames.setdefault(FrameId(message.frame_id, message.is_extended_frame), _Frame())
-            frame.message = message
-            frame.signals.append((key, signal))
-
     def _reading(self, now_s: float) -> Reading:
         cells_v = tuple(self._get("cells", now_s, number) for number in range(self._cells))
         return Reading(
@@ -185,6 +156,13 @@ def _signals(settings: CanSource) -> Iterator[tuple[Key, Signal]]:
         yield ("temperature", 0), settings.temperature
     members = [signal for cells in settings.cells for signal in cells.members()]
     yield from ((("cells", number), signal) for number, signal in enumerate(members))
+
+
+def _packaged(profile: str | None) -> Database:
+    """Load the DBC file of a profile."""
+    database = Database()
+    database.add_dbc_string((resources.files("bms_estimator.sources.fieldbus") / f"{profile}.dbc").read_text())
+    return database
 
 
 def _load(path: Path) -> Database:
@@ -227,8 +205,8 @@ def _message(quantity: str, signal: str, database: Database) -> Message:
     raise UserError(f"source.{quantity}: signal = {signal!r}: {reason}")
 
 
-def _named(message: Message, data: bytes) -> Mapping[str, float]:
-    """Values as the DBC file scales them, by name: those that the frame is long enough for, and that its multiplexer names."""
+def _decode(message: Message, data: bytes) -> Mapping[str, float]:
+    """Return values by name, in the DBC file's units, as far as the frame is long enough and its multiplexer selects them."""
     try:
         values = message.decode(data, decode_choices=False, allow_truncated=True)
     except (DecodeError, ValueError, KeyError):

@@ -33,7 +33,7 @@ def test_init_writes_a_file_of_the_defaults_that_check_accepts(pack, capsys):
 
 NEEDED = {
     "ble": "name = 'battery'\n",
-    "can": "voltage = { id = 0x356 }\ncurrent = { id = 0x356, start_bit = 16 }\n",
+    "can": "dbc = 'pack.dbc'\nvoltage = { signal = 'V' }\ncurrent = { signal = 'I' }\n",
     "mqtt": "profile = 'opendtu'\n",
     "modbus": "host = 'gx'\nvoltage = { address = 259 }\ncurrent = { address = 261 }\n",
 }

@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.model.payloads import PAYLOAD_VERSION
 from bms_estimator.sinks.mqtt.asyncapi import ARGUMENTS, document
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from bms_estimator.sinks.mqtt.requests import COMMANDS, NAMES
+from bms_estimator.sinks.mqtt.requests import COMMANDS
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from tests.command_line import run
 from tests.sinks.mqtt.payload_record import broken, now, recorded
@@ -80,7 +80,7 @@ def test_all_that_the_document_points_at_is_in_it() -> None:
 
 def test_the_document_has_every_topic_with_its_own_fields() -> None:
     addresses = {channel["address"] for channel in DOCUMENT["channels"].values()}
-    for name in ("state", "sensor/availability", "alarm/{alarm}", *(f"request/{name}" for name in NAMES)):
+    for name in ("state", "sensor/availability", "alarm/{alarm}", *(f"request/{name}" for name in COMMANDS)):
         assert f"bms/{{device}}/{name}" in addresses
     schemas = DOCUMENT["components"]["schemas"]
     for topic in TOPICS.values():
@@ -91,10 +91,10 @@ def test_the_document_has_every_topic_with_its_own_fields() -> None:
 
 def test_it_says_what_each_command_takes() -> None:
     assert set(ARGUMENTS) == set(COMMANDS)
-    payloads = {name: DOCUMENT["components"]["messages"][f"request_{name}"]["payload"] for name in NAMES}
+    payloads = {name: DOCUMENT["components"]["messages"][f"request_{name}"]["payload"] for name in COMMANDS}
     assert payloads["set_soc"]["required"] == ["soc"]
     assert payloads["acknowledge_alarm"]["required"] == []
-    assert set(payloads["state"]["properties"]) == {"transaction"}
+    assert set(payloads["current_zero"]["properties"]) == {"transaction"}
 
 
 def test_the_command_prints_it(capsys: pytest.CaptureFixture[str]) -> None:

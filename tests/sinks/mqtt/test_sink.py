@@ -208,9 +208,17 @@ async def test_a_request_comes_back_as_a_response(broker: Broker, url: str) -> N
     async with Listener(broker) as live, Sink(url) as sink:
         sink.mqtt.publish(ONE)
         await live.wait("bms/pack/availability")
-        await live.publish("bms/pack/request/health", b'{"transaction": 7}', qos=1)
-        response = await live.wait_json("bms/pack/response/health")
-    assert response == {"status": "ok", "data": {"name": "health"}, "error": None, "transaction": 7}
+        await live.publish("bms/pack/request/publish_rate", b'{"transaction": 7}', qos=1)
+        response = await live.wait_json("bms/pack/response/publish_rate")
+    assert response == {"status": "ok", "data": {"name": "publish_rate"}, "error": None, "transaction": 7}
+
+
+async def test_a_former_request_is_answered_with_the_topic_to_subscribe_to(broker: Broker, url: str) -> None:
+    async with Listener(broker) as live, Sink(url):
+        await live.wait("bms/pack/availability")
+        await live.publish("bms/pack/request/state", qos=1)
+        response = await live.wait_json("bms/pack/response/state")
+    assert response["error"] == "no such request: subscribe to bms/pack/state"
 
 
 async def test_a_retained_request_that_waited_is_not_granted(broker: Broker, url: str) -> None:
@@ -218,9 +226,9 @@ async def test_a_retained_request_that_waited_is_not_granted(broker: Broker, url
         await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
         async with Sink(url) as sink:
             await live.wait("bms/pack/availability")
-            await live.publish("bms/pack/request/state", b"{}", qos=1)
-            await live.wait("bms/pack/response/state")
-    assert sink.asked == ["state"]
+            await live.publish("bms/pack/request/publish_rate", b"{}", qos=1)
+            await live.wait("bms/pack/response/publish_rate")
+    assert sink.asked == ["publish_rate"]
     assert sink.delivery.requests == {"retained": 1, "granted": 1}
 
 
@@ -228,9 +236,9 @@ async def test_a_retained_request_is_not_granted_while_connected_either(broker: 
     async with Listener(broker) as live, Sink(broker.url) as sink:
         await live.wait("bms/pack/availability")
         await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
-        await live.publish("bms/pack/request/state", b"{}", qos=1)
-        await live.wait("bms/pack/response/state")
-    assert sink.asked == ["state"]
+        await live.publish("bms/pack/request/publish_rate", b"{}", qos=1)
+        await live.wait("bms/pack/response/publish_rate")
+    assert sink.asked == ["publish_rate"]
     assert sink.delivery.requests == {"retained": 1, "granted": 1}
 
 
@@ -241,8 +249,8 @@ async def test_no_topic_of_a_request_ends_the_service(broker: Broker, url: str, 
             await started.wait("bms/pack/availability")
         for name in ("x" * name_bytes, "é" * (name_bytes // 2), "nonsense"):
             await live.publish(f"bms/pack/request/{name}", b"{}", qos=1)
-        await live.publish("bms/pack/request/state", b"{}", qos=1)
-        await live.wait("bms/pack/response/state")
+        await live.publish("bms/pack/request/publish_rate", b"{}", qos=1)
+        await live.wait("bms/pack/response/publish_rate")
         assert len(live.messages) == 1
     assert sink.delivery.requests["granted"] == sink.delivery.requests["unknown"] == 1
 
@@ -261,15 +269,15 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
         with structlog.testing.capture_logs() as logs:
             await live.publish("bms/pack/request/current_zero", qos=1)
             for _ in range(20):
-                await live.publish("bms/pack/request/state", b"x" * 1_000_000, qos=1)
+                await live.publish("bms/pack/request/none", b"x" * 1_000_000, qos=1)
             for _ in range(3 * MAX_WAITING):
-                await live.publish("bms/pack/request/state", b"x" * 4000, qos=1)
+                await live.publish("bms/pack/request/none", b"x" * 4000, qos=1)
             await until(lambda: sink.delivery.requests["overflow"] > MAX_WAITING)
             gate.set()
             await live.wait("bms/pack/response/current_zero")
         assert len(logs) < 10
-        while not live.all("bms/pack/response/health"):  # the first may still find no room
-            await live.publish("bms/pack/request/health", qos=1)
+        while not live.all("bms/pack/response/publish_rate"):  # the first may still find no room
+            await live.publish("bms/pack/request/publish_rate", qos=1)
             await asyncio.sleep(0.1)
 
 
@@ -297,12 +305,12 @@ async def test_a_fault_of_ours_is_offline_for_the_broker_and_raised(broker: Brok
 
 async def test_the_demo_s_broker_which_knows_no_mqtt_5_is_served() -> None:
     async with DemoBroker() as broker, aiomqtt.Client("127.0.0.1", broker.port) as client, Sink(broker.url) as sink:
-        await client.subscribe([("bms/pack/state", 0), ("bms/pack/response/state", 1)])
+        await client.subscribe([("bms/pack/state", 0), ("bms/pack/response/publish_rate", 1)])
         sink.mqtt.publish(ONE)
         async with asyncio.timeout(LONG_S):
             assert (await anext(client.messages)).topic.value == "bms/pack/state"
-            await client.publish("bms/pack/request/state", qos=1)
-            assert (await anext(client.messages)).topic.value == "bms/pack/response/state"
+            await client.publish("bms/pack/request/publish_rate", qos=1)
+            assert (await anext(client.messages)).topic.value == "bms/pack/response/publish_rate"
 
 
 @pytest.fixture

@@ -1,19 +1,19 @@
-"""Frames of a CAN bus to readings; where a value lies is tried against cantools."""
+"""Readings from frames of a CAN bus."""
 
 import math
+from importlib.resources import files
 from pathlib import Path
 
+import cantools
 import pytest
-from cantools.database.can import Message
-from cantools.database.can import Signal as DbcSignal
-from cantools.database.conversion import BaseConversion
+from cantools.database.can import Database
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.can_source import CanSource, CellSignals, Signal
-from bms_estimator.sources.fieldbus.can_signals import KEPT_S, CanMap, FrameId, bits_of
+from bms_estimator.settings.can_source import PROFILES, CanSource, CellSignals
+from bms_estimator.sources.fieldbus.can_signals import KEPT_S, CanMap, FrameId
 
 PYLONTECH = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])
 """52.34 V, -12.3 A (charge is positive), 21.5 degC, as frame 0x356 has them."""
@@ -29,19 +29,35 @@ BO_ 1281 Cells: 8 BMS
  SG_ Cell1 m0 : 8|16@1+ (1,0) [0|5000] "mV" X
  SG_ Cell2 m0 : 24|16@1+ (1,0) [0|5000] "mV" X
  SG_ Cell3 m1 : 8|16@1+ (1,0) [0|5000] "mV" X
+BO_ 1 V: 1 BMS
+ SG_ Volts : 0|8@1+ (0.1,0) [0|0] "V" X
+BO_ 2 I: 1 BMS
+ SG_ Amperes : 0|8@1+ (0.1,0) [0|0] "A" X
+BO_ 3 T: 1 BMS
+ SG_ Degrees : 0|8@1+ (0.1,0) [0|0] "degC" X
+BO_ 4 C: 2 BMS
+ SG_ C1 : 0|8@1+ (0.1,0) [0|0] "V" X
+ SG_ C2 : 8|8@1+ (0.1,0) [0|0] "V" X
+BO_ 5 C_: 1 BMS
+ SG_ Last : 0|8@1+ (0.1,0) [0|0] "V" X
 BO_ 2566848512 Other: 8 BMS
  SG_ Fast : 0|8@1+ (1,0) [0|0] "" X
  SG_ Temp : 8|8@1+ (1,-40) [0|0] "degC" X
 """
-"""Made for these tests: big and little endian, a multiplexer, an identifier of 29 bits."""
+"""DBC file made for these tests: a multiplexer, an identifier of 29 bits, values in frames of their own."""
 
 
 @pytest.fixture(scope="module")
-def named(tmp_path_factory: pytest.TempPathFactory) -> CanSource:
+def dbc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("dbc") / "pack.dbc"
     path.write_text(DBC)
+    return path
+
+
+@pytest.fixture(scope="module")
+def named(dbc: Path) -> CanSource:
     return source(
-        dbc=str(path),
+        dbc=str(dbc),
         voltage={"signal": "PackVoltage"},
         current={"signal": "Pack.PackCurrent"},
         temperature={"signal": "Temp"},
@@ -51,25 +67,6 @@ def named(tmp_path_factory: pytest.TempPathFactory) -> CanSource:
 
 def source(**told: object) -> CanSource:
     return CanSource.model_validate({"kind": "can"} | told)
-
-
-@given(
-    st.binary(max_size=8),
-    st.integers(0, 63),
-    st.integers(1, 32),
-    st.sampled_from(["little", "big"]),
-    st.booleans(),
-)
-def test_a_value_lies_where_cantools_finds_it(data: bytes, start: int, bits: int, order: str, signed: bool) -> None:
-    signal = Signal(id=1, start_bit=start, bits=bits, byte_order=order, signed=signed)
-    end = start + bits if order == "little" else 8 * (start // 8) + 7 - start % 8 + bits
-    if end > 8 * len(data):
-        assert bits_of(signal, data) is None
-        return
-    conversion = BaseConversion.factory()
-    dbc = DbcSignal("x", start, bits, f"{order}_endian", signed, conversion)
-    message = Message(1, "m", len(data), [dbc])
-    assert bits_of(signal, data) == message.decode(data)["x"]
 
 
 @given(st.lists(st.tuples(st.sampled_from([0x355, 0x356, 0x357]), st.booleans(), st.binary(max_size=64)), max_size=20))
@@ -110,14 +107,14 @@ def test_a_frame_that_is_too_short_for_a_value_brings_the_others() -> None:
     assert map_.counters["short_frames"] == 2
 
 
-def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest() -> None:
-    byte = {"bits": 8, "scale": 0.1}
+def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest(dbc: Path) -> None:
     map_ = CanMap(
         source(
-            voltage=byte | {"id": 1},
-            current=byte | {"id": 2, "absent": 255},
-            temperature=byte | {"id": 3},
-            cells=[byte | {"id": 4, "count": 2}, byte | {"id": 5}],
+            dbc=str(dbc),
+            voltage={"signal": "Volts"},
+            current={"signal": "Amperes", "absent": 25.5},
+            temperature={"signal": "Degrees"},
+            cells=[{"signal": "C{}", "count": 2}, {"signal": "Last"}],
         )
     )
     assert map_.feed(0.0, 3, False, b"\xd2") is None
@@ -145,13 +142,6 @@ def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest(
     assert math.isnan(late.temperature_c)
 
 
-@pytest.fixture
-def dbc(tmp_path: Path) -> Path:
-    path = tmp_path / "pack.dbc"
-    path.write_text(DBC)
-    return path
-
-
 def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
     map_ = CanMap(named)
     assert set(map_.places) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
@@ -170,8 +160,8 @@ def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
     ("name", "said"),
     [
         (
-            "Volts",
-            "source.voltage: signal = 'Volts': the DBC file has no such signal; it has Cell1, Cell2, Cell3, Fast",
+            "Voltage",
+            "source.voltage: signal = 'Voltage': the DBC file has no such signal; it has Amperes, C1, C2, Cell1",
         ),
         ("Fast", "several messages have it: write Pack.Fast or Other.Fast"),
         ("Cells.PackVoltage", "no such signal"),
@@ -193,29 +183,45 @@ def test_a_dbc_file_that_is_none(tmp_path: Path) -> None:
         CanMap(source(dbc=str(junk), **named))
 
 
-def test_cells_that_follow_each_other() -> None:
-    assert [s.start_bit for s in CellSignals(id=1, bits=12, count=3).members()] == [0, 12, 24]
-    big = CellSignals(id=1, start_bit=7, byte_order="big", count=2).members()
-    assert [bits_of(signal, b"\x0c\xe4\x0c\xe5") for signal in big] == [3300, 3301]
-    named = CellSignals(signal="C{}", count=2, first=0).members()
-    assert [signal.signal for signal in named] == ["C0", "C1"]
+def test_cells_are_numbered() -> None:
+    members = CellSignals(signal="C{}", count=2, first=0).members()
+    assert [signal.signal for signal in members] == ["C0", "C1"]
 
 
-V, I = {"id": 1}, {"id": 2}  # noqa: E741
+@pytest.mark.parametrize("profile", PROFILES)
+def test_resolutions_of_a_profile_are_the_factors_of_its_dbc_file(profile: str) -> None:
+    text = (files("bms_estimator.sources.fieldbus") / f"{profile}.dbc").read_text()
+    database = cantools.database.load_string(text, database_format="dbc")
+    assert isinstance(database, Database)
+    factors = {signal.name: signal.conversion.scale for message in database.messages for signal in message.signals}
+    given = source(profile=profile)
+    assert given.sensor["voltage_resolution_v"] == factors[given.voltage.signal]
+    assert given.sensor["current_resolution_a"] == factors[given.current.signal]
+
+
+def test_a_dbc_file_beside_a_profile_takes_its_place(dbc: Path) -> None:
+    given = source(profile="pylontech-can", dbc=str(dbc), temperature={"signal": "Temp"})
+    assert given.sensor == {"current_sign": "charge_positive"}
+    assert set(CanMap(given).places) == {FrameId(0x500, False), FrameId(0x18FF0000, True)}
+
+
+V, I = {"signal": "V"}, {"signal": "I"}  # noqa: E741
 
 
 @pytest.mark.parametrize(
     ("told", "said"),
     [
         ({"profile": "pylontech"}, "'pylontech' is none of pylontech-can"),
-        ({"voltage": {}, "current": I}, "give signal"),
-        ({"voltage": V | {"signal": "x"}, "current": I}, "and not both"),
-        ({"voltage": {"signal": "x"}, "current": I}, "dbc: missing"),
-        ({"voltage": {"id": 0x800}, "current": I}, "extended = true"),
-        ({"voltage": V | {"scale": 0.0}, "current": I}, "must not be 0"),
-        ({"voltage": V, "current": I, "cells": [{"id": 3, "count": 97}]}, "96"),
-        ({"voltage": V, "current": I, "cells": 2 * [{"id": 3, "count": 60}]}, "at most 96"),
-        ({"voltage": V, "current": I, "cells": [{"id": 3, "count": 2, "byte_order": "big"}]}, "whole bytes"),
+        ({"voltage": {}, "current": I, "dbc": "x"}, "voltage.signal\n  Field required"),
+        ({"voltage": V, "current": I}, "dbc: missing"),
+        (
+            {"voltage": {"id": 0x356, "start_bit": 0, "bits": 16, "scale": 0.01}, "current": I, "dbc": "x"},
+            "id, start_bit, bits: not supported; describe the signal in a DBC file, set source.dbc",
+        ),
+        ({"voltage": V, "current": I, "dbc": "x", "cells": [{"id": 3, "count": 2}]}, "id: not supported"),
+        ({"voltage": V | {"scale": 0.0}, "current": I, "dbc": "x"}, "must not be 0"),
+        ({"voltage": V, "current": I, "dbc": "x", "cells": [{"signal": "C{}", "count": 97}]}, "96"),
+        ({"voltage": V, "current": I, "dbc": "x", "cells": 2 * [{"signal": "C{}", "count": 60}]}, "at most 96"),
         ({"voltage": V, "current": I, "dbc": "x", "cells": [{"signal": "Cell", "count": 2}]}, "holds {}"),
     ],
 )

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.fieldbus.can_signals import CanMap, FrameId
 
 TEXT = (Path(__file__).parents[3] / "docs" / "pack" / "fieldbus.md").read_text(encoding="utf-8")
 
@@ -16,3 +18,19 @@ def test_an_example_is_accepted(example: str) -> None:
     settings = Settings.model_validate(tomllib.loads(example))
     assert settings.source is not None
     assert settings.sensor.protocol == "text"
+
+
+def test_the_dbc_file_belongs_to_the_settings_above_it(tmp_path: Path) -> None:
+    match = re.search(
+        r"^```toml\n([^`]*?dbc = [^`]*)^```.*?^```text\n(VERSION.*?)^```", TEXT, flags=re.MULTILINE | re.DOTALL
+    )
+    assert match
+    path = tmp_path / "pack.dbc"
+    path.write_text(match[2])
+    table = tomllib.loads(match[1])["source"] | {"dbc": str(path)}
+    frames = CanMap(CanSource.model_validate(table))
+    assert frames.places == (FrameId(0x6B0, False), FrameId(0x18FF0001, True))
+    assert frames.feed(0.0, 0x18FF0001, True, bytes.fromhex("e40ce50c")) is None
+    reading = frames.feed(0.0, 0x6B0, False, bytes.fromhex("ff85020815000000"))
+    assert reading is not None
+    assert reading[:4] == (52.0, -12.3, 21.0, (3.3, 3.301))
