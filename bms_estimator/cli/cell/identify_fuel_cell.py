@@ -66,7 +66,7 @@ def identify_fuel_cell(
             value=getattr(fit.model.fuel_cell, key),
             std=fit.model.std[key] * getattr(fit.model.fuel_cell, key) if key in fit.model.std else None,
             of_start=getattr(start.fuel_cell, key),
-            reason=fit.not_told.get(key),
+            reason=fit.undetermined.get(key),
         )
         for key in KEYS
     }
@@ -127,7 +127,7 @@ def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floa
 
 def _remarks(cell: str, fit: FuelCellFit) -> list[str]:
     fits = ", ".join(f"{name} ({1e3 * rms_v:.1f} mV RMS)" for name, rms_v in fit.rms_v.items())
-    kept = f"As in the file, because the data do not tell: {', '.join(fit.not_told)}." if fit.not_told else ""
+    kept = f"As in the file, because the data do not tell: {', '.join(fit.undetermined)}." if fit.undetermined else ""
     return [line for line in (f"Identified from {fits}, begun at {Path(cell).name}.", kept) if line]
 
 
@@ -140,4 +140,4 @@ def _tables(out: Path, values: dict[str, Value], fit: FuelCellFit, seconds: floa
         std = "as before" if v.std is None else f"{v.std:.2g}"
         table.add_row(key, f"{v.value:.{DIGITS}g}", std, f"{v.of_start:.{DIGITS}g}")
     left = [f"{name}: {1e3 * rms_v:.1f} mV RMS" for name, rms_v in fit.rms_v.items()]
-    return Group(table, *left, *(f"{key}: {reason}" for key, reason in fit.not_told.items()), f"{seconds:.1f} s")
+    return Group(table, *left, *(f"{key}: {reason}" for key, reason in fit.undetermined.items()), f"{seconds:.1f} s")
