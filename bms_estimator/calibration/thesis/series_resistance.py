@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.thesis.prediction import Prediction, open_circuit
-from bms_estimator.kernels.observer.series_resistance import BINS, SMALLEST_CURRENT_C
+from bms_estimator.kernels.observer.series_resistance import BINS, MIN_CURRENT_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Resistance
 from bms_estimator.model.errors import UserError
@@ -81,10 +81,10 @@ def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
     Raises:
         UserError: No current flows.
     """
-    flowing = np.abs(run.current_a) > SMALLEST_CURRENT_C * cell.cell.capacity_ah
+    flowing = np.abs(run.current_a) > MIN_CURRENT_C * cell.cell.capacity_ah
     if not flowing.any():
         raise UserError(
-            f"R_s by (4.2) needs a current: none above {SMALLEST_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
+            f"R_s by (4.2) needs a current: none above {MIN_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
             f"{np.abs(run.current_a).max():.3f} A"
         )
     resistive_v = (open_circuit(cell, run.soc) - run.overpotential_v - run.voltage_v)[flowing]

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.cli.options.capture_options import name_of, unlike
-from bms_estimator.kernels.kalman_filter.temperature import COLDEST_C, HOTTEST_C
+from bms_estimator.kernels.kalman_filter.temperature import MAX_PLAUSIBLE_C, MIN_PLAUSIBLE_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
@@ -53,8 +53,10 @@ def identify_fuel_cell(
     as_json: bool,
 ) -> None:
     """Identify, write the file and print the outcome; arguments as of ``identify_command``."""
-    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
-        raise UserError(f"--temperature-c {temperature_c:g}: must lie within {COLDEST_C:g} and {HOTTEST_C:g} C")
+    if temperature_c is not None and not MIN_PLAUSIBLE_C <= temperature_c <= MAX_PLAUSIBLE_C:
+        raise UserError(
+            f"--temperature-c {temperature_c:g}: must lie within {MIN_PLAUSIBLE_C:g} and {MAX_PLAUSIBLE_C:g} C"
+        )
     start = load_fuel_cell(cell)
     names = unlike([name_of(path) for path in paths], paths)
     sources = [_source(*one, start, temperature_c, current_sign) for one in zip(names, paths, strict=True)]
@@ -96,7 +98,7 @@ def _source(
     good = _usable(path, model, current_a, voltage_v)
     if time_s is not None:
         good &= np.diff(time_s, prepend=-np.inf) > 0.0
-    sensed = (sensed_c >= COLDEST_C) & (sensed_c <= HOTTEST_C)
+    sensed = (sensed_c >= MIN_PLAUSIBLE_C) & (sensed_c <= MAX_PLAUSIBLE_C)
     celsius = np.where(sensed, sensed_c, math.nan if temperature_c is None else temperature_c)
     return Source(
         name=name,
