@@ -2,9 +2,10 @@
 
     z_k = z_c - Ah_k / Q + (offset / Q) t_k
 
-for anchor k of the continuous part c of a capture, linear in 1/Q, offset/Q and each part's z_c. All anchors are solved
-jointly by generalised least squares (Plett 2011 weighs both axes; here charge has the offset as an unknown of known size).
-Errors of the curve go together for anchors at SOCs near each other: a capacity between two of the same SOC has none of it.
+for anchor k of the continuous part c of a capture. The equation is linear in 1/Q, offset/Q and each part's z_c. All
+anchors are solved jointly by generalised least squares. Plett (2011) weighs the errors of both axes; here the offset of
+the current is an unknown with a prior. Errors of the OCV curve are correlated between anchors at similar SOCs, so that
+they cancel in a capacity between two anchors at the same SOC.
 """
 
 import itertools
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.capture_checks import GAP_CHARGE, GAP_STEPS
+from bms_estimator.calibration.cleaning.capture_checks import MIN_GAP_CHARGE, MIN_GAP_PERIODS
 from bms_estimator.calibration.cleaning.rests import remove_glitches, resting_samples, true_runs
 from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, coldness
 from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests
@@ -31,19 +32,20 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings
 
-LARGEST_STD = 0.1
+MAX_ANCHOR_SOC_STD = 0.1
 """Maximum std of an anchor's SOC."""
-MIN_SWING = 0.15
-"""SOC between the lowest and the highest anchor that a capacity needs."""
-LARGEST_RELATIVE_STD = 0.2
+MIN_SOC_SPAN = 0.15
+"""Minimum SOC difference between the lowest and the highest anchor."""
+MAX_RELATIVE_CAPACITY_STD = 0.2
 """Maximum relative std of a capacity."""
-BEYOND = 3.0
-"""Distance beyond the curve's ends, in standard deviations, at which a rest does not belong to this cell."""
-DISAGREE = 9.0
-"""Maximum squared distance between two consistent anchors, in units of their variance."""
-HYST_UNSURE = 0.3
-"""Std of the hysteresis h if the direction of the current is known, and of its amplitude, whose error has the
-opposite sign after a charge."""
+MAX_BEYOND_CURVE_STDS = 3.0
+"""Maximum distance of a rest's voltage beyond the curve's ends, in standard deviations. A rest further out is of another
+cell."""
+MAX_REDUCED_CHI_SQUARED = 9.0
+"""Maximum weighted squared residual of the anchors per degree of freedom."""
+HYSTERESIS_STD = 0.3
+"""Std of the hysteresis state h with a known direction of the current. The std covers the error of the amplitude, which
+has the opposite sign after a charge."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +53,17 @@ class Anchor:
     """A rest whose voltage gives the SOC.
 
     Attributes:
-        capture: Name of its capture.
+        capture: Name of the capture.
         part: Number of the continuous part, over all captures.
-        time_s: Time of its end, on the capture's clock [s].
+        time_s: Time of the rest's end, on the capture's clock [s].
         rest: The detected rest.
-        soc: SOC by its voltage.
-        soc_std: Standard deviation of soc, with the error of the curve.
-        counted_ah: Drawn since the part began [Ah].
-        moved_ah: Magnitude of the charge moved since then [Ah].
-        slope_v: Slope of the curve there [V].
-        own_v: Standard deviation of its voltage that is its own [V].
-        curve_v: Value of the curve there [V].
+        soc: SOC by the rest's voltage.
+        soc_std: Standard deviation of ``soc``, with the error of the curve.
+        counted_ah: Net charge drawn since the part began [Ah].
+        throughput_ah: Sum of charge and discharge since the part began [Ah].
+        slope_v: Slope dOCV/dSOC at ``soc`` [V].
+        own_std_v: Standard deviation of the voltage, independent of other anchors [V].
+        curve_std_v: Standard deviation of the OCV curve at ``soc``, correlated between anchors [V].
     """
 
     capture: str
@@ -71,10 +73,10 @@ class Anchor:
     soc: float
     soc_std: float
     counted_ah: float
-    moved_ah: float
+    throughput_ah: float
     slope_v: float
-    own_v: float
-    curve_v: float
+    own_std_v: float
+    curve_std_v: float
 
 
 @dataclass(frozen=True)
@@ -82,13 +84,13 @@ class Capacity:
     """Result of a capacity measurement.
 
     Attributes:
-        capacity_ah: [Ah].
-        std_ah: Standard deviation [Ah].
-        offset_a: Offset of the current sensor, if the anchors determine it [A].
+        capacity_ah: Capacity [Ah].
+        std_ah: Standard deviation of the capacity [Ah].
+        offset_a: Offset of the current sensor [A]; near 0 if the anchors do not determine it.
         offset_std_a: Standard deviation of the offset [A].
-        anchors: Used.
+        anchors: Anchors that were used.
         residual: Residual of each anchor: SOC by its voltage minus SOC by the charge.
-        rejected: Why other rests were not, one line each.
+        rejected: Reasons why other rests were rejected, one line each.
     """
 
     capacity_ah: float
@@ -101,41 +103,40 @@ class Capacity:
 
 
 def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std_a: float | None = None) -> Capacity:
-    """Capacity from the anchors of one or more captures of a cell.
+    """Measure the capacity by the anchors of one or more captures of a cell.
 
     Args:
-        captures: Captures of one cell, within weeks.
-        cell: Supplies the open-circuit voltage with its error; its capacity defines small currents only.
-        offset_std_a: Standard deviation of the offset of the current sensor [A]; None: as the identifier takes it.
+        captures: Captures of one cell, recorded within weeks, so that its capacity is constant.
+        cell: Open-circuit voltage with its error. The cell's capacity only scales the limit of a rest's current.
+        offset_std_a: Standard deviation of the offset of the current sensor [A]; None: the identifier's default.
 
     Raises:
-        UserError: No two anchors are far enough apart, with the reason for each rest; or sign of the current, curve
-            and captures
-            do not go together; or two captures are the same.
+        UserError: No two anchors are far enough apart (the message lists a reason for each rest), two captures are
+            equal, or the captures contradict the curve or the sign of the current.
     """
-    _check_apart(captures)
+    _check_distinct(captures)
     p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(current_offset_std_a=offset_std_a), 1e-3, None)[0]
     anchors: list[Anchor] = []
     rejected: list[str] = []
     parts = 0
     for capture in captures:
         good = remove_glitches(capture.rows, capture.name)
-        for first, last in continuous(good, cell.cell.capacity_ah):
-            of_part(capture.name, parts, good[first:last], p, anchors, rejected)
+        for first, last in continuous_parts(good, cell.cell.capacity_ah):
+            append_anchors(capture.name, parts, good[first:last], p, anchors, rejected)
             parts += 1
     alone = {a.part for a in anchors if sum(b.part == a.part for b in anchors) == 1}
-    rejected += [f"{_where(a)}: no other anchor without a gap between" for a in anchors if a.part in alone]
+    rejected += [f"{_location(a)}: no other anchor without a gap between" for a in anchors if a.part in alone]
     used = [a for a in anchors if a.part not in alone]
     _check_range(anchors, p)
     _check_swing(used, rejected, cell.cell.capacity_ah)
-    return _solved(used, rejected, p)
+    return _solve(used, rejected, p)
 
 
-def _check_apart(captures: Sequence[Columns]) -> None:
-    """Have each capture once: twice the same would seem twice as certain.
+def _check_distinct(captures: Sequence[Columns]) -> None:
+    """Check that no capture is given twice, because a duplicate would halve the variance of the result.
 
     Raises:
-        UserError: Two are the same.
+        UserError: Two captures have equal samples.
     """
     for one, other in itertools.combinations(captures, 2):
         if all(np.array_equal(one.rows[name], other.rows[name]) for name in ("time_s", "current_a", "voltage_v")):
@@ -143,37 +144,42 @@ def _check_apart(captures: Sequence[Columns]) -> None:
 
 
 def _check_range(anchors: Sequence[Anchor], p: np.void) -> None:
-    """Have most rests on the curve.
+    """Check that most rests lie within the voltage range of the OCV curve.
 
     Raises:
-        UserError: They are beyond its ends: it is another cell's.
+        UserError: Most rests lie outside. The curve is that of another cell.
     """
     low_v, high_v = float(p["ocv_v"][0]), float(p["ocv_v"][-1])
     beyond = [
-        a for a in anchors if max(low_v - a.rest.ocv_v, a.rest.ocv_v - high_v) > BEYOND * np.hypot(a.own_v, a.curve_v)
+        a
+        for a in anchors
+        if max(low_v - a.rest.ocv_v, a.rest.ocv_v - high_v)
+        > MAX_BEYOND_CURVE_STDS * np.hypot(a.own_std_v, a.curve_std_v)
     ]
     if 2 * len(beyond) > len(anchors):
         volts = [a.rest.ocv_v for a in beyond]
         raise UserError(
             f"no capacity: {len(beyond)} of {len(anchors)} rests, at {min(volts):.3f}..{max(volts):.3f} V, are beyond the "
-            f"curve of the cell, {low_v:.3f}..{high_v:.3f} V: is it this cell's, and of as many in series?"
+            f"curve of the cell, {low_v:.3f}..{high_v:.3f} V: check the cell file and its number of cells in series"
         )
 
 
-def continuous(good: SampleBlock, capacity_ah: float) -> list[tuple[int, int]]:
-    """Parts of a capture without a gap over which the charge is unknown, each as first and one past its last index."""
+def continuous_parts(good: SampleBlock, capacity_ah: float) -> list[tuple[int, int]]:
+    """Split a capture at gaps with unknown charge. Each part is (first index, index after the last)."""
     step_s = np.diff(good["time_s"])
     charge_ah = np.abs(good["current_a"][:-1]) * step_s / 3600.0
-    gap = np.r_[(step_s > GAP_STEPS * np.median(step_s)) & (charge_ah > GAP_CHARGE * capacity_ah), True]
+    gap = np.r_[(step_s > MIN_GAP_PERIODS * np.median(step_s)) & (charge_ah > MIN_GAP_CHARGE * capacity_ah), True]
     edges = np.r_[0, np.flatnonzero(gap) + 1]
     return [(int(a), int(b)) for a, b in itertools.pairwise(edges) if b - a > 1]
 
 
-def of_part(name: str, part: int, good: SampleBlock, p: np.void, anchors: list[Anchor], rejected: list[str]) -> None:
-    """Append the anchors of a continuous part, and the reasons why its other rests are rejected."""
+def append_anchors(
+    name: str, part: int, good: SampleBlock, p: np.void, anchors: list[Anchor], rejected: list[str]
+) -> None:
+    """Append the anchors of a continuous part to ``anchors`` and the reasons for rejected rests to ``rejected``."""
     capacity_ah, series = p["capacity_as"] / 3600.0, int(p["series"])
     step_ah = good["current_a"][:-1] * np.diff(good["time_s"]) / 3600.0
-    counted_ah, moved_ah = np.r_[0.0, np.cumsum(step_ah)], np.r_[0.0, np.cumsum(np.abs(step_ah))]
+    counted_ah, throughput_ah = np.r_[0.0, np.cumsum(step_ah)], np.r_[0.0, np.cumsum(np.abs(step_ah))]
     soc = -counted_ah / capacity_ah
     resting = resting_samples(good, capacity_ah)
     rests, why_not = find_rests(good, soc, resting, series)
@@ -182,12 +188,12 @@ def of_part(name: str, part: int, good: SampleBlock, p: np.void, anchors: list[A
     ends = {float(good["time_s"][first]): last - 1 for first, last in true_runs(resting)}
     for rest in rests:
         end = ends[rest.start_s]
-        hyst = 0.5 * (up[end] + down[end]), math.hypot(HYST_UNSURE, 0.5 * HYST_STD * (up[end] - down[end]))
-        anchor = _anchor(name, part, rest, p, hyst, (float(counted_ah[end]), float(moved_ah[end])))
-        if anchor.soc_std > LARGEST_STD:
+        hyst = 0.5 * (up[end] + down[end]), math.hypot(HYSTERESIS_STD, 0.5 * HYST_STD * (up[end] - down[end]))
+        anchor = _anchor(name, part, rest, p, hyst, (float(counted_ah[end]), float(throughput_ah[end])))
+        if anchor.soc_std > MAX_ANCHOR_SOC_STD:
             rejected.append(
-                f"{_where(anchor)}: {rest.ocv_v:.4f} V tells SOC to {anchor.soc_std:.2f} only, the curve rises by "
-                f"{anchor.slope_v:.3f} V there and is wrong by {1e3 * anchor.curve_v:.0f} mV"
+                f"{_location(anchor)}: {rest.ocv_v:.4f} V determines SOC to +-{anchor.soc_std:.2f} only, because the curve "
+                f"has a slope of {anchor.slope_v:.3f} V and an error of {1e3 * anchor.curve_std_v:.0f} mV"
             )
         else:
             anchors.append(anchor)
@@ -202,27 +208,27 @@ def _anchor(
     hyst, hyst_std = (arrhenius(HYSTERESIS_J, temperature_c) * part for part in hysteresis)
     soc = soc_from_ocv(rest.ocv_v, *curve)
     for _ in range(3):  # hysteresis and entropy hardly change with SOC
-        beside_v = hyst * on_grid(soc, p["hysteresis_v"]) + warmer * on_grid(soc, p["per_kelvin_v"])
-        soc = soc_from_ocv(rest.ocv_v - beside_v, *curve)
+        offset_v = hyst * on_grid(soc, p["hysteresis_v"]) + warmer * on_grid(soc, p["per_kelvin_v"])
+        soc = soc_from_ocv(rest.ocv_v - offset_v, *curve)
     cold_v = COLD_V * float(coldness(np.array([rest.temperature_c]))[0]) * min(1.0, LONG_REST_S / rest.duration_s)
-    own_v = np.sqrt(
+    own_std_v = np.sqrt(
         rest.std_v**2 + (series * (RELAXED_V + cold_v)) ** 2 + (hyst_std * on_grid(soc, p["hysteresis_v"])) ** 2
     )
-    curve_v = on_grid(soc, p["curve_error_v"])
-    reach = 0.02
-    slope_v = (ocv(soc + reach, *curve) - ocv(soc - reach, *curve)) / (2.0 * reach)
+    curve_std_v = on_grid(soc, p["curve_error_v"])
+    half_width = 0.02
+    slope_v = (ocv(soc + half_width, *curve) - ocv(soc - half_width, *curve)) / (2.0 * half_width)
     return Anchor(
         capture=name,
         part=part,
         time_s=rest.start_s + rest.duration_s,
         rest=rest,
         soc=soc,
-        soc_std=float(np.hypot(own_v, curve_v) / slope_v),
+        soc_std=float(np.hypot(own_std_v, curve_std_v) / slope_v),
         counted_ah=charge_ah[0],
-        moved_ah=charge_ah[1],
+        throughput_ah=charge_ah[1],
         slope_v=float(slope_v),
-        own_v=float(own_v),
-        curve_v=float(curve_v),
+        own_std_v=float(own_std_v),
+        curve_std_v=float(curve_std_v),
     )
 
 
@@ -230,57 +236,57 @@ def _check_swing(anchors: Sequence[Anchor], rejected: Sequence[str], capacity_ah
     reasons = "".join(f"\n  {line}" for line in rejected[:8])
     if not anchors:
         raise UserError(
-            "no capacity: no two rests tell the SOC with the charge between them counted; rest the cell for half an hour "
+            "no capacity: no two rests give an SOC with the charge between them counted; rest the cell for half an hour "
             f"near full and again near empty, or give a whole slow discharge to `ocv`{':' if reasons else ''}{reasons}"
         )
     parts = [[a for a in anchors if a.part == part] for part in {a.part for a in anchors}]
     swing = max(np.ptp([a.soc for a in part]) for part in parts)
     counted = max(np.ptp([a.counted_ah for a in part]) for part in parts) / capacity_ah
-    if swing < MIN_SWING <= 0.5 * counted:
+    if swing < MIN_SOC_SPAN <= 0.5 * counted:
         raise UserError(
             f"no capacity: the voltages of the rests are at most {swing:.2f} of SOC apart, the charge between them is "
-            f"{counted:.2f} of the declared capacity: is the curve this cell's, and the unit of the current ampere?"
+            f"{counted:.2f} of the declared capacity: check the curve of the cell file, and that the current is in ampere"
         )
-    if swing < MIN_SWING:
+    if swing < MIN_SOC_SPAN:
         raise UserError(
-            f"no capacity: the anchors of a capture are at most {swing:.2f} of SOC apart, at least {MIN_SWING} are "
+            f"no capacity: the anchors of a capture are at most {swing:.2f} of SOC apart, at least {MIN_SOC_SPAN} are "
             f"needed: rest again after more charge{':' if reasons else ''}{reasons}"
         )
 
 
-def _solved(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> Capacity:
-    """Generalised least squares for 1/Q, offset/Q and each part's first SOC."""
+def _solve(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> Capacity:
+    """Solve for 1/Q, offset/Q and each part's first SOC by generalised least squares."""
     capacity_ah = float(p["capacity_as"]) / 3600.0
     parts = sorted({a.part for a in anchors})
     z, counted_ah = (np.array([getattr(a, name) for a in anchors]) for name in ("soc", "counted_ah"))
     hours = np.array([a.time_s for a in anchors]) / 3600.0
-    of_parts = np.array([[float(a.part == part) for part in parts] for a in anchors])
-    rows = np.column_stack([-counted_ah, hours, of_parts])
+    part_indicator = np.array([[float(a.part == part) for part in parts] for a in anchors])
+    rows = np.column_stack([-counted_ah, hours, part_indicator])
     precision = np.linalg.inv(_covariance(anchors, p))
     prior = np.zeros((rows.shape[1], rows.shape[1]))
     offset_a = float(p["offset_c"]) * capacity_ah
     prior[1, 1] = (capacity_ah / max(offset_a, 1e-9)) ** 2
     covariance = np.linalg.inv(rows.T @ precision @ rows + prior)
     x = covariance @ rows.T @ precision @ z
-    left = z - rows @ x
+    residual = z - rows @ x
     freedom = len(anchors) - len(parts) - 1
-    worse = float(left @ precision @ left) / freedom if freedom > 0 else 1.0
-    covariance *= max(1.0, worse)
+    reduced_chi_squared = float(residual @ precision @ residual) / freedom if freedom > 0 else 1.0
+    covariance *= max(1.0, reduced_chi_squared)
     relative = float(np.sqrt(covariance[0, 0]) / abs(x[0]))
-    if x[0] < 0.0 and relative < LARGEST_RELATIVE_STD:
+    if x[0] < 0.0 and relative < MAX_RELATIVE_CAPACITY_STD:
         raise UserError(
             "no capacity: the voltages of the rests rise where charge is counted out of the cell: "
             "check the sign of the current (--current-sign)"
         )
-    if worse > DISAGREE:
+    if reduced_chi_squared > MAX_REDUCED_CHI_SQUARED:
         raise UserError(
-            f"no capacity: voltages and charge of {len(anchors)} anchors disagree, by {np.sqrt(worse):.1f} times what their "
-            f"errors explain: is the curve this cell's, and were the captures taken of one cell?"
+            f"no capacity: voltages and charge of {len(anchors)} anchors disagree by {np.sqrt(reduced_chi_squared):.1f} "
+            f"times their expected errors: check the curve of the cell file, and that all captures are of one cell"
         )
-    if x[0] <= 0.0 or relative > LARGEST_RELATIVE_STD:
+    if x[0] <= 0.0 or relative > MAX_RELATIVE_CAPACITY_STD:
         raise UserError(
-            f"no capacity: {len(anchors)} anchors tell it to {100.0 * relative:.0f} % only: longer rests, further apart, "
-            "or a cell file whose curve is better known"
+            f"no capacity: {len(anchors)} anchors determine it to {100.0 * relative:.0f} % only: give longer rests, further "
+            "apart, or a cell file with a more exact curve"
         )
     q = 1.0 / float(x[0])
     return Capacity(
@@ -289,22 +295,22 @@ def _solved(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> C
         offset_a=float(x[1]) * q,
         offset_std_a=float(np.sqrt(covariance[1, 1])) * q,
         anchors=tuple(anchors),
-        residual=tuple(map(float, left)),
+        residual=tuple(map(float, residual)),
         rejected=tuple(rejected),
     )
 
 
 def _covariance(anchors: Sequence[Anchor], p: np.void) -> Floats:
-    """Return the covariance of the anchors' SOCs: errors of each voltage, of the curve, and of the charge between them."""
-    z, slope_v, own_v, curve_v, moved, part = (
+    """Return the covariance of the anchors' SOCs by the errors of voltage, curve and charge count."""
+    z, slope_v, own_std_v, curve_std_v, moved, part = (
         np.array([getattr(a, name) for a in anchors])
-        for name in ("soc", "slope_v", "own_v", "curve_v", "moved_ah", "part")
+        for name in ("soc", "slope_v", "own_std_v", "curve_std_v", "throughput_ah", "part")
     )
-    alike = np.exp(-np.abs(z[:, None] - z) / CURVE_SOC)
-    voltage = (np.diag(own_v**2) + alike * np.outer(curve_v, curve_v)) / np.outer(slope_v, slope_v)
+    correlation = np.exp(-np.abs(z[:, None] - z) / CURVE_SOC)
+    voltage = (np.diag(own_std_v**2) + correlation * np.outer(curve_std_v, curve_std_v)) / np.outer(slope_v, slope_v)
     counting = p["charge_error"] ** 2 * np.minimum.outer(moved, moved) * 3600.0 / p["capacity_as"]
     return np.asarray(voltage + np.where(part[:, None] == part, counting, 0.0))
 
 
-def _where(anchor: Anchor) -> str:
+def _location(anchor: Anchor) -> str:
     return f"{anchor.capture}: rest until {anchor.time_s:.0f} s"

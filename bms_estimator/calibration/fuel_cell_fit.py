@@ -1,7 +1,7 @@
-"""A fuel cell's parameters from polarisation curves and records under changing current (thesis 7.3).
+"""Identification of a fuel cell from polarisation curves and records under changing current (thesis 7.3).
 
-Least squares of the voltage, over the ln of all parameters at once, with the kernel that the observer runs. A
-parameter that the data determine less well than ``KNOWN`` keeps the value of the file, with a reason.
+The voltage is fitted by least squares over the logarithms of all parameters, with the kernel that the observer runs. A
+parameter with a relative std above ``MAX_RELATIVE_STD`` is not changed, and the result states the reason.
 """
 
 import math
@@ -20,19 +20,19 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, Parameter
 
-KNOWN = 0.3
+MAX_RELATIVE_STD = 0.3
 """Maximum relative std of a parameter that the data determine."""
-WIDEST = math.log(100.0)
-"""No parameter is looked for further from the file's value than this factor."""
-ROUNDS = 3
-"""Number of fits: the weights of the sources follow from the residuals of the fit before."""
+MAX_LN_CHANGE = math.log(100.0)
+"""Maximum ln of the ratio between a parameter and its value in the file."""
+FITS = 3
+"""Number of successive fits. The residuals of each fit give the weights of the sources in the next."""
 MIN_V = 1e-4
-"""No source is better than this [V]: what leaves less has as many points as parameters."""
+"""Minimum std of a source [V]. A smaller residual means that a source has hardly more points than parameters."""
 BLOCKS = 20
-"""Number of parts of a record whose means show how long its errors are correlated."""
+"""Number of blocks of a record whose means give the correlation length of its errors."""
 KEYS: tuple[Parameter, ...] = get_args(Parameter)
 """Keys of ``[fuel_cell]``, in the order of ``NAMES``."""
-NEEDS = {
+REQUIRED_DATA = {
     "r_ohm": "steps of the current, or a curve over more of its range",
     "tafel_slope_v": "currents over a decade, the smallest below a tenth of the largest",
     "activation_v": "a settled voltage",
@@ -41,19 +41,19 @@ NEEDS = {
     "limiting_current_a": "currents near the limiting one, where the voltage falls off",
     "internal_current_a": "currents near zero",
 }
-"""Data that a parameter needs."""
+"""Data that determine each parameter, for messages."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Voltages that a model is to explain. Arrays have shape (n,).
+    """Measured voltages of a polarisation curve or a record. Arrays have shape (n,).
 
     Attributes:
-        name: For people.
-        time_s: Increasing [s]; None: a polarisation curve, where each point has settled.
-        current_a: Positive when the stack delivers [A].
+        name: Name for messages.
+        time_s: Increasing times [s]; None: a polarisation curve of steady-state points.
+        current_a: Current [A], positive when the stack delivers power.
         voltage_v: Voltage of the stack [V].
-        temperature_c: NaN without a sensor [C].
+        temperature_c: Temperature [C]; NaN without a sensor.
     """
 
     name: str
@@ -62,8 +62,8 @@ class Source:
     voltage_v: Floats
     temperature_c: Floats
 
-    def predicted(self, file: Floats, theta: Floats) -> tuple[Floats, Floats]:
-        """Voltage [V] and its derivatives by theta, shape (n, 8)."""
+    def predict(self, file: Floats, theta: Floats) -> tuple[Floats, Floats]:
+        """Return the model's voltage [V] and its derivatives by theta, shape (n, 8)."""
         if self.time_s is None:
             return polarisation(file, theta, self.current_a, self.temperature_c)
         return open_loop(file, theta, self.time_s, self.current_a, self.temperature_c)
@@ -76,90 +76,93 @@ class FuelCellFit:
     Attributes:
         model: The stack with its parameters, and their errors in ``std``.
         rms_v: Residual voltage by the name of each source, RMS [V].
-        not_told: Reason why a parameter kept the value of the file, by its key in ``[fuel_cell]``.
+        undetermined: Reason why a parameter kept the value of the file, by its key in ``[fuel_cell]``.
     """
 
     model: FuelCellModel
     rms_v: dict[str, float]
-    not_told: dict[Parameter, str]
+    undetermined: dict[Parameter, str]
 
 
 def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFit:
-    """Identify a stack.
+    """Identify the parameters of a stack.
 
     Args:
-        sources: Curves and records.
-        start: Start of the search, and values of parameters that the data do not determine.
+        sources: Polarisation curves and records.
+        start: Initial values, which parameters keep that the data do not determine.
 
     Raises:
         UserError: The data determine no parameter.
     """
-    file, told, not_told = start.a, list(range(len(NAMES))), dict[Parameter, str]()
-    while told:
-        theta, covariance = _fit(sources, file, told)
+    file, free, undetermined = start.a, list(range(len(NAMES))), dict[Parameter, str]()
+    while free:
+        theta, covariance = _fit(sources, file, free)
         std = np.sqrt(np.diagonal(covariance))
         worst = int(np.argmax(std))
-        if std[worst] <= KNOWN:
+        if std[worst] <= MAX_RELATIVE_STD:
             break
-        j = told.pop(worst)
-        known = f"to {std[worst]:.0%} at best" if std[worst] < 1.0 else "at all"
-        not_told[KEYS[j]] = f"not known {known} from these data; it needs {NEEDS[NAMES[j]]}"
-    if not told:
-        reasons = "; ".join(f"{key}: it needs {NEEDS[name]}" for key, name in zip(KEYS, NAMES, strict=True))
-        raise UserError(f"these data tell of no parameter of a fuel cell: {reasons}")
+        j = free.pop(worst)
+        accuracy = f"to {std[worst]:.0%} only" if std[worst] < 1.0 else "not at all"
+        undetermined[KEYS[j]] = f"determined {accuracy} by these data; it needs {REQUIRED_DATA[NAMES[j]]}"
+    if not free:
+        reasons = "; ".join(f"{key}: it needs {REQUIRED_DATA[name]}" for key, name in zip(KEYS, NAMES, strict=True))
+        raise UserError(f"these data determine no parameter of a fuel cell: {reasons}")
     a = file.copy()
     a[1 : 1 + len(NAMES)] *= np.exp(theta[: len(NAMES)])
-    rms_v = {source.name: _rms(source.voltage_v - source.predicted(file, theta)[0]) for source in sources}
-    return FuelCellFit(start.identified(a, _errors(a, told, covariance)), rms_v, not_told)
+    rms_v = {source.name: _rms(source.voltage_v - source.predict(file, theta)[0]) for source in sources}
+    return FuelCellFit(start.identified(a, _errors(a, free, covariance)), rms_v, undetermined)
 
 
-def _fit(sources: Sequence[Source], file: Floats, told: list[int]) -> tuple[Floats, Floats]:
-    """Fit theta, shape (8,); return it with the covariance of the determined parameters."""
+def _fit(sources: Sequence[Source], file: Floats, free: list[int]) -> tuple[Floats, Floats]:
+    """Fit the parameters ``free``; return theta, shape (8,), and their covariance."""
     theta, weights = np.zeros(LEARNABLE), np.ones(len(sources))
 
-    def all_of(values: Floats) -> Floats:
+    def full_theta(values: Floats) -> Floats:
         full = np.zeros(LEARNABLE)
-        full[told] = values
+        full[free] = values
         return full
 
     @lru_cache(maxsize=2)
-    def predicted(values: bytes) -> list[tuple[Floats, Floats]]:
-        return [source.predicted(file, all_of(np.frombuffer(values))) for source in sources]
+    def predictions(values: bytes) -> list[tuple[Floats, Floats]]:
+        return [source.predict(file, full_theta(np.frombuffer(values))) for source in sources]
 
     def residual(values: Floats) -> Floats:
-        pairs = zip(weights, sources, predicted(values.tobytes()), strict=True)
+        pairs = zip(weights, sources, predictions(values.tobytes()), strict=True)
         return np.concatenate([w * (source.voltage_v - voltage_v) for w, source, (voltage_v, _) in pairs])
 
     def jacobian(values: Floats) -> Floats:
-        pairs = zip(weights, predicted(values.tobytes()), strict=True)
-        return np.concatenate([-w * psi[:, told] for w, (_, psi) in pairs])
+        pairs = zip(weights, predictions(values.tobytes()), strict=True)
+        return np.concatenate([-w * psi[:, free] for w, (_, psi) in pairs])
 
-    for _ in range(ROUNDS):
-        found = least_squares(residual, theta[told], jacobian, bounds=(-WIDEST, WIDEST), x_scale=0.1)
-        theta = all_of(found.x)
-        weights = np.array([_weight(source, file, theta, len(told)) for source in sources])
-    information = jacobian(theta[told])
-    return theta, np.linalg.pinv(information.T @ information, hermitian=True) + _blind(information)
+    for _ in range(FITS):
+        found = least_squares(residual, theta[free], jacobian, bounds=(-MAX_LN_CHANGE, MAX_LN_CHANGE), x_scale=0.1)
+        theta = full_theta(found.x)
+        weights = np.array([_weight(source, file, theta, len(free)) for source in sources])
+    information = jacobian(theta[free])
+    return theta, np.linalg.pinv(information.T @ information, hermitian=True) + _null_space_variance(information)
 
 
-def _blind(jacobian: Floats) -> Floats:
-    """Unbounded variance in directions that no datum determines; a pseudoinverse alone gives zero."""
+def _null_space_variance(jacobian: Floats) -> Floats:
+    """Return a very large variance in directions that no datum determines, where a pseudoinverse gives zero."""
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
-    unseen: Floats = vectors[:, values <= 1e-10 * values.max()]
-    blind: Floats = 1e6 * unseen @ unseen.T
-    return blind
+    null_space: Floats = vectors[:, values <= 1e-10 * values.max()]
+    variance: Floats = 1e6 * null_space @ null_space.T
+    return variance
 
 
 def _weight(source: Source, file: Floats, theta: Floats, parameters: int) -> float:
-    """One over the error of a voltage that counts once: errors that are alike for a while count as one."""
-    error_v = source.voltage_v - source.predicted(file, theta)[0]
-    free = max(error_v.size - parameters, 1) / error_v.size
-    rms_v = max(_rms(error_v) / math.sqrt(free), MIN_V)
-    return 1.0 / (rms_v * math.sqrt(_alike(error_v) if source.time_s is not None else 1.0))
+    """Return the inverse std of a source's voltage, reduced for correlated errors of successive samples."""
+    error_v = source.voltage_v - source.predict(file, theta)[0]
+    freedom = max(error_v.size - parameters, 1) / error_v.size
+    rms_v = max(_rms(error_v) / math.sqrt(freedom), MIN_V)
+    return 1.0 / (rms_v * math.sqrt(_correlation_length(error_v) if source.time_s is not None else 1.0))
 
 
-def _alike(error_v: Floats) -> float:
-    """Return the number of successive samples that count as one: variance of block means over that of independent samples."""
+def _correlation_length(error_v: Floats) -> float:
+    """Return the number of successive samples that count as one.
+
+    The number is the variance of block means over its value for independent samples.
+    """
     size = error_v.size // BLOCKS
     if size < 2:
         return 1.0
@@ -167,12 +170,15 @@ def _alike(error_v: Floats) -> float:
     return float(np.clip(size * (means**2).mean() / max((error_v**2).mean(), MIN_V**2), 1.0, size))
 
 
-def _errors(a: Floats, told: list[int], covariance: Floats) -> dict[Parameter, float]:
-    """Relative standard deviations by key; that of the exchange current e^(-a / A) from those of a and A."""
-    std = {KEYS[j]: math.sqrt(covariance[k, k]) for k, j in enumerate(told)}
+def _errors(a: Floats, free: list[int], covariance: Floats) -> dict[Parameter, float]:
+    """Return the relative standard deviations by key.
+
+    That of the exchange current i_0 = e^(-a / A) follows from those of a and A.
+    """
+    std = {KEYS[j]: math.sqrt(covariance[k, k]) for k, j in enumerate(free)}
     slope, activation = NAMES.index("tafel_slope_v"), NAMES.index("activation_v")
     ratio = a[1 + activation] / a[1 + slope]  # - ln i_0; d ln i_0 = ratio (d ln A - d ln a)
-    along = np.array([ratio if j == slope else -ratio if j == activation else 0.0 for j in told])
+    along = np.array([ratio if j == slope else -ratio if j == activation else 0.0 for j in free])
     if "exchange_current_a" in std:
         std["exchange_current_a"] = math.sqrt(along @ covariance @ along)
     return std

@@ -6,7 +6,7 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, soc_outside
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
-from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C
+from bms_estimator.calibration.cleaning.rests import REST_C_RATE
 from bms_estimator.calibration.elements.identify import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ocv.overpotential import overpotential
 from bms_estimator.estimator.settings_records import ocv_grid
@@ -17,18 +17,18 @@ from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 
 LOW_SOC = 0.1
-"""SOC below which the form of the elements fails for every cell; errors are given with and without it."""
+"""SOC below which (2.5)-(2.9) do not fit any measured cell. Errors are reported with and without that range."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Measured against simulated voltage over some samples; NaN of none.
+    """Errors of the simulated voltage over a set of samples; NaN for an empty set.
 
     Attributes:
         samples: Number of samples.
-        voltage_rms_v: Root mean square [V].
-        mean_abs_percent: Mean magnitude, of the measured voltage [%].
-        max_abs_percent: Largest magnitude, of the measured voltage [%].
+        voltage_rms_v: Root mean square error [V].
+        mean_abs_percent: Mean absolute error relative to the measured voltage [%].
+        max_abs_percent: Maximum absolute error relative to the measured voltage [%].
     """
 
     samples: int
@@ -39,24 +39,24 @@ class Errors:
 
 @dataclass(frozen=True)
 class Validation:
-    """One capture against one cell.
+    """Result of the validation of one cell on one capture.
 
     Attributes:
         samples: Number of samples in the capture.
         glitches: Number of dropped glitches.
         initial_soc: SOC at the first sample that was used, 0..1.
         initial_soc_from: ``given``, ``first rest`` or ``first sample under load``.
-        final_soc: SOC at the last sample, counted.
-        all: Over all samples.
-        above: Over the samples at SOC above ``LOW_SOC``.
-        resting: Samples without current: error of the open-circuit voltage, and remaining relaxation.
-        loaded: Samples above SOC 0.1 with current.
-        extra_ohm: Series resistance that would make the error over ``above`` least: contacts, temperature, age [ohm].
-        without_extra_ohm: The error over ``above`` with that resistance.
-        warnings: What in the capture contradicts the cell.
-        time_s: Shape (n,), good samples, from 0 [s].
-        error_v: Shape (n,), measured less simulated [V].
-        soc: Shape (n,), counted.
+        final_soc: SOC at the last sample by coulomb counting.
+        all: Errors over all samples.
+        above: Errors over the samples at SOC above ``LOW_SOC``.
+        resting: Errors over the samples of ``above`` without current: of the OCV, and of the remaining relaxation.
+        loaded: Errors over the samples of ``above`` with current.
+        extra_ohm: Additional series resistance that minimizes the errors ``above``: contacts, temperature, age [ohm].
+        without_extra_ohm: Errors over the samples of ``above`` with that resistance added.
+        warnings: Contradictions between capture and cell.
+        time_s: Shape (n,), times of the good samples, from 0 [s].
+        error_v: Shape (n,), measured less simulated voltage [V].
+        soc: Shape (n,), SOC by coulomb counting.
     """
 
     samples: int
@@ -77,10 +77,11 @@ class Validation:
 
 
 def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = None) -> Validation:
-    """Simulate a capture's voltage from its current alone and compare.
+    """Simulate a capture's voltage from its current alone and compare it with the measured voltage.
 
-    The ladder of the cell file counts, at the capture's temperature; without one (2.2)-(2.9). Negative C_ts, C_tl
-    (below delta1, delta2) are replaced with a small positive value, so that the simulation continues.
+    The simulation uses the RC ladder of the cell file at the capture's temperature, or (2.2)-(2.9) without a ladder.
+    Negative C_ts and C_tl (below delta1, delta2) are replaced with a small positive value, so that the simulation
+    continues.
 
     Args:
         capture: Raw samples, rows of dtype ``SAMPLE``; it should start from rest.
@@ -100,7 +101,7 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     grid = ocv_grid(cell)
     error_v = load.voltage_v - np.array([ocv(x, *grid) for x in soc]) + overpotential(cell, load, soc)
     above = soc > LOW_SOC
-    resting = np.abs(load.current_a) < REST_CURRENT_C * cell.cell.capacity_ah
+    resting = np.abs(load.current_a) < REST_C_RATE * cell.cell.capacity_ah
     current_a = load.current_a[above]
     extra_ohm = -float(error_v[above] @ current_a) / max(float(current_a @ current_a), 1e-12)
     found_from = "first rest" if load.resting_samples else "first sample under load"

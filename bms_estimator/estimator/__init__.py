@@ -1,4 +1,4 @@
-"""One object around the kernels: settings, state, ``step`` and ``run``."""
+"""Estimator class around the kernels, and the conversion of settings and results."""
 
 from bms_estimator.estimator.estimator import Estimator, estimate
 

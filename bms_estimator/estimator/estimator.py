@@ -1,4 +1,4 @@
-"""The estimator: kernel settings and state behind ``step`` and ``run``."""
+"""Estimator of one pack: kernel settings and state with the methods ``step`` and ``run``."""
 
 import math
 from copy import copy
@@ -24,13 +24,13 @@ from bms_estimator.settings.sampling import BOARD, Sampling
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
 SAMPLE_OUTCOMES = tuple(SampleOutcome)
-"""Outcomes by value: ``SampleOutcome(value)`` takes nearly as long as the kernel."""
+"""Outcomes by value. A tuple is used, because ``SampleOutcome(value)`` takes nearly as long as the kernel."""
 IDENTIFIER = IdentifierSettings()
 """Default settings of the identifier."""
 
 
 class Estimator:
-    """Estimates SOC, parameters and margins of one pack, sample by sample.
+    """Estimator of SOC, parameters and stability margin of one pack, sample by sample.
 
     ``run`` on a block and ``step`` on each of its samples leave the same state to the last bit.
 
@@ -38,14 +38,14 @@ class Estimator:
         cell: The pack as one two-terminal object (``CellModel.pack``). A fuel cell has no SOC (NaN), and its
             parameters are always learned, under any law.
         observer: The adaptive observer's settings.
-        identifier: The identifier's settings; None: off, the thesis's method alone.
+        identifier: The identifier's settings; None: identifier disabled, the thesis's method alone.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
-        voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
-        initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
-        sampling: Resolution and period of the source; that of a board when left out.
+        voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
+        initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
+        sampling: Resolution and period of the source; default: those of the board.
 
     Attributes:
-        record: Shape (1,), dtype ``ESTIMATOR_STATE``: all there is. It can be copied, saved, compared and put back.
+        record: Shape (1,), dtype ``ESTIMATOR_STATE``: the complete state, which can be copied, saved and restored.
         settings_record: Shape (1,), dtype ``ESTIMATOR_SETTINGS``.
         state: The observer's part of ``record``, shape (1,), dtype ``OBSERVER_STATE``.
         settings: The observer's part of ``settings_record``, shape (1,), dtype ``OBSERVER_SETTINGS``.
@@ -78,16 +78,16 @@ class Estimator:
         self._trace: TraceBlock = np.zeros(0, dtype=TRACE)
 
     def bound_to_record(self, record: NDArray[np.void]) -> Self:
-        """Another of the same settings, which it shares, that works on ``record``, shape (1,), dtype ``ESTIMATOR_STATE``."""
+        """Return an estimator that shares the settings and works on ``record``, shape (1,), dtype ``ESTIMATOR_STATE``."""
         other = copy(self)
         other.record, other.state = record, record["observer"]
-        other._trace = np.zeros(0, dtype=TRACE)  # noqa: SLF001 - of this class
+        other._trace = np.zeros(0, dtype=TRACE)  # noqa: SLF001 - an instance of this class
         return other
 
     def step(
         self, time_s: float, current_a: float, voltage_v: float, status: int = 0, temperature_c: float = math.nan
     ) -> SampleOutcome:
-        """Take one sample.
+        """Process one sample.
 
         Args:
             time_s: Time stamp [s].
@@ -97,17 +97,17 @@ class Estimator:
             temperature_c: Temperature of the cell [C]; NaN without a sensor.
 
         Returns:
-            Whether it was accepted, else why not; the state counts each kind.
+            ``SampleOutcome.ACCEPTED``, or the reason for a rejection. The state counts each outcome.
         """
         return SAMPLE_OUTCOMES[
             kernel.step(self.record, self.settings_record, time_s, current_a, voltage_v, status, temperature_c)
         ]
 
     def run(self, block: SampleBlock) -> TraceBlock:
-        """Take a block of samples, dtype ``SAMPLE``.
+        """Process a block of samples, dtype ``SAMPLE``.
 
         Returns:
-            A row for each accepted sample, valid until the next call.
+            One row for each accepted sample. The array is valid until the next call.
         """
         if self._trace.size < block.size:
             self._trace = np.zeros(block.size, dtype=TRACE)
@@ -120,13 +120,13 @@ class Estimator:
         return bool(self.settings_record["identify"][0])
 
     def set_soc(self, soc: float) -> None:
-        """Take ``soc`` as the state of charge from now on, until the voltage shows that it is wrong; after the first sample.
+        """Set the state of charge. Later voltages may correct it. Call this after the first sample.
 
         Raises:
-            ValueError: It is outside 0..1; or this is a fuel cell, which has none.
+            ValueError: ``soc`` is outside 0..1, or the estimator is of a fuel cell, which has no SOC.
         """
         if isinstance(self.cell, FuelCellModel):
-            raise ValueError("a fuel cell has no SOC")  # noqa: TRY004 - of the pack, not of the argument
+            raise ValueError("a fuel cell has no SOC")  # noqa: TRY004 - the argument has the right type
         if not 0.0 <= soc <= 1.0:
             raise ValueError(f"SOC {soc} is outside 0..1")
         self.state["soc"] = self.state["soc_coulomb"] = soc
@@ -139,24 +139,23 @@ class Estimator:
             store_last_good_state(c, f)
 
     def resume(self, unseen_s: float) -> None:
-        """Prepare for samples of another clock, after a time without measurements.
-
-        The next sample follows a gap of ``unseen_s``, in which the load may have continued or changed.
+        """Prepare for samples with another time base, after a gap without measurements.
 
         Args:
-            unseen_s: Length of the unmeasured gap [s]; infinite if unknown.
+            unseen_s: Duration of the gap before the next sample [s]; infinite if unknown. The load may have changed in
+                the gap.
         """
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
         if self.identifying:
             self.record["filter"]["soc"] = self.state["soc"]
-            self.record["filter"]["smallest_a"] = 0.0  # a sensor repeats what it can measure
+            self.record["filter"]["smallest_a"] = 0.0  # the resolution is measured again
 
 
 def estimator_of(settings: Settings, cell: PackModel) -> Estimator:
-    """Make the estimator of a pack.
+    """Create the estimator of a pack.
 
     Args:
-        settings: The pack's.
+        settings: Settings of the pack.
         cell: The pack as one object (``CellModel.pack``).
     """
     return Estimator(
@@ -173,7 +172,9 @@ def estimator_of(settings: Settings, cell: PackModel) -> Estimator:
 def estimate(
     capture: Columns, cell: PackModel, *, initial_soc: float | None = None, voltage_resolution_v: float = 1e-3
 ) -> Columns:
-    """Estimate over a whole capture; with other settings: ``Columns(Estimator(cell, ...).run(capture.rows))``.
+    """Estimate over a whole capture with default settings.
+
+    ``Columns(Estimator(cell, ...).run(capture.rows))`` is the equivalent for other settings.
 
     Args:
         capture: Rows of dtype ``SAMPLE``.

@@ -1,4 +1,4 @@
-"""Settings record of the filter from cell file and settings."""
+"""Settings record of the Kalman filter from cell file and settings."""
 
 from dataclasses import fields, replace
 
@@ -14,31 +14,34 @@ from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.sampling import BOARD, Sampling
 
 CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
-"""Std of one cell's OCV [V] and std along SOC, for a cell file that does not declare its error."""
-STEEPEST_V = 5.0
-"""Slope near full and empty above which the end of a cell's OCV is known better than its SOC elsewhere [V]."""
+"""Default std of the OCV per cell [V] and in SOC, for a cell file without an error column."""
+MAX_SLOPE_V = 5.0
+"""Upper limit of the slope per cell that converts an error of SOC to one of the OCV [V]. The steep ends of the curve have a
+better defined SOC."""
 LEARNED, LEARNED_SLOPE_V = 0.97, 0.15
-"""Fraction of the OCV's error variance that is learned permanently, where its slope is at least this everywhere [V].
-On a plateau a voltage does not distinguish the error of the curve from the SOC, and the knees move."""
-CURVE_SOC, KNEE_V, TURN = 0.3, 1.0, 4.0
-"""Correlation length of the OCV's error [SOC], also over a change between flat and steep: on a plateau the error is
-in volts, at a knee, of slopes above ``KNEE_V`` per cell [V], in SOC. The correlation of both is e^-(TURN x angle
-in radians)."""
+"""Fraction of the OCV's error variance that is learned permanently, and minimum slope dOCV/dSOC per cell over the whole
+curve [V] for learning. On a plateau the voltage cannot distinguish an error of the curve from one of the SOC, and the
+knees move."""
+CURVE_SOC, KNEE_V, KNEE_DECORRELATION = 0.3, 1.0, 4.0
+"""Correlation length of the OCV's error in SOC; slope per cell of 45 degrees [V]; loss of correlation per radian of slope
+angle. On a plateau the error is one of voltage, at a knee one of SOC, so that both are correlated by
+e^-(KNEE_DECORRELATION x angle)."""
 COUNT_ERROR_SOC = 0.004
-"""However well the curve is known: how full the cell was that it was measured on, std."""
+"""Minimum std of the OCV curve in SOC, because the SOC of the cell that was measured has an error."""
 BEYOND_BRANCHES = 0.2
-"""Two branches leave out diffusion that is slower: its resistance, as a part of theirs."""
+"""Resistance of diffusion slower than both RC pairs, as a fraction of each pair's resistance."""
 BRANCHES_STD = 0.35
 """Relative std of resistances derived from two RC pairs."""
 BIAS_OF_STD = 0.15
-"""Fraction of the resistances' relative std that becomes ``bias_relative``, because uncertain resistances are wrong
-in their ratios, too."""
+"""Minimum of ``bias_relative``, as a fraction of the resistances' relative std, because the ratios of uncertain
+resistances are uncertain, too."""
 ROOM_C = 15.0, 35.0
-"""Resistances of unknown temperature are those of a room [C]."""
+"""Temperature range of resistances without a declared range: that of a room [C]."""
 MIN_SHARE = 1e-4
-"""No branch has less than this part of the sum at SOC 0.5: time constants are means weighted by resistance."""
+"""Minimum resistance of an RC pair, as a fraction of the sum at SOC 0.5. Equivalent time constants are weighted by resistance
+and need weights above 0."""
 MIN_CAPACITANCE = 0.05
-"""C_ts, C_tl, negative below delta1, delta2, are at least this part of a9, a12."""
+"""Lower limit of C_ts and C_tl, as fractions of a9 and a12. Below delta1 and delta2 they would be negative."""
 
 SOC_GRID = np.linspace(0.0, 1.0, GRID)
 """SOC grid of the resistances and of the OCV's error. Shape (GRID,)."""
@@ -55,11 +58,11 @@ def filter_settings(
     """Return the filter's settings record.
 
     Args:
-        cell: The pack as one object.
-        grid: Open-circuit voltage and its slope, from ``records.ocv_grid`` [V].
+        cell: The pack as one two-terminal object.
+        grid: Open-circuit voltage and its slope, from ``settings_records.ocv_grid`` [V].
         identifier: Section ``[identifier]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
-        voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
+        voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
         sampling: Resolution and period of the source.
 
     Returns:
@@ -71,8 +74,8 @@ def filter_settings(
     p["ocv_v"], p["ocv_slope_v"] = grid
     _open_circuit(p, cell, identifier.hysteresis_v)
     weak_ohm, strong_ohm, r_std, (p["low_c"], p["high_c"]) = _ladder(cell)
-    middle = GRID // 2
-    p["middle_ohm"] = weak_ohm[middle].sum() + strong_ohm[middle].sum()
+    mid_soc = GRID // 2
+    p["middle_ohm"] = weak_ohm[mid_soc].sum() + strong_ohm[mid_soc].sum()
     p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, MIN_SHARE * p["middle_ohm"]), strong_ohm
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
@@ -82,9 +85,9 @@ def filter_settings(
     if identifier.current_offset_std_a is not None:
         noise = replace(noise, offset_c=identifier.current_offset_std_a / cell.cell.capacity_ah)
     capacity_std = cell.cell.capacity_std if identifier.capacity_std is None else identifier.capacity_std
-    for name, told in (("capacity_std", capacity_std), ("soc_std", identifier.soc_std)):
-        if told is not None:
-            noise = replace(noise, **{name: told})
+    for name, configured in (("capacity_std", capacity_std), ("soc_std", identifier.soc_std)):
+        if configured is not None:
+            noise = replace(noise, **{name: configured})
     noise = replace(noise, bias_relative=max(noise.bias_relative, BIAS_OF_STD * r_std))
     for field in fields(noise):
         p[field.name] = getattr(noise, field.name)
@@ -98,22 +101,22 @@ def unmeasured_s(sampling: Sampling) -> float:
 
 
 def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> None:
-    """Fill in the error of E_o at 25 C, hysteresis and the temperature coefficient.
+    """Write the error of E_o at 25 C, the hysteresis and the temperature coefficient to ``p``.
 
     Args:
-        p: Record of dtype EKF_SETTINGS, with E_o; written.
-        cell: The pack as one object.
-        hysteresis_v: OCV after charge less that after discharge, of one cell [V]; None: the cell file's.
+        p: Record of dtype EKF_SETTINGS that contains E_o; written.
+        cell: The pack as one two-terminal object.
+        hysteresis_v: OCV after charge less OCV after discharge, per cell [V]; None: the cell file's hysteresis.
     """
     series, ocv = p["series"], cell.ocv
     slope_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_slope_v"].size), p["ocv_slope_v"])
     radians = np.abs(np.gradient(np.arctan(slope_v / (KNEE_V * series)), SOC_GRID))
-    p["curve_soc"] = 1.0 / (1.0 / CURVE_SOC + TURN * radians)
-    slope_v = np.minimum(slope_v, STEEPEST_V * series)
+    p["curve_soc"] = 1.0 / (1.0 / CURVE_SOC + KNEE_DECORRELATION * radians)
+    slope_v = np.minimum(slope_v, MAX_SLOPE_V * series)
     p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * slope_v)
-    midway = False
+    is_mean_curve = False
     if isinstance(ocv, TableOcv):
-        midway = ocv.hysteresis_v is not None
+        is_mean_curve = ocv.hysteresis_v is not None
         for name in ("error_v", "hysteresis_v", "per_kelvin_v"):
             column = getattr(ocv, name)
             if column is not None:
@@ -123,12 +126,16 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
     p["learned"] = LEARNED if slope_v.min() >= LEARNED_SLOPE_V * series else 0.0
     if hysteresis_v is not None:
         p["hysteresis_v"] = 0.5 * hysteresis_v * series
-        if not midway:  # the curve is that after discharge
+        if not is_mean_curve:  # a curve without hysteresis is that after discharge
             p["ocv_v"] += 0.5 * hysteresis_v * series
 
 
 def _ladder(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:
-    """Weak and strong part of the resistances, each (GRID, RESISTANCES) [ohm], their relative std, temperatures [C]."""
+    """Return the resistances of the RC ladder.
+
+    Returns:
+        Weak and strong part, each of shape (GRID, RESISTANCES) [ohm], their relative std, and their temperature range [C].
+    """
     ladder = cell.ladder
     if ladder is None:
         ohm, weak = ladder_of_branches(cell), weak_share(SOC_GRID).T
@@ -141,9 +148,10 @@ def _ladder(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], 
 
 
 def ladder_of_branches(cell: CellModel) -> NDArray[np.float64]:
-    """Return the network's resistances [ohm] that are equivalent to (2.5)-(2.9). Shape (GRID, RESISTANCES).
+    """Return the resistances of an RC ladder equivalent to (2.5)-(2.9) [ohm]. Shape (GRID, RESISTANCES).
 
-    Each branch is shared between the two time constants of the ladder around its own, by the logarithm.
+    The resistance of each RC pair is divided between the two nearest time constants of the ladder by linear interpolation
+    of ln tau.
     """
     ohm, a = np.zeros((GRID, RESISTANCES)), cell.a
     ln_taus = np.log(TAU_S)

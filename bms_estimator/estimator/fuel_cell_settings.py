@@ -1,4 +1,4 @@
-"""Settings record of the adaptive law from a fuel cell's file."""
+"""Settings record of the learning law from a fuel cell's file."""
 
 import math
 
@@ -12,9 +12,9 @@ from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
 from bms_estimator.model.fuel_cell import FuelCellModel
 
 MEMORY_S = 60.0
-"""Memory of a stack's law [s]: water and gas change within a minute."""
+"""Time constant with which the learning law of a stack discounts data [s]. Water and gas supply change within a minute."""
 SETTLE_S = 5.0
-"""Time in which double layer and oxygen forget an unmeasured load [s]."""
+"""Settling time of double layer and oxygen supply after an unmeasured gap [s]."""
 FACTORS = {
     "r_ohm": 4.0,
     "tafel_slope_v": 1.5,
@@ -24,17 +24,17 @@ FACTORS = {
     "limiting_current_a": 2.0,
     "internal_current_a": 4.0,
 }
-"""Maximum factor between a parameter and its value in the file; 1.3 of the activation loss at 1 A is about 8 of the
-exchange current."""
+"""Maximum factor between a parameter and its value in the file. A factor of 1.3 in the activation loss at 1 A corresponds
+to about 8 in the exchange current."""
 
 
 def fuel_cell_settings(cell: FuelCellModel, of_observer: np.void) -> NDArray[np.void]:
-    """Return the adaptive law's settings record.
+    """Return the learning law's settings record.
 
-    Nothing is injected: a voltage that is wrong as a whole is the exchange current's, not an offset's.
+    The output error is not injected as a voltage offset, because a constant voltage error indicates the exchange current.
 
     Args:
-        cell: The stack as one object.
+        cell: The stack as one two-terminal object.
         of_observer: Record of dtype ``OBSERVER_SETTINGS``.
 
     Returns:

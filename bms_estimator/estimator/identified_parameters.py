@@ -1,4 +1,4 @@
-"""Identified parameters, read from the estimator's records."""
+"""Identified parameters in the estimator's records, with their standard deviations."""
 
 import math
 from functools import lru_cache
@@ -17,16 +17,16 @@ from bms_estimator.kernels.kalman_filter.ocv_correction import node_error_scale,
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
 from bms_estimator.model.cell import CellModel, TableOcv
 
-WIDEST_CAPACITY_STD = 0.3
-"""Maximum std that a cell file may hold."""
-EVEN = tuple(np.round(np.linspace(0.0, 1.0, 101), 2).tolist())
-"""SOCs of a table computed from (2.10)."""
+MAX_CAPACITY_STD = 0.3
+"""Maximum relative std of the capacity that a cell file may contain."""
+EVEN_SOC = tuple(np.round(np.linspace(0.0, 1.0, 101), 2).tolist())
+"""SOC nodes of a table computed from (2.10)."""
 MIN_RISE_V = 1e-6
 """Minimum rise of the OCV between two SOCs of its table [V]."""
 
 
 class IdentifiedValue(NamedTuple):
-    """Value with its standard deviation, both in the unit of its name, and the age of the last data that determined it."""
+    """Value and standard deviation, both in the unit of the value's name, and age of the last data that determined them."""
 
     value: float
     std: float
@@ -34,15 +34,15 @@ class IdentifiedValue(NamedTuple):
 
     @property
     def relative_std(self) -> float:
-        """Standard deviation over value; infinite where it is unknown."""
+        """Relative standard deviation; infinite if unknown."""
         return self.std / abs(self.value) if math.isfinite(self.std) and self.value else math.inf
 
 
 def present_elements(record: np.void) -> dict[str, IdentifiedValue]:
-    """Return the elements at the present SOC by name: ``ELEMENT_NAMES``, in ohm and farad.
+    """Return the elements at the present SOC by name (``ELEMENT_NAMES``), in ohm and farad.
 
     Args:
-        record: Record of dtype ESTIMATOR_STATE, after a sample, identifying.
+        record: Record of dtype ESTIMATOR_STATE, after a sample, with the identifier enabled.
     """
     elements, ages = record["elements"], record["unlearned_s"]
     order = R_TS, R_TL, C_TS, C_TL, R_S
@@ -54,17 +54,21 @@ def present_elements(record: np.void) -> dict[str, IdentifiedValue]:
 
 
 def present_resistance(record: np.void) -> float:
-    """All of it at the present SOC, settled [ohm]; ``record`` as in ``present_elements``."""
+    """Return the total DC resistance at the present SOC, with all RC pairs in steady state [ohm].
+
+    Args:
+        record: Record of dtype ESTIMATOR_STATE, after a sample, with the identifier enabled.
+    """
     ohm = record["elements"]["value"]
     return float(ohm[R_S] + ohm[R_TS] + ohm[R_TL])
 
 
 def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
-    """a_index, 1..15, of the fit over SOC; None where its element was seen in fewer than ``MIN_BINS`` bins.
+    """Return a_i of the fit over SOC; None if its element was observed in fewer than ``MIN_BINS`` SOC bins.
 
     Args:
         record: Record of dtype ESTIMATOR_STATE.
-        index: 1..15.
+        index: i, 1..15.
     """
     element = (index - 1) // 3
     fit = record["fit"]
@@ -74,16 +78,16 @@ def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
 
 
 def relative_capacity(record: np.void) -> IdentifiedValue:
-    """Return true over declared capacity."""
+    """Return the ratio of the estimated to the declared capacity."""
     ln_q, std = _bias(record, LN_Q)
     return IdentifiedValue(math.exp(ln_q), math.exp(ln_q) * std, 0.0)
 
 
 def relative_series_resistance(record: np.void, settings: np.void) -> IdentifiedValue:
-    """R_s over that of the cell file at the same SOC and temperature.
+    """Return the ratio of R_s to that of the cell file at equal SOC and temperature.
 
     Args:
-        record: Record of dtype ESTIMATOR_STATE, after a sample, identifying.
+        record: Record of dtype ESTIMATOR_STATE, after a sample, with the identifier enabled.
         settings: Record of dtype ESTIMATOR_SETTINGS.
     """
     ratio, variance = ln_r_s_ratio(record["filter"], settings["filter"])
@@ -94,15 +98,15 @@ def relative_series_resistance(record: np.void, settings: np.void) -> Identified
 
 
 def current_offset(record: np.void) -> IdentifiedValue:
-    """Measured less true current [A]."""
+    """Return the offset of the current sensor: measured less true current [A]."""
     return IdentifiedValue(*_bias(record, OFFSET), 0.0)
 
 
 def _bias(record: np.void, j: int) -> tuple[float, float]:
-    """Mean and standard deviation of state ``j`` of the hypotheses together, as that of the SOC is."""
+    """Return the mean and standard deviation of state ``j`` over the mixture of hypotheses."""
     f = record["filter"]
     n = f["count"]
-    if n == 1:  # as nearly always
+    if n == 1:  # the usual case, without the cost of the general one
         return float(f["mean"][0, j]), math.sqrt(f["covariance"][0, j, j])
     weight = np.exp(f["ln_weight"][:n] - f["ln_weight"][f["best"]])
     weight /= weight.sum()
@@ -114,7 +118,7 @@ def _bias(record: np.void, j: int) -> tuple[float, float]:
 def ocv_correction_with_std(
     record: np.void, settings: np.void, soc: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the learned correction of the cell file's OCV by the most likely hypothesis, and its standard deviation.
+    """Return the OCV correction learned by the most likely hypothesis, and its standard deviation.
 
     Args:
         record: Record of dtype ESTIMATOR_STATE.
@@ -136,8 +140,8 @@ def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArra
     """Return the weight of each node of the correction at each SOC, and the error of the curve there [V].
 
     Args:
-        settings: Settings of a record of EKF_SETTINGS, as all that it depends on.
-        socs: SOC values of float64.
+        settings: Bytes of a record of EKF_SETTINGS, a hashable argument for the cache.
+        socs: Bytes of an array of SOCs, float64.
     """
     p, soc = np.frombuffer(bytearray(settings), EKF_SETTINGS)[0], np.frombuffer(socs)
     rows, own_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
@@ -150,12 +154,12 @@ def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArra
 
 
 def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
-    """Return a cell file's values with the learned OCV, capacity and resistances, each with its error.
+    """Return the cell file with the learned OCV, capacity and resistances and their errors.
 
     Args:
-        estimator: Estimator of a pack of that cell, after samples, identifying.
-        cell: As its file has it, before ``CellModel.pack``.
-        series: Number of them in the pack.
+        estimator: Estimator of a pack of that cell, after samples, with the identifier enabled.
+        cell: Single cell of the cell file, before ``CellModel.pack``.
+        series: Number of these cells in series in the pack.
     """
     record, settings = estimator.record[0], estimator.settings_record[0]
     capacity = relative_capacity(record)
@@ -163,10 +167,10 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
     ohm, branch_ohm = math.exp(ln_r0), math.exp(ln_r)
     values = cell.model_dump()
     values["cell"]["capacity_ah"] *= capacity.value
-    values["cell"]["capacity_std"] = min(capacity.relative_std, WIDEST_CAPACITY_STD)
+    values["cell"]["capacity_std"] = min(capacity.relative_std, MAX_CAPACITY_STD)
     for name, factor in (("r_s", ohm), ("r_ts", branch_ohm), ("r_tl", branch_ohm)):
         values[name] |= {key: factor * values[name][key] for key in ("amplitude_ohm", "offset_ohm")}
-    for name in ("c_ts", "c_tl"):  # the time constants stay
+    for name in ("c_ts", "c_tl"):  # the time constants do not change
         values[name] |= {key: values[name][key] / branch_ohm for key in ("amplitude_farad", "offset_farad")}
     if cell.ladder is not None:
         factors = [ohm, *(len(cell.ladder.weak_ohm) - 1) * [branch_ohm]]
@@ -180,8 +184,8 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
 
 
 def _corrected(record: np.void, settings: np.void, cell: CellModel, series: int) -> dict[str, Any]:
-    """Return the corrected OCV of a cell as a table; its other columns stay."""
-    table = cell.ocv.model_dump() if isinstance(cell.ocv, TableOcv) else {"form": "table", "soc": EVEN}
+    """Return the corrected OCV of a cell as a table, with the other columns of the given table."""
+    table = cell.ocv.model_dump() if isinstance(cell.ocv, TableOcv) else {"form": "table", "soc": EVEN_SOC}
     soc = np.array(table["soc"])
     correction_v, std_v = ocv_correction_with_std(record, settings, soc)
     ocv_v = np.array(table["ocv_v"]) if "ocv_v" in table else np.array([emf(x, cell.a) for x in soc])

@@ -1,4 +1,4 @@
-"""Settings records of the adaptive law from typed settings."""
+"""Settings record of the learning law from typed settings."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,28 +11,29 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.settings.observer import ObserverSettings
 
 MEMORY_S = 3600.0
-"""Under load data are forgotten with this time constant [s]."""
+"""Time constant with which data are discounted under load [s]."""
 OFFSET_S = 600.0
-"""The injection absorbs an error of the open-circuit voltage with this time constant [s]."""
+"""Time constant with which the injection absorbs an error of the open-circuit voltage [s]."""
 SETTLE_S = 1200.0
-"""Settling time after an unmeasured gap [s]: at least three time constants of the slow branch."""
+"""Settling time after an unmeasured gap [s]: at least three time constants of the slow RC pair."""
 RATE_HZ = 1.0 / 60.0
-"""gamma: the parameters go where the data lead with its inverse as time constant, at k = 1 [1/s]."""
+"""gamma: rate at which theta approaches the solution of the data, at k = 1 [1/s]."""
 LEAK_S = 10.0
-"""Weight of the nominal parameters: as much as data of this duration with errors of ``epsilon_v`` [s]."""
+"""Weight of the nominal parameters, as a duration of data with errors of ``epsilon_v`` [s]."""
 REACH = 0.5
 """Trust region for theta. The sensitivities are a linearization; beyond this step the second-order error is no longer
 small."""
 TAU_TS, TAU_TL = NAMES.index("tau_ts"), NAMES.index("tau_tl")
 SCALED = {"r_s": (13, 15), "r_ts": (1, 3), "tau_ts": (7, 9), "r_tl": (4, 6), "tau_tl": (10, 12)}
-"""Parameters that scale with each that is learned: a time constant is bounded as its capacitance is, at the file's R."""
+"""Indices of the a_i that scale with each element of theta. A time constant has the bounds of its capacitance, because its
+resistance is that of the file."""
 
 
 def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: np.void) -> NDArray[np.void]:
-    """Return the adaptive law's settings record.
+    """Return the learning law's settings record.
 
     Args:
-        cell: The pack as one object.
+        cell: The pack as one two-terminal object.
         observer: Section ``[observer]``.
         of_observer: Record of dtype ``OBSERVER_SETTINGS``.
 
@@ -45,7 +46,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
     q["file"][1:] = a[1:PARAMETERS]
     for j, name in enumerate(NAMES):
         q["lower"][j], q["upper"][j] = _bounds(cell, SCALED[name])
-    # an RC pair stays on its side of the mean of both ln tau; if their order is reversed, neither moves further
+    # each ln tau is limited to its side of the mean of both; if their order is reversed, the limit is the file's value
     between = max(0.5 * np.log(a[6] * a[12] / (a[3] * a[9])), 0.0)
     q["upper"][TAU_TS], q["lower"][TAU_TL] = min(q["upper"][TAU_TS], between), max(q["lower"][TAU_TL], -between)
     q["middle"] = 0.5 * (q["lower"] + q["upper"])
@@ -60,7 +61,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
 
 
 def _bounds(cell: CellModel, scaled: tuple[int, ...]) -> tuple[float, float]:
-    """Return the bounds of theta: the limits of all ``scaled`` parameters, and the file's own values."""
+    """Return the bounds of an element of theta by the bounds of its ``scaled`` parameters; they include the file's value."""
     bounds = [(cell.bounds(i), cell.a[i]) for i in scaled]
     lower = max(np.log(b.lower / value) for b, value in bounds)
     upper = min(np.log(b.upper / value) for b, value in bounds)

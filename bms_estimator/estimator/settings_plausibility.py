@@ -1,4 +1,4 @@
-"""Settings that are allowed, but cannot be: a slip of the unit, a count given twice or not at all."""
+"""Checks for valid but implausible settings, such as a wrong unit or a wrong number of cells."""
 
 from collections.abc import Iterator
 
@@ -11,30 +11,30 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.settings.pack import Settings
 
-LARGEST_AH = 2000.0
-"""The largest Li-ion cells on sale hold some 1300 Ah [Ah]."""
+MAX_CAPACITY_AH = 2000.0
+"""Maximum plausible capacity of a cell [Ah]. The largest Li-ion cells on sale have some 1300 Ah."""
 CELL_V = 1.5, 4.5
-"""Range of the nominal voltage of Li-ion cells [V]: titanate 2.3 V, NMC 3.7 V."""
-SMALL_AH, MANY = 5.5, 8
-"""Maximum capacity of a 18650 or 21700 cell [Ah], and number in series beyond which a single row of such cells is
-rare."""
+"""Range of plausible nominal voltages of a Li-ion cell [V]: titanate has 2.3 V, NMC 3.7 V."""
+SMALL_CELL_AH, MAX_SINGLE_ROW = 5.5, 8
+"""Maximum capacity of a 18650 or 21700 cell [Ah], and number in series above which such cells are rarely used without
+cells in parallel."""
 CONVERTER_STEPS = 1024
 """Number of steps of the firmware's voltage converter."""
 
 
 def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
-    """One line for each implausible setting, with a likely intention; empty where all may be.
+    """Return one line for each implausible setting, with a possible correction.
 
     Args:
-        settings: The pack's.
-        cell: The pack as one object (``CellModel.pack``).
+        settings: Settings of the pack.
+        cell: The pack as one two-terminal object (``CellModel.pack``).
     """
     if isinstance(cell, FuelCellModel):
-        found = [_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
+        found = [_voltage_out_of_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
     else:
-        checks = _capacity, _counted_twice, _cell_voltage, _single_row
+        checks = _too_large_capacity, _series_counted_twice, _implausible_cell_voltage, _missing_parallel
         full_v = float(ocv_grid(cell)[0][-1])
-        found = [*(check(settings, cell) for check in checks), _range(settings, full_v, "when full")]
+        found = [*(check(settings, cell) for check in checks), _voltage_out_of_range(settings, full_v, "when full")]
     return [line for line in found if line]
 
 
@@ -45,50 +45,50 @@ def _no_load_v(cell: FuelCellModel) -> float:
 
 
 def _ignored(settings: Settings, cell: FuelCellModel) -> Iterator[str]:
-    """Return the settings that a fuel cell ignores."""
+    """Yield a line for each setting that a fuel cell ignores."""
     if "law" in settings.observer.model_fields_set and settings.observer.law != "learning":
         yield f"observer.law = {settings.observer.law!r}: ignored: a fuel cell ({cell.cell.name}) always has 'learning'"
     if "enabled" in settings.identifier.model_fields_set and settings.identifier.enabled:
         yield f"identifier.enabled = true: ignored: the identifier is of batteries, {cell.cell.name} is a fuel cell"
 
 
-def _capacity(settings: Settings, cell: CellModel) -> str | None:
+def _too_large_capacity(settings: Settings, cell: CellModel) -> str | None:
     capacity_ah = cell.cell.capacity_ah / settings.pack.parallel
-    if capacity_ah <= LARGEST_AH:
+    if capacity_ah <= MAX_CAPACITY_AH:
         return None
     section = "cell" if settings.pack.capacity_ah is None else "pack"
-    return f"{section}.capacity_ah = {capacity_ah:g}: no cell holds more than {LARGEST_AH:g} Ah; is it in mAh?"
+    return f"{section}.capacity_ah = {capacity_ah:g}: no cell holds more than {MAX_CAPACITY_AH:g} Ah; is it in mAh?"
 
 
-def _counted_twice(settings: Settings, cell: CellModel) -> str | None:
+def _series_counted_twice(settings: Settings, cell: CellModel) -> str | None:
     series = settings.pack.series
-    within = cell.cell.series_count // series
-    if series == 1 or within == 1:
+    file_series = cell.cell.series_count // series
+    if series == 1 or file_series == 1:
         return None
     return (
-        f"pack.series = {series}: the cell file is of {within} cells in series already (series_count), which makes "
+        f"pack.series = {series}: the cell file is of {file_series} cells in series already (series_count), which makes "
         f"{cell.cell.series_count}; is the file the whole pack, and series 1?"
     )
 
 
-def _cell_voltage(_: Settings, cell: CellModel) -> str | None:
-    each_v = cell.cell.nominal_voltage_v / cell.cell.series_count
-    if CELL_V[0] <= each_v <= CELL_V[1]:
+def _implausible_cell_voltage(_: Settings, cell: CellModel) -> str | None:
+    cell_v = cell.cell.nominal_voltage_v / cell.cell.series_count
+    if CELL_V[0] <= cell_v <= CELL_V[1]:
         return None
     return (
-        f"{cell.cell.nominal_voltage_v:g} V nominal of {cell.cell.series_count} in series: {each_v:.3g} V a cell, but "
+        f"{cell.cell.nominal_voltage_v:g} V nominal of {cell.cell.series_count} in series: {cell_v:.3g} V a cell, but "
         f"Li-ion cells have {CELL_V[0]:g} to {CELL_V[1]:g} V; is series_count of the cell file right?"
     )
 
 
-def _single_row(settings: Settings, cell: CellModel) -> str | None:
+def _missing_parallel(settings: Settings, cell: CellModel) -> str | None:
     c = cell.cell
-    if settings.pack.parallel > 1 or c.capacity_ah > SMALL_AH or c.series_count <= MANY:
+    if settings.pack.parallel > 1 or c.capacity_ah > SMALL_CELL_AH or c.series_count <= MAX_SINGLE_ROW:
         return None
     return f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
 
 
-def _range(settings: Settings, highest_v: float, when: str) -> str | None:
+def _voltage_out_of_range(settings: Settings, highest_v: float, when: str) -> str | None:
     sensor = settings.sensor
     range_v = CONVERTER_STEPS * sensor.voltage_resolution_v
     if sensor.protocol != "binary" or highest_v <= range_v:

@@ -1,4 +1,4 @@
-"""Settings records of the kernels from typed settings."""
+"""Conversion of typed settings to the settings records of the kernels."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +17,25 @@ from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.sampling import BOARD, Sampling
 
-SETTLED_STEPS = 2.0
-"""Width of the dead zone in steps of the converter: half a step of rounding, half of noise, and as much again."""
+DEAD_ZONE_STEPS = 2.0
+"""Default dead zone in steps of the voltage converter: half a step of rounding, half a step of noise, and a safety factor
+of 2."""
 LOCK_FRACTION = 0.02
-"""An error of this fraction of the nominal voltage is no tracking."""
+"""Default error above which the observer loses the lock, as a fraction of the nominal voltage."""
 GAP_S = 5.0
-"""A step longer than this counts as a gap [s], or of a slow source one longer than ``PERIODS``."""
+"""Duration of a step above which it counts as a gap [s]; for a slow source, ``PERIODS`` of its periods."""
 IMPROVED = range(1, 13)
-"""Parameters that the improved method adapts (Algorithm 1); a13..a15 by (4.2)."""
+"""Indices of the a_i that the improved method adapts (Algorithm 1). a13..a15 follow from (4.2)."""
 
 
 def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Open-circuit voltage and its slope dOCV/dSOC [V] at ``OCV_POINTS`` evenly spaced SOCs 0..1."""
+    """Return the open-circuit voltage and its slope dOCV/dSOC [V] at ``OCV_POINTS`` evenly spaced SOCs 0..1."""
     soc = np.linspace(0.0, 1.0, OCV_POINTS)
     if isinstance(cell.ocv, ChenMoraOcv):
         a = cell.a
         slope = a[16] * a[17] * np.exp(-a[17] * soc) + a[19] - 2.0 * a[20] * soc + 3.0 * a[21] * soc**2
         return np.array([emf(x, a) for x in soc]), slope
-    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - half a second that a start without table saves
+    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - importing scipy takes half a second
 
     curve = PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v)
     return curve(soc), curve.derivative()(soc)
@@ -53,12 +54,12 @@ def estimator_settings(
     """Return the settings record of the whole estimator.
 
     Args:
-        cell: The pack as one object.
+        cell: The pack as one two-terminal object.
         observer: Section ``[observer]``.
         identifier: Section ``[identifier]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
-        voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
-        initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
+        voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
+        initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
         sampling: Resolution and period of the source.
 
     Returns:
@@ -68,11 +69,11 @@ def estimator_settings(
     p = record[0]
     if isinstance(cell, FuelCellModel):
         gain_and_limits(p["observer"], cell.cell, observer, voltage_resolution_v)
-        _pace(p["observer"], sampling)
+        _period_limits(p["observer"], sampling)
         p["learning"] = fuel_cell_settings(cell, p["observer"])[0]
         return record
     p["observer"] = observer_settings(cell, observer, voltage_resolution_v, initial_soc)[0]
-    _pace(p["observer"], sampling)
+    _period_limits(p["observer"], sampling)
     p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
     p["hand_over"] = observer.law in ("improved", "scheme-3")  # (3.16) and (3.17) have no limit to set
@@ -92,10 +93,10 @@ def observer_settings(
     """Return the observer's settings record.
 
     Args:
-        cell: The pack as one object.
+        cell: The pack as one two-terminal object.
         observer: Section ``[observer]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
-        initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
+        initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
 
     Returns:
         Shape (1,), dtype ``OBSERVER_SETTINGS``.
@@ -113,7 +114,7 @@ def observer_settings(
 
 
 def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage_resolution_v: float) -> None:
-    """Fill in the settings of every observer: gain, dead zone, lock, limits of a sample.
+    """Write the settings that batteries and fuel cells share: gain, dead zone, lock, and limits of a sample.
 
     Args:
         p: Record of dtype ``OBSERVER_SETTINGS``; written.
@@ -129,7 +130,7 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
     p["k0"] = observer.k0
     p["gain_limit"] = observer.gain_limit
     p["rearm_gain"] = -np.inf if observer.rearm_gain is None else observer.rearm_gain
-    dead_zone_v = SETTLED_STEPS * voltage_resolution_v if observer.dead_zone_v is None else observer.dead_zone_v
+    dead_zone_v = DEAD_ZONE_STEPS * voltage_resolution_v if observer.dead_zone_v is None else observer.dead_zone_v
     p["dead_zone_v"] = dead_zone_v
     p["epsilon_v"] = observer.epsilon_v or 2.0 * max(dead_zone_v, voltage_resolution_v)
     lock_error_v = max(LOCK_FRACTION * cell.nominal_voltage_v, 10.0 * voltage_resolution_v)
@@ -138,17 +139,17 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
     p["voltage_min_v"] = cell.voltage_min_v
     p["voltage_max_v"] = cell.voltage_max_v
     p["current_max_a"] = cell.current_max_a
-    _pace(p, BOARD)
+    _period_limits(p, BOARD)
 
 
-def _pace(p: np.void, sampling: Sampling) -> None:
-    """Usual length of a step; ``p`` is of dtype ``OBSERVER_SETTINGS``, written."""
+def _period_limits(p: np.void, sampling: Sampling) -> None:
+    """Write the limits of a regular sample period to ``p``, a record of dtype ``OBSERVER_SETTINGS``."""
     p["gap_s"] = max(GAP_S, PERIODS * sampling.period_s)
     p["unmeasured_s"] = unmeasured_s(sampling)
 
 
 def _adaptation(p: np.void, cell: CellModel, observer: ObserverSettings) -> None:
-    """All laws as one, a' = drive e^2 + rate (target - a): (3.16), (3.17), (3.18)."""
+    """Write the adaptive law (3.16), (3.17) or (3.18) as a' = drive e^2 + rate (target - a)."""
     a = cell.a
     initial, target, rate, drive = (np.zeros(PARAMETERS) for _ in range(4))
     initial[1:] = target[1:] = a[1:PARAMETERS]

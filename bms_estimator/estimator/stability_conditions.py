@@ -1,4 +1,4 @@
-"""The conditions of Lemma 4.1.1, under which C_ts and C_tl stay positive while the parameters adapt."""
+"""Conditions of Lemma 4.1.1, under which C_ts and C_tl stay positive during adaptation."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from bms_estimator.model.cell import Bounds, CellModel
 
 @dataclass(frozen=True)
 class Condition:
-    """One condition, whether it holds, and its two sides."""
+    """One inequality, with its two sides and a flag that it holds."""
 
     name: str
     holds: bool
@@ -18,29 +18,30 @@ class Condition:
 def lemma_conditions(cell: CellModel) -> list[Condition]:
     """Check the conditions of Lemma 4.1.1 on bounds, weights and initial values of (a7, a9) and (a10, a12).
 
-    A capacitance that is positive over the whole of SOC 0..1 at both ends of the adaptation needs no condition;
-    ``failed_conditions`` leaves it out.
+    The list also contains conditions that are not required, because the capacitance is positive over SOC 0..1 at both
+    ends of the adaptation. ``failed_conditions`` omits these.
     """
     conditions = []
     for number, (amplitude, offset) in enumerate(((7, 9), (10, 12)), start=1):
-        big, small = cell.bounds(amplitude), cell.bounds(offset)
+        amplitude_bounds, offset_bounds = cell.bounds(amplitude), cell.bounds(offset)
         a, b = f"a{amplitude}", f"a{offset}"
+        products = _weighted_bounds(offset_bounds), _weighted_bounds(amplitude_bounds)
         conditions += [
-            _below(f"{number}: {b}(0) < {a}(0)", _initial(small), _initial(big)),
-            _below(f"{number}: rate of {a} < rate of {b}", big.rate, small.rate),
-            _below(f"{number}: P{offset}.l{offset} < P{amplitude}.l{amplitude}", _pull(small), _pull(big)),
+            _below(f"{number}: {b}(0) < {a}(0)", _initial(offset_bounds), _initial(amplitude_bounds)),
+            _below(f"{number}: rate of {a} < rate of {b}", amplitude_bounds.rate, offset_bounds.rate),
+            _below(f"{number}: P{offset}.l{offset} < P{amplitude}.l{amplitude}", *products),
         ]
     return conditions
 
 
 def failed_conditions(cell: CellModel) -> list[Condition]:
-    """Return the conditions that fail where they are needed."""
-    needed = []
+    """Return the required conditions that fail."""
+    required = []
     for (amplitude, offset), number in zip(((7, 9), (10, 12)), "12", strict=True):
-        big, small = cell.bounds(amplitude), cell.bounds(offset)
-        if big.limit >= small.limit or _initial(big) >= _initial(small):
-            needed.append(number)
-    return [c for c in lemma_conditions(cell) if not c.holds and c.name[0] in needed]
+        amplitude_bounds, offset_bounds = cell.bounds(amplitude), cell.bounds(offset)
+        if amplitude_bounds.limit >= offset_bounds.limit or _initial(amplitude_bounds) >= _initial(offset_bounds):
+            required.append(number)
+    return [c for c in lemma_conditions(cell) if not c.holds and c.name[0] in required]
 
 
 def _below(name: str, left: float, right: float) -> Condition:
@@ -51,6 +52,6 @@ def _initial(bounds: Bounds) -> float:
     return bounds.limit if bounds.initial is None else bounds.initial
 
 
-def _pull(bounds: Bounds) -> float:
-    """P_i . lambda_i = lambda_x a_u + lambda_y a_l."""
+def _weighted_bounds(bounds: Bounds) -> float:
+    """Return P_i . lambda_i = lambda_x a_u + lambda_y a_l."""
     return bounds.limit * bounds.rate

@@ -1,4 +1,4 @@
-"""Callbacks on compilation: a first start takes a minute or two, later ones load kernels from the cache."""
+"""Callback for each compiled kernel. The first start compiles for a minute or two; later starts load kernels from the cache."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -9,15 +9,16 @@ from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
 PACKAGE = __name__.partition(".")[0]
+"""Name of the top-level package."""
 
 CompileCallback = Callable[[str, int, int], None]
-"""Gets a kernel's name, how many kernels have begun with it, and how many there are at most."""
+"""Callback with a kernel's name, the number of kernels started so far, and the maximum number of kernels."""
 
 
 @contextmanager
-def report_compilation(tell: CompileCallback) -> Iterator[None]:
-    """Call ``tell`` for each imported kernel whose compilation begins meanwhile."""
-    with event.install_listener("numba:compile", _Listener(_kernels(), tell)):
+def report_compilation(on_kernel: CompileCallback) -> Iterator[None]:
+    """Call ``on_kernel`` for each imported kernel whose compilation starts within the context."""
+    with event.install_listener("numba:compile", _Listener(_kernels(), on_kernel)):
         yield
 
 
@@ -27,22 +28,22 @@ def _kernels() -> set[FunctionType]:
 
 
 def _name(kernel: FunctionType) -> str:
-    """``file: function`` in words."""
+    """Return "file: function" with spaces for underscores."""
     return f"{kernel.__module__.rpartition('.')[2]}: {kernel.__name__}".replace("_", " ")
 
 
 class _Listener(event.Listener):
-    """Listener for functions that numba begins to compile; cached ones are not reported."""
+    """Listener for functions that numba compiles. Cached functions cause no event."""
 
-    def __init__(self, kernels: set[FunctionType], tell: CompileCallback) -> None:
-        self._waiting, self._all, self._tell = kernels, len(kernels), tell
+    def __init__(self, kernels: set[FunctionType], on_kernel: CompileCallback) -> None:
+        self._pending, self._total, self._on_kernel = kernels, len(kernels), on_kernel
 
     def on_start(self, event: event.Event) -> None:
-        """Count a kernel of this package; inner functions follow their callers."""
+        """Report a kernel of this package once."""
         kernel = event.data["dispatcher"].py_func
-        if kernel in self._waiting:  # a kernel is compiled for each type of argument
-            self._waiting.remove(kernel)
-            self._tell(_name(kernel), self._all - len(self._waiting), self._all)
+        if kernel in self._pending:  # numba compiles a kernel once for each set of argument types
+            self._pending.remove(kernel)
+            self._on_kernel(_name(kernel), self._total - len(self._pending), self._total)
 
     def on_end(self, event: event.Event) -> None:
-        """Do nothing: the end of a compilation is not needed."""
+        """Do nothing, because only the start of a compilation is reported."""

@@ -1,4 +1,4 @@
-"""The filter at work beside the observer: its SOC, its elements gathered in the map, the fit handed to (3.18).
+"""Identifier: one sample updates the Kalman filter, the map of elements over SOC, and the targets of (3.18).
 
 ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 """
@@ -21,12 +21,12 @@ from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     R_S,
     R_TL,
     R_TS,
-    equivalent,
     r_s_identified_by_steps,
     scale_is_identified,
+    write_equivalent_circuit,
 )
 from bms_estimator.kernels.kalman_filter.frozen_sensor import detect_frozen_input
-from bms_estimator.kernels.kalman_filter.hypotheses import ONE_STD, update_hypotheses
+from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD, update_hypotheses
 from bms_estimator.kernels.kalman_filter.input_checks import (
     UNUSABLE,
     coast_without_voltage,
@@ -43,9 +43,9 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 FIT_EVERY_S = 120.0
-"""One element is fitted this often, each in its turn [s of samples]."""
+"""Interval at which the next of the five elements is fitted, in sample time [s]."""
 MIN_BINS = 3
-"""Minimum number of SOC bins for the three parameters of an element."""
+"""Minimum number of SOC bins for a fit of an element's three parameters."""
 MIN_EXCITATION_C = 0.05
 """Minimum load that excites the resistances, RMS over 10 min [C]."""
 
@@ -54,7 +54,17 @@ MIN_EXCITATION_C = 0.05
 def identifier_step(
     s: Record, p: Record, dt_s: float, gap: bool, current_a: float, voltage_v: float, temperature_c: float
 ) -> None:
-    """Take one sample, after a ``gap`` or not: SOC for the observer, elements for the map, now and then a fit for (3.18)."""
+    """Process one sample: update SOC, map of elements and, at intervals, the targets of (3.18).
+
+    Args:
+        s: Record of ESTIMATOR_STATE.
+        p: Record of ESTIMATOR_SETTINGS.
+        dt_s: Time since the previous sample [s].
+        gap: True if samples are missing since the previous sample.
+        current_a: Current, positive on discharge [A].
+        voltage_v: Terminal voltage [V].
+        temperature_c: Temperature of the cell [C]; NaN without a sensor.
+    """
     f, c = s.filter, s.checks
     change_a = current_a - f.current_a
     if gap and f.window.samples > 0:
@@ -63,7 +73,7 @@ def identifier_step(
     if dt_s > p.filter.unmeasured_s:
         s.unlearned_s[:] += dt_s
     unknown = f.window.unknown_as / p.filter.capacity_as
-    if gap and unknown > ONE_STD and not c.suspects & UNUSABLE:
+    if gap and unknown > MAX_SINGLE_STD and not c.suspects & UNUSABLE:
         prepare_transition(f, p.filter)
         predict(f, p.filter, f.best)
         restart_filter(s, p, math.hypot(f.soc_std, unknown), current_a, voltage_v)
@@ -88,21 +98,21 @@ def identifier_step(
 
 @njit(cache=True)
 def update_from_window(s: Record, p: Record) -> None:
-    """One update of the filter, and what follows from it."""
+    """Update the filter, the input checks, the elements and the map by the samples of the window."""
     f, c = s.filter, s.checks
     dt_s = f.window.time_s
     c.mean_a = f.window.sum_a / f.window.samples
     update_hypotheses(f, p.filter)
     restore_if_not_finite(c, s.counters, f, p.filter, dt_s)
     update_input_faults(c, f, p.filter, dt_s)
-    equivalent(f, p.filter, s.elements)
+    write_equivalent_circuit(f, p.filter, s.elements)
     if dt_s <= p.filter.unmeasured_s:
         add_elements_to_map(s, p, dt_s)
 
 
 @njit(cache=True)
 def fit_next_element(s: Record, p: Record) -> None:
-    """Fit one element to the map, each in its turn."""
+    """Fit the next element to the map and set its targets."""
     e = s.next_element
     for row in range(ELEMENTS):
         decay_weights(s.map, row, math.exp(-s.fit_age_s / p.map_memory_s))
@@ -114,7 +124,7 @@ def fit_next_element(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def add_elements_to_map(s: Record, p: Record, dt_s: float) -> None:
-    """Add the present elements to the map, in its order R_ts, R_tl, C_ts, C_tl, R_s, if the load excites them."""
+    """Add the present elements to the map if the load excites them, in the order R_ts, R_tl, C_ts, C_tl, R_s."""
     f = s.filter
     exciting_a = MIN_EXCITATION_C * p.filter.capacity_as / 3600.0
     loaded = f.rms_a2 > exciting_a * exciting_a
@@ -129,9 +139,17 @@ def add_elements_to_map(s: Record, p: Record, dt_s: float) -> None:
 
 
 @njit(cache=True)
-def add_element_to_map(s: Record, e: int, j: int, is_told: bool, dt_s: float) -> None:
-    """Add one element, ``j`` of the equivalent ones, and note when that was."""
-    learned = is_told and add_observation(
+def add_element_to_map(s: Record, e: int, j: int, identified: bool, dt_s: float) -> None:
+    """Add one element to the map if it is identified, and update the age of its data.
+
+    Args:
+        s: Record of ESTIMATOR_STATE.
+        e: Row of the map.
+        j: Index of the element in ``s.elements``.
+        identified: True if the present data determine the element.
+        dt_s: Time since the last update [s].
+    """
+    learned = identified and add_observation(
         s.map, e, s.filter.soc, math.log(s.elements.value[j]), s.elements.ln_variance[j], dt_s
     )
     s.unlearned_s[e] = 0.0 if learned else s.unlearned_s[e] + dt_s
@@ -139,11 +157,11 @@ def add_element_to_map(s: Record, e: int, j: int, is_told: bool, dt_s: float) ->
 
 @njit(cache=True)
 def set_adaptation_targets(s: Record, p: Record, e: int) -> None:
-    """Let the fitted parameters of an element be where (3.18) leads, within the configured bounds.
+    """Set the fitted parameters of an element, within the configured bounds, as limits of (3.18).
 
-    By Lemma 4.1.3 the limit is all that (3.18) takes of its bounds: it is set, in place of two bounds around it.
-    Parameters that no law adapts (a13..a15 of the improved method) take the fitted values at once.
-    A capacitance that is negative at the present SOC is no limit to strive for: it would end the adaptation (E14).
+    By Lemma 4.1.3, (3.18) depends on its bounds only through this limit. Parameters that no law adapts (a13..a15 of the
+    improved method) get the fitted values at once. A capacitance that is negative at the present SOC is not set, because
+    it would end the adaptation (erratum 14).
     """
     if p.hand_over == 0 or s.fit.bins[e] < MIN_BINS:
         return
@@ -158,7 +176,7 @@ def set_adaptation_targets(s: Record, p: Record, e: int) -> None:
 
 @njit(cache=True)
 def set_target(s: Record, p: Record, i: int, value: float) -> None:
-    """Let ``value`` be the limit of a_i, of the observer's records."""
+    """Set ``value`` as the limit of a_i, and as a_i itself if no law adapts it. Records are those of the observer."""
     s.target[i] = value
     if p.drive[i] == 0.0:
         s.a[i] = value

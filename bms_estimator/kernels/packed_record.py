@@ -1,9 +1,8 @@
-"""A record without redundant words: words of 8 bytes that are 0, or equal on both sides of a diagonal.
+"""Lossless packing of records without redundant 8-byte words: zeros, and lower triangles of symmetric matrices.
 
-The packed form is a bitmap with one bit for each word, the lowest first, and the words whose bit is set. What the
-others are
-follows from ``mirror``, which is of the layout alone: a word that mirrors an earlier one is as that, any other is 0. No
-bit of a record is lost, symmetric or not.
+The packed form is a bitmap with one bit for each word, the lowest first, and the words whose bit is set. A word without a
+bit equals the earlier word that the symmetry map of the layout names, or is 0. A matrix that is not symmetric is stored in
+full.
 """
 
 import math
@@ -17,71 +16,71 @@ from numpy.typing import NDArray
 from bms_estimator.numba_cache import njit
 
 Words = NDArray[np.uint64]
-Mirror = NDArray[np.int32]
-"""Shape (words of a record,): which word each is likely to equal, an earlier one; -1: 0."""
+SymmetryMap = NDArray[np.int32]
+"""Shape (words of a record,): index of the earlier word that each word is likely to equal; -1: likely 0."""
 WORD_BYTES, WORD_BITS = 8, 64
-_WORDS = "f8", "i8", "u8"
+_WORD_TYPES = "f8", "i8", "u8"
 """Data types of a word."""
 
 
 @lru_cache(maxsize=64)
-def symmetry_map(dtype: np.dtype[Any]) -> Mirror:
-    """Return which words of a record are likely equal: those below and above the diagonal of a square matrix.
+def symmetry_map(dtype: np.dtype[Any]) -> SymmetryMap:
+    """Return the words of a record that are likely equal: those below and above the diagonal of a square matrix.
 
     Raises:
-        ValueError: Not all of its fields have whole words, without padding.
+        ValueError: A field does not consist of whole words, or the record has padding.
     """
     mirror = np.full(dtype.itemsize // WORD_BYTES, -1, np.int32)
-    known = 0
+    words = 0
     for first, shape in _fields(dtype, 0):
         size = math.prod(shape)
-        known += size
+        words += size
         if len(shape) > 1 and shape[-1] == shape[-2]:
             n = shape[-1]
             place = np.arange(n * n).reshape(n, n)
             row, column = np.tril_indices(n, -1)
             for matrix in range(first, first + size, n * n):
                 mirror[matrix + place[row, column]] = matrix + place[column, row]
-    if known * WORD_BYTES != dtype.itemsize:
+    if words * WORD_BYTES != dtype.itemsize:
         raise ValueError(
-            f"{dtype.itemsize - known * WORD_BYTES} bytes of the record are no words of {WORD_BYTES} bytes"
+            f"{dtype.itemsize - words * WORD_BYTES} bytes of the record are no words of {WORD_BYTES} bytes"
         )
     mirror.flags.writeable = False
     return mirror
 
 
 def _fields(dtype: np.dtype[Any], offset: int) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """First word and shape of each field that has no fields itself.
+    """Yield the index of the first word and the shape of each field, with the fields of nested records.
 
     Raises:
-        ValueError: It has no whole words, or is an array of records.
+        ValueError: A field does not consist of whole words, or is an array of records.
     """
     for name in dtype.names or ():
         field, at = dtype.fields[name][:2]  # type: ignore[index]
         if field.names:
             yield from _fields(field, offset + at)
-        elif field.base.str[1:] not in _WORDS or (offset + at) % WORD_BYTES:
-            raise ValueError(f"{name}: {field} at {offset + at} cannot be taken word by word")
+        elif field.base.str[1:] not in _WORD_TYPES or (offset + at) % WORD_BYTES:
+            raise ValueError(f"{name}: {field} at {offset + at} does not consist of whole words")
         else:
             yield (offset + at) // WORD_BYTES, field.shape
 
 
-def room(words: int) -> Words:
-    """Return the buffer size for a packed record of that many words."""
+def packed_buffer(words: int) -> Words:
+    """Return a buffer for the packed form of a record of ``words`` words."""
     return np.zeros(words + (words + WORD_BITS - 1) // WORD_BITS, np.uint64)
 
 
 @njit(cache=True)
-def pack(words: Words, mirror: Mirror, out: Words) -> int:
+def pack(words: Words, mirror: SymmetryMap, out: Words) -> int:
     """Write a record to ``out`` without redundant words.
 
     Args:
         words: Shape (n,).
-        mirror: Mirrored words of its layout.
-        out: As ``room`` made it.
+        mirror: Symmetry map of the record's layout.
+        out: Result of ``packed_buffer``; written.
 
     Returns:
-        How many words of ``out`` are it.
+        Number of words written to ``out``.
     """
     n = words.shape[0]
     bitmap = (n + WORD_BITS - 1) // WORD_BITS
@@ -99,16 +98,16 @@ def pack(words: Words, mirror: Mirror, out: Words) -> int:
 
 
 @njit(cache=True)
-def unpack(packed: Words, mirror: Mirror, words: Words) -> bool:
-    """Write to ``words`` the record that was packed.
+def unpack(packed: Words, mirror: SymmetryMap, words: Words) -> bool:
+    """Write the record that was packed to ``words``.
 
     Args:
-        packed: As ``pack`` left it.
-        mirror: Mirrored words of its layout.
-        words: Shape (n,), n words of a record.
+        packed: Words written by ``pack``.
+        mirror: Symmetry map of the record's layout.
+        words: Shape (n,), the record's words; written.
 
     Returns:
-        False: ``packed`` does not have this layout, and ``words`` have no meaning.
+        True, or False if ``packed`` does not have this layout; ``words`` are then undefined.
     """
     n = words.shape[0]
     bitmap = (n + WORD_BITS - 1) // WORD_BITS
@@ -126,6 +125,6 @@ def unpack(packed: Words, mirror: Mirror, words: Words) -> bool:
                 at += 1
             words[w] = word
             bits >>= np.uint64(1)
-        if bits:  # of words that there are not
+        if bits:  # set bits beyond the last word
             return False
     return at == size

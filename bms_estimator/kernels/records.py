@@ -1,4 +1,4 @@
-"""The records of the whole estimator, in one each: observer, learning law, filter and its checks, map of the elements, fit to it."""
+"""Settings and state records of the whole estimator."""
 
 import numpy as np
 
@@ -20,9 +20,9 @@ ESTIMATOR_SETTINGS = np.dtype(
         ("series_resistance", "i8"),  # 1: R_s by (4.2), step 3 of the thesis
         ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
         ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
-        ("lower", "f8", PARAMETERS),  # the configured bounds limit the values handed over
+        ("lower", "f8", PARAMETERS),  # configured bounds of the values handed over
         ("upper", "f8", PARAMETERS),
-        ("map_memory_s", "f8"),  # time constant with which the map forgets [s]
+        ("map_memory_s", "f8"),  # time constant with which the map discounts data [s]
     ],
     align=True,
 )
@@ -33,15 +33,19 @@ ESTIMATOR_STATE = np.dtype(
         ("learning", LEARNING_STATE),
         ("series_resistance", SERIES_RESISTANCE),
         ("filter", EKF_STATE),
-        ("elements", EQUIVALENT),  # what the filter's ladder amounts to now
+        ("elements", EQUIVALENT),  # circuit equivalent to the filter's ladder at the present SOC and temperature
         ("checks", CHECKS),
         ("counters", COUNTERS),
         ("map", ELEMENT_MAP),
         ("fit", ELEMENT_FIT),
-        ("fit_age_s", "f8"),  # since an element was fitted
-        ("next_element", "i8"),  # to be fitted
-        ("unseen_s", "f8"),  # gap before the first sample of a new clock [s]; infinite if unknown
-        ("unlearned_s", "f8", ELEMENTS),  # since the map learned of each element; infinite: never did
+        ("fit_age_s", "f8"),  # time since the last fit of an element [s]
+        ("next_element", "i8"),  # index of the element to be fitted next
+        ("unseen_s", "f8"),  # gap before the first sample with a new time base [s]; infinite if unknown
+        (
+            "unlearned_s",
+            "f8",
+            ELEMENTS,
+        ),  # time since the map's last observation of each element [s]; infinite: none yet
     ],
     align=True,
 )

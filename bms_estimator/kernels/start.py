@@ -1,4 +1,4 @@
-"""The first sample of all, and the first one after a restart.
+"""Processing of the first sample, and of the first one after a restart.
 
 ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 """
@@ -7,7 +7,7 @@ import math
 
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
-    equivalent,
+    write_equivalent_circuit,
 )
 from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, spawn_hypotheses, update_hypotheses
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
@@ -16,7 +16,7 @@ from bms_estimator.kernels.kalman_filter.temperature import is_temperature, upda
 from bms_estimator.kernels.kalman_filter.window import add_to_window, reset_window
 from bms_estimator.kernels.observer.learning_law import initialize_learning, initialize_states_at_rest
 from bms_estimator.kernels.observer.series_resistance import (
-    begin_series_resistance,
+    initialize_series_resistance,
 )
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
@@ -27,7 +27,7 @@ MAX_SOC_STD_AFTER_GAP = 0.3
 
 @njit(cache=True)
 def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """Begin at the SOC of the observer's first sample."""
+    """Initialize the filter at the observer's initial SOC and update it by the first sample."""
     initialize_filter(s.filter, p.filter, s.observer.soc, current_a, temperature_c)
     s.unlearned_s[:] = math.inf
     first_update(s, p, current_a, voltage_v)
@@ -35,7 +35,7 @@ def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, tempe
 
 @njit(cache=True)
 def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, voltage_v: float) -> None:
-    """Restart after an unmeasured gap: SOC as in ``s.filter`` with ``soc_std``; the load before is unknown."""
+    """Re-initialize the filter after an unmeasured gap with an unknown load, at its present SOC with ``soc_std``."""
     f = s.filter
     f.current_a, f.step.phase = current_a, UNHELD
     update_arrhenius_factors(f)
@@ -50,19 +50,19 @@ def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, volta
 
 @njit(cache=True)
 def first_update(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
-    """Update the filter by the first sample alone."""
+    """Update the newly initialized filter by its first sample."""
     f = s.filter
     store_last_good_state(s.checks, f)
     add_to_window(f, current_a, voltage_v)
     s.checks.mean_a = current_a
     update_hypotheses(f, p.filter)
-    equivalent(f, p.filter, s.elements)
+    write_equivalent_circuit(f, p.filter, s.elements)
     s.observer.soc = f.soc
 
 
 @njit(cache=True)
 def initialize_state(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """Initialize filter and adaptive law at the first sample. Records as in ``step``."""
+    """Initialize filter, learning law and sums of R_s at the first sample."""
     s.learning.temperature_c = math.nan
     store_temperature(s.learning, temperature_c)
     if p.identify:
@@ -70,19 +70,19 @@ def initialize_state(s: Record, p: Record, current_a: float, voltage_v: float, t
     if p.learning.enabled:
         initialize_learning(s, p, voltage_v)
     if p.series_resistance:
-        begin_series_resistance(s, p)
+        initialize_series_resistance(s, p)
 
 
 @njit(cache=True)
 def store_temperature(m: Record, temperature_c: float) -> None:
-    """Keep the last temperature that a cell can have; ``m`` is a record of LEARNING_STATE."""
+    """Store a plausible temperature in ``m``, a record of LEARNING_STATE."""
     if is_temperature(temperature_c):
         m.temperature_c = temperature_c
 
 
 @njit(cache=True)
 def restart_after_unknown_gap(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """Restart at the first sample of a new clock, after a gap of unknown length. Records as in ``step``."""
+    """Restart at the first sample with a new time base, after a gap of unknown duration."""
     if p.identify:
         if is_temperature(temperature_c):
             s.filter.temperature_c, s.filter.sensed = temperature_c, 1

@@ -1,4 +1,4 @@
-"""The way of one sample through the numbers: ``step`` takes it, ``run`` loops ``step`` over a block."""
+"""Estimator step for one sample (``step``) and for a block of samples (``run``)."""
 
 import math
 from enum import IntEnum
@@ -21,7 +21,7 @@ from bms_estimator.numba_cache import njit
 
 
 class SampleOutcome(IntEnum):
-    """Outcome of a sample: accepted, or why it was dropped."""
+    """Outcome of a sample: accepted, or the reason for its rejection."""
 
     ACCEPTED = 0
     NOT_FINITE = 1
@@ -40,7 +40,7 @@ _SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SAT
 
 @njit(cache=True)
 def validate_sample(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
-    """Verdict on a sample; dropped samples are counted by kind.
+    """Return the outcome of a sample, and count rejected samples by reason.
 
     ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
     """
@@ -69,7 +69,7 @@ def step(
     status: int,
     temperature_c: float,
 ) -> int:
-    """Take one sample.
+    """Process one sample.
 
     Args:
         state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
@@ -84,30 +84,30 @@ def step(
         A ``SampleOutcome``.
     """
     s, p = state[0].observer, settings[0].observer
-    verdict = validate_sample(s, p, time_s, current_a, voltage_v, status)
-    if verdict != _ACCEPTED:
-        return verdict
+    outcome = validate_sample(s, p, time_s, current_a, voltage_v, status)
+    if outcome != _ACCEPTED:
+        return outcome
     s.samples += 1
     if not s.started:
         initialize(s, p, time_s, current_a, voltage_v)
         initialize_state(state[0], settings[0], current_a, voltage_v, temperature_c)
-        return verdict
+        return outcome
     store_temperature(state[0].learning, temperature_c)
     dt_s = time_s - s.time_s
     s.time_s = time_s
     new_clock = dt_s == -math.inf
     if new_clock:
         dt_s = state[0].unseen_s
-        settle_s = settings[0].learning.settle_s  # the load meanwhile is not known
+        settle_s = settings[0].learning.settle_s  # the load in the gap is unknown
         state[0].learning.settle_s = state[0].series_resistance.settle_s = settle_s
-    if not 0.0 <= dt_s < math.inf:  # the clock was set back, or the gap is unknown: continue from here
+    if not 0.0 <= dt_s < math.inf:  # the clock was set back, or the gap is unknown
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
         if new_clock:
             restart_after_unknown_gap(state[0], settings[0], current_a, voltage_v, temperature_c)
         else:
             s.time_steps_back += 1
-        return verdict
+        return outcome
     gap = new_clock or is_gap(s, p, dt_s)
     before_a, before_soc = s.current_a, s.soc
     count_charge(s, p, dt_s, current_a)
@@ -121,12 +121,12 @@ def step(
         observer_step(s, p, dt_s, voltage_v)
     if settings[0].series_resistance:
         series_resistance_step(state[0], settings[0], dt_s, before_a, before_soc, voltage_v)
-    return verdict
+    return outcome
 
 
 @njit(cache=True)
 def is_gap(s: Record, p: Record, dt_s: float) -> bool:
-    """Return True and count a gap if samples are missing in a step of ``dt_s``. Records as in ``validate_sample``."""
+    """Return True if samples are missing in a step of ``dt_s``, and count the gap. Records as in ``validate_sample``."""
     gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
     s.step_s = dt_s
     if gap:
@@ -136,7 +136,7 @@ def is_gap(s: Record, p: Record, dt_s: float) -> bool:
 
 @njit(cache=True)
 def run(state: Records, settings: Records, samples: Records, trace: Records) -> int:
-    """Take a block of samples: ``step`` for each, a row of ``trace`` for each accepted one.
+    """Process a block of samples and write a row of ``trace`` for each accepted sample.
 
     Args:
         state: As in ``step``.
@@ -145,7 +145,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
         trace: Shape (m,) with m >= n, dtype TRACE; written from its start.
 
     Returns:
-        How many rows of ``trace`` were written.
+        Number of rows written to ``trace``.
     """
     rows = 0
     for j in range(samples.shape[0]):
@@ -159,7 +159,10 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
 
 @njit(cache=True)
 def write_observer_trace(row: Record, s: Record, p: Record, x: Record) -> None:
-    """Columns of the observer for an accepted sample ``x``; records of OBSERVER_STATE and ESTIMATOR_SETTINGS."""
+    """Write the observer's columns for an accepted sample ``x``.
+
+    ``s`` is a record of OBSERVER_STATE, ``p`` of ESTIMATOR_SETTINGS.
+    """
     row.time_s = x.time_s
     row.voltage_v = x.voltage_v
     row.current_a = x.current_a
@@ -180,9 +183,10 @@ def write_observer_trace(row: Record, s: Record, p: Record, x: Record) -> None:
 
 @njit(cache=True)
 def write_filter_trace(row: Record, s: Record, p: Record) -> None:
-    """Columns of the filter; records as in ``step``. Without it: the observer's e, R_s by (4.2) where that is on, and NaN.
+    """Write the filter's columns. ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 
-    The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.
+    Without the filter, the columns contain the observer's e, R_s by (4.2) if enabled, and NaN. ``soc_ocv`` is then NaN,
+    because the observer's v_ts and v_tl absorb any error of the SOC, so that (7.1) would return the observer's own SOC.
     """
     if not p.identify:
         row.innovation_v = s.observer.innovation_v

@@ -1,4 +1,4 @@
-"""The trace: one row of values for each accepted sample."""
+"""Trace of the estimator: one row of values for each accepted sample."""
 
 import numpy as np
 
@@ -21,7 +21,10 @@ TRACE = np.dtype(
         ("lock", "i8"),
         ("converged", "i8"),  # |e| < eps2
         ("soc_coulomb", "f8"),  # by coulomb counting alone
-        ("soc_ocv", "f8"),  # by the inverted OCV (7.1); from here on the identifier's, NaN without it
+        (
+            "soc_ocv",
+            "f8",
+        ),  # by the inverted OCV (7.1); this column and all later ones are the identifier's, NaN without it
         ("soc_std", "f8"),
         ("r_s_ohm", "f8"),
         ("r_s_std_ohm", "f8"),

@@ -1,7 +1,7 @@
 """Published parameters of R_s by (4.2), step 3 of the thesis."""
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.observer.series_resistance import SMALLEST_CURRENT_C
+from bms_estimator.kernels.observer.series_resistance import MIN_CURRENT_C
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Parameter
 from bms_estimator.telemetry.state import finite
@@ -23,7 +23,7 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
     sums = record["series_resistance"]
     square_a2 = float(sums["square_a2"].sum())
     if square_a2 == 0.0:
-        smallest_a = SMALLEST_CURRENT_C * float(estimator.settings[0]["capacity_as"]) / 3600.0
+        smallest_a = MIN_CURRENT_C * float(estimator.settings[0]["capacity_as"]) / 3600.0
         missing = f"(4.2) needs a current: none above {smallest_a:.3g} A has flowed"
         return {"r_s_ohm": Parameter(value=None, std=None, valid=False, source="identified", reason=missing)}
     try:

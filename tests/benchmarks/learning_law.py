@@ -52,7 +52,7 @@ NOISES_V = (0.0, 1e-3, 5e-3)
 CONVERGING = [0, 2, 4]
 K_STILL_V = 9.0
 """A dead zone that nothing gets out of [V]."""
-K_BOUND = learning_law.FASTEST_HZ / RATE_HZ
+K_BOUND = learning_law.MAX_RATE_HZ / RATE_HZ
 OF_OBSERVER = ("dead_zone_v", "k0")
 LEAK = 1e-4
 """Gain of the law without a memory: ten times as much already diverges."""
@@ -208,7 +208,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "k = 1": {"settings": {"dead_zone_v": K_STILL_V}},
     "k at its bound from the start": {"settings": {"k0": K_BOUND}},
     "ten times this bound, k there from the start": {
-        "others": {"FASTEST_HZ": 10.0 * learning_law.FASTEST_HZ},
+        "others": {"MAX_RATE_HZ": 10.0 * learning_law.MAX_RATE_HZ},
         "settings": {"k0": 10.0 * K_BOUND},
     },
 }

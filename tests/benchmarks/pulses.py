@@ -19,7 +19,7 @@ from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import FROM_START, GROUPS, WRONG, Group, cell_file, chosen, load
 
 MIN_C, HELD_SHARE = 0.2, 0.1
-MAX_S, SLOW_S = 1.6, 0.5
+MAX_STEP_S, SLOW_S = 1.6, 0.5
 AROUND = 9
 AFTER_S = 900.0
 
@@ -71,7 +71,7 @@ def pulses(samples: SampleBlock, capacity_ah: float) -> tuple[NDArray[np.intp], 
     most_a = HELD_SHARE * np.abs(change_a[inner])
     held = (np.abs(change_a[inner - 1]) < most_a) & (np.abs(change_a[inner + 1]) < most_a)
     large = np.abs(change_a[inner]) > MIN_C * capacity_ah
-    soon = (step_s[inner] > 0.0) & (step_s[inner] < MAX_S) & (time_s[inner] > time_s[0] + AFTER_S)
+    soon = (step_s[inner] > 0.0) & (step_s[inner] < MAX_STEP_S) & (time_s[inner] > time_s[0] + AFTER_S)
     rows = inner[held & large & soon]
     over = np.where(step_s[rows + 1] > SLOW_S, 1, 2)
     ohm = -(voltage_v[rows + over] - voltage_v[rows]) / (current_a[rows + over] - current_a[rows])

@@ -40,7 +40,7 @@ def test_parameters_come_out_within_their_errors() -> None:
     scores = []
     for seed in range(5):
         fit = fit_fuel_cell(of_the_model(truth, seed=seed), PEM)
-        assert fit.not_told == {}
+        assert fit.undetermined == {}
         assert fit.rms_v["steps"] == pytest.approx(0.003, rel=0.05)
         for key in KEYS:
             off = np.log(getattr(fit.model.fuel_cell, key) / getattr(truth.fuel_cell, key))
@@ -51,7 +51,7 @@ def test_parameters_come_out_within_their_errors() -> None:
 
 def test_a_curve_alone_does_not_tell_of_the_double_layer() -> None:
     fit = fit_fuel_cell(of_the_model(PEM, seed=1)[:1], PEM)
-    assert "steps of the current" in fit.not_told["c_dl_farad"]
+    assert "steps of the current" in fit.undetermined["c_dl_farad"]
     assert fit.model.fuel_cell.c_dl_farad == PEM.fuel_cell.c_dl_farad
     assert "c_dl_farad" not in fit.model.std
     assert fit.model.fuel_cell.r_ohm == pytest.approx(PEM.fuel_cell.r_ohm, rel=3.0 * fit.model.std["r_ohm"])
@@ -59,8 +59,8 @@ def test_a_curve_alone_does_not_tell_of_the_double_layer() -> None:
 
 def test_steps_far_from_the_limit_do_not_tell_of_concentration() -> None:
     fit = fit_fuel_cell(of_the_model(PEM, seed=2, highest_a=2.0)[1:], PEM)
-    assert "concentration_v" in fit.not_told
-    assert "near the limiting one" in fit.not_told["concentration_v"]
+    assert "concentration_v" in fit.undetermined
+    assert "near the limiting one" in fit.undetermined["concentration_v"]
     assert fit.model.fuel_cell.c_dl_farad == pytest.approx(0.067, rel=3.0 * fit.model.std["c_dl_farad"])
 
 
@@ -70,7 +70,7 @@ def test_one_current_tells_of_nothing_but_the_voltage() -> None:
     constant = np.full(record.current_a.size, 3.0)
     voltage_v = np.random.default_rng(0).normal(9.4, 0.003, constant.size)
     fit = fit_fuel_cell([Source("constant", record.time_s, constant, voltage_v, record.temperature_c)], PEM)
-    assert set(fit.not_told) >= {"r_ohm", "tafel_slope_v", "c_dl_farad", "limiting_current_a"}
+    assert set(fit.undetermined) >= {"r_ohm", "tafel_slope_v", "c_dl_farad", "limiting_current_a"}
 
 
 def test_data_that_are_no_fuel_cell_s_are_refused() -> None:
@@ -109,7 +109,7 @@ def test_a_real_polarisation_curve_gives_the_resistance_that_impedance_has() -> 
         [Source("oxygen", None, current_a, voltage_v, temperature_c)], load_fuel_cell(DATA / "one_cm2.toml")
     )
     assert fit.rms_v["oxygen"] < 0.009
-    assert set(fit.not_told) == {"c_dl_farad", "internal_current_a"}
+    assert set(fit.undetermined) == {"c_dl_farad", "internal_current_a"}
     assert fit.model.fuel_cell.r_ohm == pytest.approx(
         IMPEDANCE_OHM, abs=3.0 * fit.model.std["r_ohm"] * fit.model.fuel_cell.r_ohm
     )
@@ -125,5 +125,5 @@ def test_a_flooding_cell_on_air_is_not_this_model_s() -> None:
     fit = fit_fuel_cell(
         [Source("air", None, current_a, voltage_v, temperature_c)], load_fuel_cell(DATA / "one_cm2.toml")
     )
-    assert {"r_ohm", "c_dl_farad"} <= set(fit.not_told)
+    assert {"r_ohm", "c_dl_farad"} <= set(fit.undetermined)
     assert fit.rms_v["air"] > 0.015

@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.kernels.kalman_filter.temperature import COOLS_S, WARMEST_C
+from bms_estimator.kernels.kalman_filter.temperature import COOLING_S, MAX_MODELLED_C
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.replay import load_capture
@@ -63,7 +63,7 @@ def test_a_sensor_is_believed() -> None:
     assert np.all(rise_k(samples) == 10.0 - REFERENCE_C)
 
 
-@pytest.mark.parametrize("unseen_s", [COOLS_S, 8 * 3600.0, math.inf], ids=["minutes", "a night", "nobody knows"])
+@pytest.mark.parametrize("unseen_s", [COOLING_S, 8 * 3600.0, math.inf], ids=["minutes", "a night", "nobody knows"])
 def test_a_cell_cools_while_nobody_measures(unseen_s: float) -> None:
     estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
     warm_k = loaded(estimator) - REFERENCE_C
@@ -71,12 +71,12 @@ def test_a_cell_cools_while_nobody_measures(unseen_s: float) -> None:
     estimator.resume(unseen_s)
     estimator.step(0.0, 0.0, 3.9)
     estimator.step(1.0, 0.0, 3.9)
-    assert 0.0 <= taken_c(estimator) - REFERENCE_C < warm_k * (0.1 if unseen_s > COOLS_S else 0.9)
+    assert 0.0 <= taken_c(estimator) - REFERENCE_C < warm_k * (0.1 if unseen_s > COOLING_S else 0.9)
 
 
 def test_a_current_that_is_no_truth_makes_no_fire() -> None:
     estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
     for second in range(300):
         estimator.step(float(second), 99.0, 3.9)
-    assert REFERENCE_C < taken_c(estimator) <= WARMEST_C
+    assert REFERENCE_C < taken_c(estimator) <= MAX_MODELLED_C
     assert np.isfinite(estimator.record["filter"]["soc"][0])

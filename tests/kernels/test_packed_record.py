@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.packed_record import WORD_BITS, pack, room, symmetry_map, unpack
+from bms_estimator.kernels.packed_record import WORD_BITS, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.cell import load_cell
 from tests.estimator.simulated_cell import pulses
@@ -22,7 +22,7 @@ words_of = hnp.arrays(np.uint64, SIZE, elements=st.sampled_from([0, 1, 2**63, 2*
 
 
 def packed(words, mirror=MIRROR):
-    out = room(words.size)
+    out = packed_buffer(words.size)
     return out[: pack(words, mirror, out)].copy()
 
 

@@ -1,46 +1,55 @@
-"""Contradictions between a capture and its alleged cell."""
+"""Checks of a capture against the cell file that it is used with."""
 
 import numpy as np
 
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
-from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C, SOC_SLACK, true_runs
+from bms_estimator.calibration.cleaning.rests import REST_C_RATE, SOC_SLACK, true_runs
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 
-MIN_CURRENT_C = 0.1
-"""Maximum C-rate of a capture without information on resistances [1/h]; such a capture is for `ocv`."""
-STEP_SHARE = 0.1
-"""Change of current between two samples that counts as a step, of the capture's largest current."""
-STEP_S = 3.0
-"""Two samples further apart do not show the ohmic step [s]."""
+MIN_PEAK_C_RATE = 0.1
+"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with less is of use to `ocv` only."""
+STEP_FRACTION = 0.1
+"""Minimum change of current between two samples of a current step, as a fraction of the capture's largest current."""
+MAX_STEP_S = 3.0
+"""Maximum time between the two samples of a current step [s]. Later samples include relaxation beside the ohmic step."""
 MIN_STEPS = 5
-"""Fewer steps do not show the sign."""
+"""Minimum number of current steps whose median determines the sign of the current."""
 LONG_REST_S = 300.0
-"""Length of a rest after which the voltage is near the OCV [s]."""
-SOC_OFF, VOLTAGE_OFF_V = 0.1, 0.1
-"""A rested voltage this far off the OCV at the counted SOC, in SOC and per cell in volts, cannot be the model's error."""
-GAP_STEPS, GAP_CHARGE = 10.0, 0.01
-"""A step is a gap with unknown charge if it is this many times the median one and the current at its start would draw
-this fraction of the capacity."""
-MIN_S = 30.0
+"""Duration of a rest after which the voltage is near the OCV [s]."""
+MAX_SOC_DEVIATION, MAX_VOLTAGE_DEVIATION_V = 0.1, 0.1
+"""Maximum deviation of a rested voltage from the OCV at the counted SOC, as SOC and per cell [V]. A deviation beyond both
+is larger than errors of the model."""
+MIN_GAP_PERIODS, MIN_GAP_CHARGE = 10.0, 0.01
+"""Minimum duration of a gap with unknown charge, in multiples of the median sample period, and minimum charge, as a
+fraction of the capacity, that the current at its start would draw over it."""
+MIN_DURATION_S = 30.0
 """Minimum duration of a capture [s]."""
-MIN_ANSWER_V = 1e-3
-"""Minimum change of a real cell's voltage at current steps of 1 C, per cell [V]: most have 20 to 100 mV."""
-MIN_SWEEP = 0.05
-"""SOC that must have moved for the sign to show in the voltage's trend."""
+MIN_RESPONSE_V = 1e-3
+"""Minimum change of a real cell's voltage at a current step of 1 C, per cell [V]. Most cells change by 20 to 100 mV."""
+MIN_SOC_CHANGE = 0.05
+"""Minimum change of SOC over which the trend of the voltage shows the sign of the current."""
 
 
 def capture_contradictions(load: CleanCapture, cell: CellModel, start: float) -> list[str]:
-    """One line with what to do; empty where all is well. The first one found explains the others.
+    """Return one line on the first contradiction, with a remedy, or an empty list.
+
+    Later contradictions are usually consequences of the first.
 
     Args:
         load: The capture.
-        cell: The alleged cell.
+        cell: Cell of the cell file.
         start: SOC at the first sample, 0..1.
     """
-    found = _short(load) or _no_excitation(load, cell) or _sign(load, cell) or _answer(load, cell) or _gap(load, cell)
-    found = found or _capacity(load, cell, start)
+    found = (
+        _too_short(load)
+        or _no_excitation(load, cell)
+        or _wrong_sign(load, cell)
+        or _unresponsive_voltage(load, cell)
+        or _gap_with_charge(load, cell)
+    )
+    found = found or _wrong_capacity(load, cell, start)
     return [f"{load.name}: {found}"] if found else []
 
 
@@ -50,17 +59,17 @@ def without_excitation(load: CleanCapture, cell: CellModel) -> bool:
 
 
 def step_resistance(load: CleanCapture) -> float | None:
-    """Median of -dV/dI over the steps of current [ohm], negative under a wrong sign; None with too few steps."""
+    """Return the median of -dV/dI over the current steps [ohm]. It is negative for a wrong sign; None: too few steps."""
     change_a = np.diff(load.current_a)
     largest_a = float(np.abs(load.current_a).max(initial=0.0))
-    steps = (np.abs(change_a) > STEP_SHARE * largest_a) & (np.diff(load.time_s) <= STEP_S)
+    steps = (np.abs(change_a) > STEP_FRACTION * largest_a) & (np.diff(load.time_s) <= MAX_STEP_S)
     if steps.sum() < MIN_STEPS:
         return None
     return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
 
 
 def soc_outside(load: CleanCapture, capacity_ah: float, start: float) -> str | None:
-    """Return how far SOC, counted from ``start``, leaves 0..1; None if it stays within."""
+    """Return a message if SOC, counted from ``start``, leaves 0..1; None if it stays within."""
     soc = start - load.discharged_ah / capacity_ah
     if soc.min() >= -2.0 * SOC_SLACK and soc.max() <= 1.0 + 2.0 * SOC_SLACK:
         return None
@@ -71,24 +80,26 @@ def soc_outside(load: CleanCapture, capacity_ah: float, start: float) -> str | N
     )
 
 
-def _short(load: CleanCapture) -> str | None:
-    if load.time_s[-1] >= MIN_S:
+def _too_short(load: CleanCapture) -> str | None:
+    if load.time_s[-1] >= MIN_DURATION_S:
         return None
-    return f"it lasts {load.time_s[-1]:.3g} s, which tells nothing of a battery: is time_s in seconds?"
+    return (
+        f"it lasts {load.time_s[-1]:.3g} s, at least {MIN_DURATION_S:g} s are needed: check that time_s is in seconds"
+    )
 
 
 def _no_excitation(load: CleanCapture, cell: CellModel) -> str | None:
     largest_a = float(np.abs(load.current_a).max())
-    least_a = MIN_CURRENT_C * cell.cell.capacity_ah
+    least_a = MIN_PEAK_C_RATE * cell.cell.capacity_ah
     if largest_a >= least_a:
         return None
     return (
         f"no excitation: the current never exceeds {largest_a:.4f} A in {load.time_s[-1] / 3600.0:.2f} h, and at least "
-        f"{least_a:.4f} A ({MIN_CURRENT_C:g} C) is needed; record a load with steps and rests"
+        f"{least_a:.4f} A ({MIN_PEAK_C_RATE:g} C) is needed; record a load with steps and rests"
     )
 
 
-def _sign(load: CleanCapture, cell: CellModel) -> str | None:
+def _wrong_sign(load: CleanCapture, cell: CellModel) -> str | None:
     ohm = step_resistance(load)
     if ohm is not None and ohm < 0.0:
         return (
@@ -96,7 +107,7 @@ def _sign(load: CleanCapture, cell: CellModel) -> str | None:
             "ampere (median); discharge must be positive (--current-sign)"
         )
     soc = -load.discharged_ah / cell.cell.capacity_ah
-    if ohm is None and np.ptp(soc) > MIN_SWEEP and np.cov(soc, load.voltage_v)[0, 1] < 0.0:
+    if ohm is None and np.ptp(soc) > MIN_SOC_CHANGE and np.cov(soc, load.voltage_v)[0, 1] < 0.0:
         return (
             f"the current's sign is wrong: {load.discharged_ah[-1]:.3f} Ah drawn while the voltage went from "
             f"{load.voltage_v[0]:.3f} to {load.voltage_v[-1]:.3f} V; discharge must be positive (--current-sign)"
@@ -104,21 +115,21 @@ def _sign(load: CleanCapture, cell: CellModel) -> str | None:
     return None
 
 
-def _answer(load: CleanCapture, cell: CellModel) -> str | None:
-    ohm, least_ohm = step_resistance(load), MIN_ANSWER_V * cell.cell.series_count / cell.cell.capacity_ah
+def _unresponsive_voltage(load: CleanCapture, cell: CellModel) -> str | None:
+    ohm, least_ohm = step_resistance(load), MIN_RESPONSE_V * cell.cell.series_count / cell.cell.capacity_ah
     if np.ptp(load.voltage_v) == 0.0:
-        moves = "does not move"
+        moves = "is constant"
     elif ohm is not None and ohm < least_ohm:
-        moves = f"moves by {1e3 * ohm:.3f} mV per ampere at the current's steps (median)"
+        moves = f"changes by {1e3 * ohm:.3f} mV per ampere at the current's steps (median)"
     else:
         return None
-    return f"the voltage {moves}: it is not this current's; check the column, and that no old value was repeated"
+    return f"the voltage {moves}, so it does not belong to this current; check the column for repeated old values"
 
 
-def _gap(load: CleanCapture, cell: CellModel) -> str | None:
+def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
     step_s = np.diff(load.time_s)
     charge_ah = np.abs(load.current_a[:-1]) * step_s / 3600.0
-    gaps = (step_s > GAP_STEPS * np.median(step_s)) & (charge_ah > GAP_CHARGE * cell.cell.capacity_ah)
+    gaps = (step_s > MIN_GAP_PERIODS * np.median(step_s)) & (charge_ah > MIN_GAP_CHARGE * cell.cell.capacity_ah)
     if not gaps.any():
         return None
     j = int(np.argmax(gaps))
@@ -128,7 +139,7 @@ def _gap(load: CleanCapture, cell: CellModel) -> str | None:
     )
 
 
-def _capacity(load: CleanCapture, cell: CellModel, start: float) -> str | None:
+def _wrong_capacity(load: CleanCapture, cell: CellModel, start: float) -> str | None:
     capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
     outside = soc_outside(load, capacity_ah, start)
     if outside:
@@ -137,7 +148,10 @@ def _capacity(load: CleanCapture, cell: CellModel, start: float) -> str | None:
     for j in _ends_of_long_rests(load, capacity_ah):
         rested_v = float(load.voltage_v[j])
         expected_v, seen = ocv(soc[j], *grid), soc_from_ocv(rested_v, *grid)
-        if abs(rested_v - expected_v) > VOLTAGE_OFF_V * cell.cell.series_count and abs(seen - soc[j]) > SOC_OFF:
+        if (
+            abs(rested_v - expected_v) > MAX_VOLTAGE_DEVIATION_V * cell.cell.series_count
+            and abs(seen - soc[j]) > MAX_SOC_DEVIATION
+        ):
             return (
                 f"charge and voltage disagree: after {load.discharged_ah[j]:.3f} Ah, at rest at {load.time_s[j]:.0f} s, "
                 f"SOC is {soc[j]:.3f} by the charge and a capacity of {capacity_ah:g} Ah, but {seen:.3f} by "
@@ -147,6 +161,6 @@ def _capacity(load: CleanCapture, cell: CellModel, start: float) -> str | None:
 
 
 def _ends_of_long_rests(load: CleanCapture, capacity_ah: float) -> list[int]:
-    """Last sample of each rest longer than ``LONG_REST_S``."""
-    resting = np.abs(load.current_a) < REST_CURRENT_C * capacity_ah
+    """Return the index of the last sample of each rest longer than ``LONG_REST_S``."""
+    resting = np.abs(load.current_a) < REST_C_RATE * capacity_ah
     return [end - 1 for first, end in true_runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]

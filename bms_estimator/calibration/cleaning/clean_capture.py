@@ -1,25 +1,25 @@
-"""A capture as calibration wants it: what the cell did, without glitches."""
+"""A capture without glitches, prepared for calibration."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C, remove_glitches
+from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 NEIGHBOURS = 2
-"""Number of neighbors on each side by which a glitch is recognized."""
+"""Number of neighbours on each side whose median a sample is compared with."""
 MIN_SAMPLES = 2 * NEIGHBOURS + 1
 """Minimum number of good samples of a capture."""
 SPIKE_V = 0.03
-"""A voltage off its neighbours' median by more than this, per cell, and more than the current explains, is a glitch [V]."""
+"""Maximum deviation of a voltage from its neighbours' median per cell, beyond the part that the current explains [V]."""
 SPIKE_C = 0.1
-"""A current off its neighbours' median by more than this C-rate while the voltage does not move is a glitch [1/h]."""
-EXPLAINED = 3.0
-"""Times its series resistance at mid SOC that a change of current may move the voltage by."""
+"""Maximum deviation of a current from its neighbours' median while the voltage stays constant, as C-rate [1/h]."""
+RESISTANCE_FACTOR = 3.0
+"""Largest plausible voltage change per ampere, in multiples of the series resistance at SOC 0.5."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class CleanCapture:
     """One capture.
 
     Attributes:
-        name: What to call it.
+        name: Name for messages.
         time_s: Shape (n,), increasing, from 0 [s].
-        current_a: Shape (n,), at the sample, discharge positive [A].
+        current_a: Shape (n,), positive on discharge [A].
         voltage_v: Shape (n,), measured [V].
         temperature_c: Shape (n,), of the cell [C]; NaN where it was not measured.
         discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
-        resting_samples: Number of first samples at rest.
+        resting_samples: Number of samples at rest before the first load.
         samples: Number of samples in the capture.
         glitches: Number of dropped glitches.
     """
@@ -50,20 +50,20 @@ class CleanCapture:
 
     @property
     def start_v(self) -> float:
-        """Voltage of the first rest [V]; of the first sample where the capture starts under load."""
+        """Voltage of the first rest [V]; the first sample's if the capture starts under load."""
         return float(np.median(self.voltage_v[: max(self.resting_samples, 1)]))
 
 
 def clean_capture(name: str, samples: SampleBlock, cell: CellModel) -> CleanCapture:
-    """All good samples of a capture.
+    """Return the good samples of a capture.
 
     Raises:
-        UserError: No, too few or mostly samples that cannot be this cell's.
+        UserError: Too few good samples, or most samples lie outside the cell's limits.
     """
     good = _without_spikes(_within_limits(name, remove_glitches(samples, name), cell), cell)
     time_s = np.ascontiguousarray(good["time_s"] - good["time_s"][0])
     current_a = np.ascontiguousarray(good["current_a"])
-    resting = np.abs(current_a) < REST_CURRENT_C * cell.cell.capacity_ah
+    resting = np.abs(current_a) < REST_C_RATE * cell.cell.capacity_ah
     return CleanCapture(
         name=name,
         time_s=time_s,
@@ -89,7 +89,7 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
         raise UserError(
             f"{name}: {good.size} of {samples.size} samples lie within the cell's limits ({limits.voltage_min_v:g} to "
             f"{limits.voltage_max_v:g} V, {limits.current_max_a:g} A); the capture runs from {voltage_v.min():.3f} to "
-            f"{voltage_v.max():.3f} V and {current_a.min():.3f} to {current_a.max():.3f} A: is it this cell's?"
+            f"{voltage_v.max():.3f} V and {current_a.min():.3f} to {current_a.max():.3f} A: check the cell file"
         )
     if good.size < MIN_SAMPLES:
         raise UserError(f"{name}: {good.size} good samples are too few, at least {MIN_SAMPLES} are needed")
@@ -97,19 +97,19 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
 
 
 def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
-    """Remove voltage jumps that the current does not explain, and current jumps without a change of voltage."""
-    off_v = np.abs(_off_median(samples["voltage_v"]))
-    off_a = np.abs(_off_median(samples["current_a"]))
-    ohm = EXPLAINED * (cell.a[13] * np.exp(-0.5 * cell.a[14]) + cell.a[15])
-    jumped = off_v > SPIKE_V * cell.cell.series_count + ohm * off_a
-    unheard = (off_a > SPIKE_C * cell.cell.capacity_ah) & (off_v < 0.01 * ohm * off_a)
-    good: SampleBlock = samples[~(jumped | unheard)]
+    """Remove voltage spikes that the current does not explain, and current spikes without a change of voltage."""
+    deviation_v = np.abs(_deviation_from_median(samples["voltage_v"]))
+    deviation_a = np.abs(_deviation_from_median(samples["current_a"]))
+    ohm = RESISTANCE_FACTOR * (cell.a[13] * np.exp(-0.5 * cell.a[14]) + cell.a[15])
+    voltage_spike = deviation_v > SPIKE_V * cell.cell.series_count + ohm * deviation_a
+    current_spike = (deviation_a > SPIKE_C * cell.cell.capacity_ah) & (deviation_v < 0.01 * ohm * deviation_a)
+    good: SampleBlock = samples[~(voltage_spike | current_spike)]
     return good
 
 
-def _off_median(values: Floats) -> Floats:
-    """Each value less the median of itself and its neighbours; 0 at the ends."""
+def _deviation_from_median(values: Floats) -> Floats:
+    """Return each value less the median of the value and its neighbours; 0 at the ends."""
     windows = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
-    off = np.zeros(values.size)
-    off[NEIGHBOURS:-NEIGHBOURS] = values[NEIGHBOURS:-NEIGHBOURS] - np.median(windows, axis=1)
-    return off
+    deviation = np.zeros(values.size)
+    deviation[NEIGHBOURS:-NEIGHBOURS] = values[NEIGHBOURS:-NEIGHBOURS] - np.median(windows, axis=1)
+    return deviation

@@ -1,4 +1,4 @@
-"""Samples without glitches, and the samples at rest among them."""
+"""Removal of glitches, coulomb counting, and detection of rests."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,20 +8,21 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 GLITCH_FRACTION = 0.5
-"""A voltage off the median by more than this fraction is a fault of the instrument: no Li-ion cell swings so far."""
-MAX_BACK = 0.1
-"""Part of the samples that may lie before others in time: a clock that is set back by a little."""
-MIN_GOOD = 0.5
+"""Maximum deviation of a voltage from the median, as a fraction of the median. A larger one is a fault of the
+instrument, because no Li-ion cell has such a range."""
+MAX_BACKWARD_FRACTION = 0.1
+"""Maximum fraction of samples with a time before that of an earlier sample, as after a small correction of a clock."""
+MIN_GOOD_FRACTION = 0.5
 """Minimum fraction of good voltages; below it the faulty ones cannot be recognized."""
-REST_CURRENT_C = 0.01
-"""Maximum current of a rest [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
-NOISE_STDS, NOISE_STEP_C = 6.0, 0.1
-"""A current within this many standard deviations of its noise is zero. Changes from sample to sample below this
-C-rate are noise [1/h]."""
-BLIP_CHARGE = 2e-5
-"""Charge, in capacities, below which a current within a rest is a glitch of the sensor, not a load."""
+REST_C_RATE = 0.01
+"""Maximum C-rate of a rest [1/h]. A hundredth of 1 C changes SOC by 0.25 % in a quarter of an hour."""
+NOISE_STDS, NOISE_STEP_C_RATE = 6.0, 0.1
+"""Maximum current of a rest in standard deviations of the current's noise, and the change between two samples, as C-rate,
+below which it counts as noise [1/h]."""
+MIN_LOAD_CHARGE = 2e-5
+"""Minimum charge of a load that interrupts a rest, as a fraction of the capacity. Less is a glitch of the sensor."""
 SOC_SLACK = 0.03
-"""Distance that SOC may leave 0..1 before the capacity is called wrong: cells of one type differ by as much."""
+"""Tolerance of the counted SOC outside 0..1, because the capacities of cells of one type differ by as much."""
 
 
 def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
@@ -34,28 +35,28 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
     good = samples[finite]
     if good.size == 0:
         raise UserError(f"{name}: none of {samples.size} samples has finite time, current and voltage")
-    alive_v = good["voltage_v"][good["voltage_v"] > 0.0]
-    if alive_v.size == 0:
+    positive_v = good["voltage_v"][good["voltage_v"] > 0.0]
+    if positive_v.size == 0:
         raise UserError(
             f"{name}: none of {samples.size} samples has a voltage above 0 V, the largest is {good['voltage_v'].max():g} V"
         )
-    middle = float(np.median(alive_v))
-    off = np.abs(good["voltage_v"] - middle) > GLITCH_FRACTION * middle
-    if off.mean() > 1.0 - MIN_GOOD:
-        first = good[int(np.argmax(off))]
+    median_v = float(np.median(positive_v))
+    glitch = np.abs(good["voltage_v"] - median_v) > GLITCH_FRACTION * median_v
+    if glitch.mean() > 1.0 - MIN_GOOD_FRACTION:
+        first = good[int(np.argmax(glitch))]
         raise UserError(
-            f"{name}: {off.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
-            f"{first['voltage_v']:.3f} V where the median is {middle:.3f} V: look at the sensor's wiring"
+            f"{name}: {glitch.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
+            f"{first['voltage_v']:.3f} V where the median is {median_v:.3f} V: check the sensor's wiring"
         )
-    good = good[~off]
+    good = good[~glitch]
     latest = np.maximum.accumulate(good["time_s"])
     back = good["time_s"] < latest
-    if back.mean() > MAX_BACK:
+    if back.mean() > MAX_BACKWARD_FRACTION:
         first = int(np.argmax(back))
         raise UserError(
             f"{name}: time goes back {(np.diff(good['time_s']) < 0.0).sum()} times, first from {latest[first]:g} to "
-            f"{good['time_s'][first]:g} s, and {back.sum()} of {samples.size} samples lie before others: these are several "
-            "captures, or a clock was set; nobody knows what happened between them: give each stretch a file of its own"
+            f"{good['time_s'][first]:g} s, and {back.sum()} of {samples.size} samples lie before earlier ones: the file "
+            "contains several captures, or a clock was set; give each stretch as a file of its own"
         )
     later = np.r_[True, good["time_s"][1:] > latest[:-1]]
     kept: SampleBlock = good[later]
@@ -63,9 +64,9 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
 
 
 def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:
-    """SOC at every sample by coulomb counting, (2.1): 1 - Ah/Q from full.
+    """Return SOC at every sample by coulomb counting, (2.1). Shape (n,), not limited to 0..1.
 
-    A current holds until the next sample. Shape (n,), not limited to 0..1.
+    A current counts as constant until the next sample.
     """
     step_s = np.diff(samples["time_s"])
     charge_ah = np.r_[0.0, np.cumsum(samples["current_a"][:-1] * step_s)] / 3600.0
@@ -79,27 +80,27 @@ def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     for first, last in true_runs(~resting):
         until_s = time_s[min(last, good.size - 1)]
         charge_ah = abs(float(good["current_a"][first:last].mean())) * (until_s - time_s[first]) / 3600.0
-        if charge_ah < BLIP_CHARGE * capacity_ah:
+        if charge_ah < MIN_LOAD_CHARGE * capacity_ah:
             resting[first:last] = True
     return resting
 
 
 def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
-    """Return the maximum current of a rest [A]: a small C-rate, or the sensor's noise, but never half a load."""
+    """Return the maximum current of a rest [A]: a small C-rate or the sensor's noise, limited to half of the load."""
     change_a = np.diff(current_a)
-    small_a = change_a[np.abs(change_a) < NOISE_STEP_C * capacity_ah]
+    small_a = change_a[np.abs(change_a) < NOISE_STEP_C_RATE * capacity_ah]
     noise_a = float(np.sqrt(np.mean(small_a**2) / 2.0)) if small_a.size else 0.0
     half_load_a = 0.5 * float(np.quantile(np.abs(current_a), 0.95))
-    return max(REST_CURRENT_C * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
+    return max(REST_C_RATE * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
 
 
 def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Stretches where ``mask`` holds, each as first and one past its last index."""
+    """Return the runs of True in ``mask``, each as (first index, index after the last)."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def mean_temperature_c(samples: SampleBlock) -> float:
     """Return the mean of the reported temperatures [C], NaN without any."""
-    told = samples["temperature_c"][np.isfinite(samples["temperature_c"])]
-    return float(told.mean()) if told.size else float("nan")
+    reported_c = samples["temperature_c"][np.isfinite(samples["temperature_c"])]
+    return float(reported_c.mean()) if reported_c.size else float("nan")

@@ -1,4 +1,4 @@
-"""Prior from the shipped generic cell with the most similar open-circuit voltage, for values that captures do not determine."""
+"""Prior for values that captures do not determine: the generic cell with the most similar open-circuit voltage."""
 
 import numpy as np
 
@@ -7,59 +7,61 @@ from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells, load_cell
 
-INSIDE = 0.1, 0.95
-"""SOC at which curves are compared: their ends are steep."""
+COMPARED_SOC = 0.1, 0.95
+"""SOC range in which OCV curves are compared. Their steep ends would dominate the difference."""
 RESTS_STD = 0.35
-"""Relative standard deviation of resistances from rests, divided as in typical cells."""
+"""Relative standard deviation of resistances from rests, distributed over RC pairs as in typical cells."""
 
 
 def nearest_generic_cell(soc: Floats, ocv_v: Floats, capacity_ah: float, series_count: int) -> CellModel:
-    """Return the generic cell of this capacity with the nearest OCV curve, as a pack of the same cells in series.
+    """Return the generic cell with the nearest OCV curve, scaled to the capacity and the number of cells in series.
 
     Args:
         soc: Shape (n,), increasing.
         ocv_v: Open-circuit voltage there [V].
-        capacity_ah: It is scaled to [Ah].
+        capacity_ah: Capacity of the returned cell [Ah].
         series_count: Cells in series.
     """
-    inside = (soc > INSIDE[0]) & (soc < INSIDE[1])
+    inside = (soc > COMPARED_SOC[0]) & (soc < COMPARED_SOC[1])
 
-    def off_v(cell: CellModel) -> float:
+    def mean_squared_v2(cell: CellModel) -> float:
         curve_v = np.interp(soc[inside], *curve(cell, "ocv_v"))
         return float(np.mean((curve_v - ocv_v[inside]) ** 2))
 
     cells = [load_cell(name, capacity_ah).pack(series_count, 1) for name in generic_cells()]
-    return min(cells, key=off_v)
+    return min(cells, key=mean_squared_v2)
 
 
 def curve(cell: CellModel, column: str) -> tuple[Floats, Floats]:
-    """SOC and a column of a generic cell's table."""
+    """Return SOC and a column of a generic cell's OCV table."""
     ocv = cell.ocv
     if not isinstance(ocv, TableOcv):
-        raise TypeError(f"{cell.cell.name}: a generic cell has a table")
+        raise TypeError(f"{cell.cell.name}: a generic cell must have an OCV table")
     return np.array(ocv.soc), np.array(getattr(ocv, column))
 
 
 def scaled_generic_ladder(
     generic: CellModel, rests: InitialElements | None, temperature_c: float = REFERENCE_C
 ) -> Ladder:
-    """Return the generic resistances over SOC, scaled to those of the rests. Rests do not show growth in the cold and near empty.
+    """Return the generic resistances over SOC, scaled to those of the rests.
+
+    Rests do not show how resistances grow in the cold and near empty, so that growth stays generic.
 
     Args:
         generic: Result of ``nearest_generic_cell``.
-        rests: None: as large as the generic cell's.
+        rests: Elements from the rests; None: without scaling.
         temperature_c: Temperature of the rests [C].
     """
     ladder = generic.ladder
     if ladder is None:
-        raise TypeError(f"{generic.cell.name}: a generic cell has a ladder")
+        raise TypeError(f"{generic.cell.name}: a generic cell must have an RC ladder")
     if rests is None:
         return ladder
     weak_ohm, strong_ohm = np.array(ladder.weak_ohm), np.array(ladder.strong_ohm)
-    there_ohm = arrhenius(WEAK_J, temperature_c) * weak_ohm + arrhenius(STRONG_J, temperature_c) * strong_ohm
-    middle_ohm = np.array([np.interp(0.5, ladder.soc, row) for row in there_ohm])
-    scale = np.full(middle_ohm.size, (rests.r_ts_ohm + rests.r_tl_ohm) / middle_ohm[1:].sum())
-    scale[0] = rests.r_s_ohm / middle_ohm[0]
+    total_ohm = arrhenius(WEAK_J, temperature_c) * weak_ohm + arrhenius(STRONG_J, temperature_c) * strong_ohm
+    mid_soc_ohm = np.array([np.interp(0.5, ladder.soc, row) for row in total_ohm])
+    scale = np.full(mid_soc_ohm.size, (rests.r_ts_ohm + rests.r_tl_ohm) / mid_soc_ohm[1:].sum())
+    scale[0] = rests.r_s_ohm / mid_soc_ohm[0]
     rows = {
         name: tuple(tuple(float(f"{ohm:.4g}") for ohm in row) for row in scale[:, None] * ohms)
         for name, ohms in (("weak_ohm", weak_ohm), ("strong_ohm", strong_ohm))

@@ -1,7 +1,8 @@
-"""Identification of a cell from captures: the ladder of the filter, a1..a15 of its two branches, a better OCV.
+"""Identification of a cell from captures: RC ladder, a1..a15 of two equivalent RC pairs, corrected OCV.
 
-The fit is that of ``ladder_fit``. The estimator judges the result: replays started in mid-load, before and after. A
-capture beside which others of about its temperature were given is held back from the fit that it judges.
+``ladder_fit`` fits the resistances. The result is scored by replays of the estimator that start in mid-load, with the
+given and with the identified cell. If other captures at about the temperature of a capture were given, the replays of
+that capture use a fit without it (hold-out).
 """
 
 from collections.abc import Sequence
@@ -17,15 +18,15 @@ from bms_estimator.calibration.cleaning.capture_checks import (
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.elements import two_branch_fit
 from bms_estimator.calibration.elements.ladder_fit import (
-    EVEN,
-    HELD_PER_KELVIN_V,
-    HELD_V,
+    EVEN_SOC,
+    FIXED_OCV_STD_V,
+    FIXED_PER_KELVIN_STD_V,
     KELVIN_NODES,
-    KNOWN_PER_KELVIN_V,
-    NOTHING,
-    PER_KELVIN_V,
+    MEASURED_PER_KELVIN_STD_V,
+    PER_KELVIN_STD_V,
     SOC_NODES,
-    TYPICAL_V,
+    TYPICAL_DROP_V,
+    ZERO_FRACTION,
     LadderFit,
     Prior,
     correction_at,
@@ -54,30 +55,31 @@ from bms_estimator.model.errors import UserError
 SHOWN_SOC = (0.2, 0.5, 0.8)
 """SOCs at which the resistances are reported."""
 OCV_STEP = 0.01
-"""Nodes of the corrected table: at each such step of SOC."""
+"""SOC step between the nodes of the corrected OCV table."""
 MIN_SLOPE_V = 1e-3
-"""The corrected table rises at least so steeply, per cell and 1 of SOC [V]."""
+"""Minimum slope dOCV/dSOC of the corrected table per cell [V]."""
 SPAN_K = 10.0
 """Minimum temperature difference that gives activation energies and dE/dT [K]."""
-FULL_V, COLD_K = 0.03, 5.0
-"""Error of the SOC from a rest in the cold, per cell [V], and the distance from 25 C from which on it applies [K]: a
-rest this close to full counts as full."""
-LOWEST_C, HIGHEST_C = -45.0, 85.0
-"""Temperatures of cells [C]."""
+FULL_TOLERANCE_V, COLD_K = 0.03, 5.0
+"""Maximum distance of a first rest's voltage from that of a full cell, per cell [V], at which the capture counts as
+starting full, and minimum deviation from 25 C at which this rule applies [K]. Cold rests are not relaxed, so that their
+voltage gives a wrong SOC."""
+MIN_CELL_C, MAX_CELL_C = -45.0, 85.0
+"""Range of plausible cell temperatures [C]."""
 PERCENTILES = (2.0, 98.0)
-"""The temperatures of the captures are known between these."""
+"""Percentiles of the captures' temperatures that become the temperature range of the ladder [%]."""
 LADDER_STD = 0.1
-"""Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
-TYPICAL_STD = 0.3
-"""A ladder with a larger standard deviation was not identified, so its temperature range is unknown."""
-MIDDLE_SOC, SHAPE = 0.4, (0.2, 20.0)
-"""Above it is the middle; limits of each part relative to its value there."""
-JUDGED_SOC = 0.1
-"""RMS errors are given above it."""
+"""Relative std of resistances between cells of one make: two NCR18650 differ by 5 to 8 %, and cells age."""
+GENERIC_STD = 0.3
+"""Relative std from which on a ladder counts as generic, not identified, so that its temperature range is unknown."""
+SHAPE_MIN_SOC, SHAPE_LIMITS = 0.4, (0.2, 20.0)
+"""SOC above which a resistance is averaged to normalize its shape, and limits of the shape relative to that mean."""
+MIN_RMS_SOC = 0.1
+"""Lower SOC limit of the reported RMS errors."""
 COUNT_PASSES = 3
-"""Fits from which the miscount of each capture is found: a knee is not linear."""
+"""Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a knee."""
 NO_WORSE = 1.05
-"""Scores within this factor are equal, because four replays do not resolve more."""
+"""Ratio within which two scores count as equal, because four replays do not resolve more."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +92,11 @@ class CaptureFit:
         glitches: Number of dropped glitches.
         initial_soc: At the first sample, 0..1.
         temperature_c: Lowest and highest [C]; None without a sensor.
-        miscount: Relative charge that the samples miss; the SOC of the fit has it.
-        voltage_rms_v: What the ladder leaves, each second weighing the same, SOC above 0.1 [V].
+        miscount: Relative error of the counted charge, corrected in the SOC of the fit.
+        voltage_rms_v: RMS residual of the voltage, weighted by time, at SOC above 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
-        score_after: Interval score with the identified cell.
-        held_back: The capture had no part in the cell of ``score_after``.
+        score_after: Interval score with the identified cell [%].
+        held_back: True if ``score_after`` is of a fit without this capture.
     """
 
     name: str
@@ -114,13 +116,13 @@ class Identification:
     """An identified cell.
 
     Attributes:
-        cell: The cell with its ladder, the elements of its two branches, and perhaps a new open-circuit voltage.
+        cell: The cell with its ladder, the elements of two RC pairs, and a corrected OCV if that improves the replays.
         elements: SOC -> ``r_s``, ``r_ts``, ``r_tl`` at 25 C -> value, standard error [ohm].
-        captures: In the order given.
+        captures: Fit of each capture, in the order given.
         left_out: Names of captures without excitation.
-        ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0: it is the given one.
-        score_before: Geometric mean over the captures of the interval score with the given cell [%]; NaN when none could judge.
-        score_after: Interval score with the identified cell.
+        ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0: the OCV is the given one.
+        score_before: Geometric mean of the captures' interval scores with the given cell [%]; NaN when none has a score.
+        score_after: Geometric mean of the interval scores with the identified cell [%].
     """
 
     cell: CellModel
@@ -134,23 +136,23 @@ class Identification:
 
 @dataclass(frozen=True)
 class Run:
-    """One capture with derived information."""
+    """One capture with its SOC and temperature."""
 
     load: CleanCapture
     soc: Floats
     temperature_c: Floats
     miscount: float = 0.0
-    """Additional charge moved beyond the capture's, relative; ``soc`` includes it."""
+    """Relative correction of the counted charge. ``soc`` includes the correction."""
 
     def recounted(self, more: float) -> "Run":
-        """Return a copy with the miscount increased by ``more``."""
+        """Return a copy with ``miscount`` increased by ``more`` and ``soc`` rescaled."""
         miscount = self.miscount + more
         moved = (self.soc - self.soc[0]) / (1.0 + self.miscount)
         return replace(self, soc=self.soc[0] + (1.0 + miscount) * moved, miscount=miscount)
 
     @property
-    def warm_load(self) -> CleanCapture:
-        """``load`` at ``temperature_c``."""
+    def load_with_temperature(self) -> CleanCapture:
+        """``load`` with the temperatures replaced by ``temperature_c``."""
         return replace(self.load, temperature_c=self.temperature_c)
 
     @property
@@ -171,58 +173,58 @@ def identify(
 
     Args:
         captures: Raw samples, rows of dtype ``SAMPLE``; each should start from rest.
-        cell: Capacity, limits and OCV; its ladder, if it has one, supplies what captures at one temperature do not
-            show.
-        refine_ocv: Correct the open-circuit voltage as well where that makes the replays better.
+        cell: Capacity, limits and OCV. A ladder supplies the temperature dependence if all captures are at one
+            temperature.
+        refine_ocv: Correct the open-circuit voltage as well if the correction improves the replays.
         initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
-        temperature_c: Temperature of captures without a sensor; None: 25 C.
+        temperature_c: Temperature of captures without a sensor [C]; None: 25 C.
 
     Raises:
-        UserError: No capture with excitation; one that contradicts the cell: sign of the current, capacity, OCV; a
-            temperature that no cell has; or replays that get worse.
+        UserError: No capture has excitation, a capture contradicts the cell (sign of the current, capacity, OCV), a
+            temperature is implausible, or replays get worse.
     """
-    whole = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
-    loads = [load for load in whole if not without_excitation(load, cell)]
-    runs = [_run(load, cell, initial_soc, temperature_c) for load in loads or whole]
+    cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
+    loads = [load for load in cleaned if not without_excitation(load, cell)]
+    runs = [_run(load, cell, initial_soc, temperature_c) for load in loads or cleaned]
     found = [line for run in runs for line in capture_contradictions(run.load, cell, float(run.soc[0]))]
     found += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
     if found:
         raise UserError("\n".join(found))
     runs = _recounted(runs, cell, refine_ocv=refine_ocv)
-    left_out = tuple(load.name for load in whole if without_excitation(load, cell))
+    left_out = tuple(load.name for load in cleaned if without_excitation(load, cell))
     candidates = [_Candidate(runs, cell, refine_ocv=refine) for refine in ((False, True) if refine_ocv else (False,))]
     before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
     after = [candidate.scores() for candidate in candidates]
-    best = len(after) - 1  # where nothing can be judged
+    best = len(after) - 1  # without scores: the last candidate
     if np.isfinite(before).any():
         judged = [j for j in range(len(runs)) if candidates[0].held_back(j)]
-        kept, own = (_mean(scores[judged] if judged else scores) for scores in (after[0], after[-1]))
-        best = int((NO_WORSE if judged else 1.0) * own < kept)
+        given, refined = (_geometric_mean(scores[judged] if judged else scores) for scores in (after[0], after[-1]))
+        best = int((NO_WORSE if judged else 1.0) * refined < given)
     outcome = candidates[best].outcome(before, after[best], left_out)
     if outcome.score_after > NO_WORSE * outcome.score_before:
-        raise UserError(_worse(outcome))
+        raise UserError(_worse_replays(outcome))
     return outcome
 
 
 def initial_soc(load: CleanCapture, cell: CellModel) -> float:
-    """SOC at the first sample from the voltage of the first rest; of a first sample under load, with i R_s added."""
+    """Return SOC at the first sample by the voltage of the first rest, or by the loaded voltage plus i R_s."""
     current_a = 0.0 if load.resting_samples else float(load.current_a[0])
     return soc_from_ocv(load.start_v + current_a * r_s(0.5, cell.a), *ocv_grid(cell))
 
 
 class _Candidate:
-    """One variant of the fit: with the OCV refined or kept."""
+    """One variant of the fit: with a corrected or with the given OCV."""
 
     def __init__(self, runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> None:
         self._runs, self._cell, self._refine = runs, cell, refine_ocv
         steps = [ohm for ohm in (step_resistance(run.load) for run in runs) if ohm is not None]
         self._scale_ohm = (
-            float(np.median(steps)) if steps else TYPICAL_V * cell.cell.series_count / cell.cell.capacity_ah
+            float(np.median(steps)) if steps else TYPICAL_DROP_V * cell.cell.series_count / cell.cell.capacity_ah
         )
         grid = np.linspace(0.0, 1.0, ocv_grid(cell)[0].size)
         self._moments = []
         for run in runs:
-            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + ocv_offset(cell, run.warm_load, run.soc)
+            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + ocv_offset(cell, run.load_with_temperature, run.soc)
             self._moments.append(
                 moments(
                     run.load,
@@ -238,20 +240,26 @@ class _Candidate:
         self.fit, self.cell = self._fitted(range(len(runs)))
 
     def miscounts(self) -> list[float]:
-        """Additional miscount of each capture at which its voltage matches the fit's."""
+        """Return the additional miscount of each capture at which its voltage matches the fit."""
         return [one.miscount(self.fit) for one in self._moments]
 
     def scores(self) -> Floats:
-        """Scores of each capture's replays [%], with a cell that did not use the capture if there are similar ones."""
+        """Return the score of each capture's replays [%], by a fit without the capture if it is held back."""
         return np.array([interval_score(self._cell_for(j), run.load, run.soc) for j, run in enumerate(self._runs)])
 
     def held_back(self, j: int) -> bool:
-        """Return True if another capture at about the temperature of ``j`` was given."""
+        """Return True if another capture within ``SPAN_K`` of the temperature of capture ``j`` was given."""
         mean_c = [run.mean_c for run in self._runs]
         return any(k != j and abs(mean_c[k] - mean_c[j]) < SPAN_K for k in range(len(mean_c)))
 
     def outcome(self, before: Floats, after: Floats, left_out: tuple[str, ...]) -> Identification:
-        """Text of the result."""
+        """Return the identification with this variant's cell.
+
+        Args:
+            before: Scores with the given cell [%].
+            after: Scores with this variant's cell [%].
+            left_out: Names of captures without excitation.
+        """
         fits = tuple(
             CaptureFit(
                 name=run.load.name,
@@ -277,8 +285,8 @@ class _Candidate:
             captures=fits,
             left_out=left_out,
             ocv_correction_v=float(np.sqrt(np.mean(change_v**2))) if self._refine else 0.0,
-            score_before=_mean(before),
-            score_after=_mean(after),
+            score_before=_geometric_mean(before),
+            score_after=_geometric_mean(after),
         )
 
     def _cell_for(self, j: int) -> CellModel:
@@ -289,21 +297,21 @@ class _Candidate:
     def _fitted(self, which: Sequence[int]) -> tuple[LadderFit, CellModel]:
         runs = [self._runs[k] for k in which]
         low_c, high_c = _temperature_range(runs)
-        known = self._cell.ladder
-        tells = high_c - low_c >= SPAN_K
+        given = self._cell.ladder
+        spans_temperature = high_c - low_c >= SPAN_K
         series = self._cell.cell.series_count
-        entropy_v = PER_KELVIN_V if _per_kelvin(self._cell) is None else KNOWN_PER_KELVIN_V
+        entropy_v = PER_KELVIN_STD_V if _per_kelvin(self._cell) is None else MEASURED_PER_KELVIN_STD_V
         prior = Prior(
-            ocv_error_v=_middle_error(self._cell) if self._refine else np.full(EVEN.size, HELD_V),
-            per_kelvin_v=(entropy_v if tells and self._refine else HELD_PER_KELVIN_V) * series,
+            ocv_error_v=_curve_error(self._cell) if self._refine else np.full(EVEN_SOC.size, FIXED_OCV_STD_V),
+            per_kelvin_v=(entropy_v if spans_temperature and self._refine else FIXED_PER_KELVIN_STD_V) * series,
             scale_ohm=self._scale_ohm,
             series=series,
             shapes=self._shapes(),
-            weak_share=None if tells else weak_share(SOC_NODES) if known is None else _share(known),
+            weak_share=None if spans_temperature else weak_share(SOC_NODES) if given is None else _weak_share_of(given),
         )
         fit = fit_ladder([self._moments[k] for k in which], prior)
-        if not tells and known is not None and known.std < TYPICAL_STD:
-            low_c, high_c = min(low_c, known.temperature_c[0]), max(high_c, known.temperature_c[1])
+        if not spans_temperature and given is not None and given.std < GENERIC_STD:
+            low_c, high_c = min(low_c, given.temperature_c[0]), max(high_c, given.temperature_c[1])
         ohm, ohm_std = fit.branches(0.5, 0, RESISTANCES)
         ladder = Ladder(
             soc=_tuple(SOC_NODES),
@@ -315,25 +323,26 @@ class _Candidate:
         )
         update: dict[str, object] = {"ladder": ladder, "adaptation": {}, **two_branch_fit.cell_file_sections(ladder)}
         if self._refine:
-            update["ocv"] = _corrected_ocv(self._cell, fit, entropy=tells)
+            update["ocv"] = _corrected_ocv(self._cell, fit, entropy=spans_temperature)
         new = self._cell.model_copy(update=update)
         error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), 1e-5)
         return fit, new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
 
     def _shapes(self) -> Floats:
-        """Return the usual ratio of the weak and strong part of each resistance to its value at mid SOC, at ``SOC_NODES``.
+        """Return the prior shape of the weak and strong part of each resistance over SOC, at ``SOC_NODES``.
 
-        As an identified ladder; halfway between level and a typical one: cells differ. Level for one with a plateau: the
-        LFP cell that there are captures of is not like the generic one there.
+        The shape of an identified ladder is used in full. A generic ladder gives the square root of its shape, because
+        cells differ. The shape is constant for a cell with a plateau, because the generic shape did not fit the captures
+        of an LFP cell.
         """
-        known, grid_v = self._cell.ladder, ocv_grid(self._cell)[0]
-        if known is None or has_plateau(np.linspace(0.0, 1.0, grid_v.size), grid_v, self._cell.cell.series_count):
+        given, grid_v = self._cell.ladder, ocv_grid(self._cell)[0]
+        if given is None or has_plateau(np.linspace(0.0, 1.0, grid_v.size), grid_v, self._cell.cell.series_count):
             return np.ones((2, RESISTANCES, SOC_NODES.size))
-        rows = _at_nodes(known)
-        middle = rows[:, :, SOC_NODES > MIDDLE_SOC].mean(axis=2, keepdims=True)
-        nothing = middle < NOTHING * self._scale_ohm
-        shapes = np.clip(np.where(nothing, 1.0, rows / np.where(nothing, 1.0, middle)), *SHAPE)
-        return np.asarray(np.sqrt(shapes) if known.std >= TYPICAL_STD else shapes)
+        rows = _at_nodes(given)
+        mean_ohm = rows[:, :, SOC_NODES > SHAPE_MIN_SOC].mean(axis=2, keepdims=True)
+        zero = mean_ohm < ZERO_FRACTION * self._scale_ohm
+        shapes = np.clip(np.where(zero, 1.0, rows / np.where(zero, 1.0, mean_ohm)), *SHAPE_LIMITS)
+        return np.asarray(np.sqrt(shapes) if given.std >= GENERIC_STD else shapes)
 
 
 def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
@@ -343,13 +352,13 @@ def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: 
     start = initial_soc(load, cell) if soc is None else soc
     full_v = ocv_grid(cell)[0][-1]
     cold = abs(float(temperature[0]) - REFERENCE_C) > COLD_K
-    if soc is None and cold and abs(full_v - load.start_v) < FULL_V * cell.cell.series_count:
+    if soc is None and cold and abs(full_v - load.start_v) < FULL_TOLERANCE_V * cell.cell.series_count:
         start = 1.0
     return Run(load, start - load.discharged_ah / cell.cell.capacity_ah, temperature)
 
 
 def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
-    """Return the captures with the charge that their knees show."""
+    """Return the captures with their charge corrected so that the knees of the OCV fit."""
     for _ in range(COUNT_PASSES):
         miscounts = _Candidate(runs, cell, refine_ocv=refine_ocv).miscounts()
         runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
@@ -358,10 +367,10 @@ def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Ru
 
 def _wrong_temperature(load: CleanCapture, temperature_c: float | None) -> list[str]:
     temperature = temperature_of(load, REFERENCE_C if temperature_c is None else temperature_c)
-    if temperature.min() >= LOWEST_C and temperature.max() <= HIGHEST_C:
+    if temperature.min() >= MIN_CELL_C and temperature.max() <= MAX_CELL_C:
         return []
-    runs = f"temperature_c runs from {temperature.min():.1f} to {temperature.max():.1f}"
-    return [f"{load.name}: {runs}, but cells are between {LOWEST_C:g} and {HIGHEST_C:g} C"]
+    measured = f"temperature_c runs from {temperature.min():.1f} to {temperature.max():.1f}"
+    return [f"{load.name}: {measured}, but cells are between {MIN_CELL_C:g} and {MAX_CELL_C:g} C"]
 
 
 def _temperature_range(runs: list[Run]) -> tuple[float, float]:
@@ -375,30 +384,30 @@ def _at_nodes(ladder: Ladder) -> Floats:
     return np.array([[np.interp(SOC_NODES, ladder.soc, ohm) for ohm in part] for part in parts])
 
 
-def _share(ladder: Ladder) -> Floats:
-    """Weak part of each resistance, at ``SOC_NODES``."""
+def _weak_share_of(ladder: Ladder) -> Floats:
+    """Return the fraction of each resistance with the weak temperature dependence, at ``SOC_NODES``."""
     weak, strong = _at_nodes(ladder)
     return np.where(weak + strong > 0.0, weak / np.maximum(weak + strong, 1e-12), weak_share(SOC_NODES))
 
 
 def _ocv_error(cell: CellModel) -> Floats:
-    """Std of the given OCV at ``EVEN`` [V]."""
+    """Return the std of the given OCV at ``EVEN_SOC`` [V]."""
     if isinstance(cell.ocv, TableOcv) and cell.ocv.error_v is not None:
-        return np.interp(EVEN, cell.ocv.soc, cell.ocv.error_v)
-    slope_v = np.interp(EVEN, np.linspace(0.0, 1.0, ocv_grid(cell)[1].size), ocv_grid(cell)[1])
+        return np.interp(EVEN_SOC, cell.ocv.soc, cell.ocv.error_v)
+    slope_v = np.interp(EVEN_SOC, np.linspace(0.0, 1.0, ocv_grid(cell)[1].size), ocv_grid(cell)[1])
     return np.hypot(CURVE_ERROR_V * cell.cell.series_count, CURVE_ERROR_SOC * slope_v)
 
 
-def _middle_error(cell: CellModel) -> Floats:
-    """Return the error of the curve alone at ``EVEN`` [V], without the minimum error of the hysteresis.
+def _curve_error(cell: CellModel) -> Floats:
+    """Return the std of the OCV curve at ``EVEN_SOC`` [V], without the error of the hysteresis.
 
-    Drives are discharges: they would attribute an error of the hysteresis to the curve, and charges would see it with
-    the opposite sign.
+    Captures of drives are discharges. With the error of the hysteresis in the prior, the fit would attribute that error
+    to the curve, where it has the wrong sign in charges.
     """
     error_v = _ocv_error(cell)
     if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:
         return error_v
-    hysteresis_v = REST_SHARE_STD * np.interp(EVEN, cell.ocv.soc, cell.ocv.hysteresis_v)
+    hysteresis_v = REST_SHARE_STD * np.interp(EVEN_SOC, cell.ocv.soc, cell.ocv.hysteresis_v)
     return np.sqrt(np.maximum(error_v**2 - hysteresis_v**2, (PAIR_V * cell.cell.series_count) ** 2))
 
 
@@ -407,7 +416,7 @@ def _per_kelvin(cell: CellModel) -> tuple[float, ...] | None:
 
 
 def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOcv:
-    """Return the corrected OCV as an increasing table. Hysteresis and error columns stay as in the cell."""
+    """Return the corrected OCV as an increasing table with the hysteresis and error columns of the cell."""
     given = cell.ocv if isinstance(cell.ocv, TableOcv) else None
     soc = np.linspace(0.0, 1.0, round(1.0 / OCV_STEP) + 1)
     grid_v = ocv_grid(cell)[0]
@@ -422,29 +431,29 @@ def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOc
         form="table",
         soc=_tuple(soc),
         ocv_v=_tuple(np.maximum.accumulate(corrected_v - slope) + slope),
-        error_v=_tuple(np.interp(soc, EVEN, _ocv_error(cell))),
+        error_v=_tuple(np.interp(soc, EVEN_SOC, _ocv_error(cell))),
         hysteresis_v=None if hysteresis_v is None or given is None else _tuple(np.interp(soc, given.soc, hysteresis_v)),
         per_kelvin_v=None if per_kelvin_v is None else _tuple(per_kelvin_v),
     )
 
 
 def _rms(cell: CellModel, run: Run) -> float:
-    """Return the RMS error of the cell's voltage on a capture at 25 C, weighted by time [V]."""
+    """Return the RMS error of the cell's voltage on a capture, weighted by time and scaled to 25 C [V]."""
     grid_v = ocv_grid(cell)[0]
     e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
-    error_v = run.load.voltage_v - e_o + overpotential(cell, run.warm_load, run.soc)
+    error_v = run.load.voltage_v - e_o + overpotential(cell, run.load_with_temperature, run.soc)
     weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, 60.0)
-    weight *= (run.soc > JUDGED_SOC) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
+    weight *= (run.soc > MIN_RMS_SOC) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
     return float(np.sqrt((weight * error_v**2).sum() / max(weight.sum(), 1e-12)))
 
 
-def _mean(scores: Floats) -> float:
-    """Geometric: a capture that every cell file does badly in does not decide alone."""
+def _geometric_mean(scores: Floats) -> float:
+    """Return the geometric mean, so that a capture with a high score for every cell file does not dominate."""
     known = scores[np.isfinite(scores)]
     return float(np.exp(np.log(known).mean())) if known.size else float("nan")
 
 
-def _worse(outcome: Identification) -> str:
+def _worse_replays(outcome: Identification) -> str:
     lines = [
         f"{c.name}: {c.score_before:.2f} before, {c.score_after:.2f} after"
         for c in outcome.captures
@@ -453,7 +462,7 @@ def _worse(outcome: Identification) -> str:
     return (
         "nothing is written: replays cut in mid-load get worse, their interval score (smaller is better) goes from "
         f"{outcome.score_before:.2f} to {outcome.score_after:.2f} % of SOC; keep the cell file, or give captures with "
-        f"more of its loads\n" + "\n".join(lines)
+        f"more typical loads\n" + "\n".join(lines)
     )
 
 

@@ -1,6 +1,6 @@
-"""Initial elements of a cell from the rests of a relaxation test: one value each for all SOC.
+"""Initial elements of a cell from the rests of a relaxation test: one value of each element for all SOC.
 
-A fit of a whole capture starts from these. At the end of a load the voltage steps by i R_s and then rises in two
+A fit of a whole capture starts from these values. At the end of a load the voltage steps by i R_s and then rises in two
 exponentials, which give the two RC pairs: (2.2), (2.3) with i = 0.
 """
 
@@ -15,16 +15,18 @@ from bms_estimator.model.cell import Capacitance, Resistance
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-FAST = np.geomspace(0.003, 0.05, 12)
-SLOW = np.geomspace(0.08, 0.7, 10)
-"""Time constants tried for the short and the long branch, in rests."""
+SHORT_TAUS = np.geomspace(0.003, 0.05, 12)
+"""Candidate time constants of the short RC pair, as fractions of the rest's duration."""
+LONG_TAUS = np.geomspace(0.08, 0.7, 10)
+"""Candidate time constants of the long RC pair, as fractions of the rest's duration."""
 NEGLIGIBLE = 1e-6
-"""Part of an element that depends on SOC: none, but a cell file wants it above 0."""
-LOWEST_SOC = 0.1
-"""Rests below are left out: the elements rise there."""
+"""Relative amplitude of the SOC dependence of an element. A cell file requires an amplitude above 0."""
+MIN_SOC = 0.1
+"""Minimum SOC of a rest that is used. The elements rise steeply below."""
 MAX_SAMPLES = 1000
-"""Maximum number of samples of a rest; longer ones are thinned."""
+"""Maximum number of samples of a rest. Longer rests are thinned."""
 MIN_OHM = 1e-5
+"""Lower limit of a resistance [ohm]. A cell file requires values above 0."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +34,11 @@ class InitialElements:
     """Elements that do not depend on SOC.
 
     Attributes:
-        r_s_ohm: Series resistance, all that is faster than the capture's sampling [ohm].
-        r_ts_ohm: Resistance of the short branch [ohm].
-        tau_ts_s: Time constant [s].
-        r_tl_ohm: Resistance of the long branch [ohm].
-        tau_tl_s: Time constant [s].
+        r_s_ohm: Series resistance, with all dynamics faster than the capture's sampling [ohm].
+        r_ts_ohm: Resistance of the short RC pair [ohm].
+        tau_ts_s: Time constant of the short RC pair [s].
+        r_tl_ohm: Resistance of the long RC pair [ohm].
+        tau_tl_s: Time constant of the long RC pair [s].
     """
 
     r_s_ohm: float
@@ -58,12 +60,12 @@ class InitialElements:
 
 
 def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: float) -> InitialElements:
-    """Return the medians over the rests of one test.
+    """Return the median of each element over the rests of one test.
 
     Args:
-        samples: What ``test`` was made of, dtype ``SAMPLE``, raw.
+        samples: Raw samples of ``test``, dtype ``SAMPLE``.
         test: Relaxation test with its rests.
-        capacity_ah: As ``test`` was counted with [Ah].
+        capacity_ah: Capacity that the SOC of ``test`` was counted against [Ah].
 
     Raises:
         UserError: No rest follows a load.
@@ -77,21 +79,21 @@ def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: fl
         first = int(np.searchsorted(good["time_s"], rest.start_s))
         last = int(np.searchsorted(good["time_s"], rest.start_s + rest.duration_s, side="right"))
         current_a = float(good["current_a"][first - 1]) if first else 0.0
-        if drawn_as > 0.0 and current_a > 0.0 and rest.soc > LOWEST_SOC:
+        if drawn_as > 0.0 and current_a > 0.0 and rest.soc > MIN_SOC:
             found.append(_of_rest(good[first:last], float(good["voltage_v"][first - 1]), current_a, drawn_as))
     if not found:
-        raise UserError(f"{test.name}: none of its {len(test.rests)} rests follows a discharge above SOC {LOWEST_SOC}")
+        raise UserError(f"{test.name}: none of its {len(test.rests)} rests follows a discharge above SOC {MIN_SOC}")
     return InitialElements(*(float(x) for x in np.median(np.array(found), axis=0)))
 
 
 def _of_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: float) -> tuple[float, ...]:
-    """R_s, R_ts, tau_ts, R_tl, tau_tl from one rest after a load of ``current_a``."""
+    """Fit R_s, R_ts, tau_ts, R_tl and tau_tl to one rest after a load of ``current_a``."""
     rest = rest[:: -(-rest.size // MAX_SAMPLES)]
     time_s = rest["time_s"] - rest["time_s"][0]
     duration_s = float(time_s[-1])
     fits = []
-    for fast in FAST * duration_s:
-        for slow in SLOW * duration_s:
+    for fast in SHORT_TAUS * duration_s:
+        for slow in LONG_TAUS * duration_s:
             basis = np.column_stack([np.ones_like(time_s), -np.exp(-time_s / fast), -np.exp(-time_s / slow)])
             sizes, norm = nnls(basis, rest["voltage_v"])
             fits.append((float(norm), fast, slow, sizes))
@@ -107,7 +109,7 @@ def _of_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: flo
 
 
 def _loaded_ohm(size_v: float, current_a: float, load_s: float, tau_s: float) -> float:
-    """Resistance of a branch that a load of ``load_s`` has charged to ``size_v``, (2.2) solved for it [ohm]."""
+    """Return the resistance of an RC pair that a load of ``load_s`` charged to ``size_v`` [ohm]; (2.2) solved for R."""
     return max(size_v / (current_a * -float(np.expm1(-load_s / tau_s))), MIN_OHM)
 
 

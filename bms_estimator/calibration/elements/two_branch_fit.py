@@ -1,4 +1,4 @@
-"""a1..a15 of the two branches that a ladder amounts to at 25 C, (2.5)-(2.9)."""
+"""a1..a15 of two RC pairs that are equivalent to an RC ladder at 25 C, (2.5)-(2.9)."""
 
 import numpy as np
 from scipy.optimize import nnls
@@ -10,45 +10,45 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Capacitance, Ladder, Resistance
 
 SOC = np.linspace(0.02, 1.0, 50)
-"""SOC at which the curves should match those of the RC network."""
+"""SOC grid on which the curves are fitted to those of the ladder."""
 EXPONENTS = np.geomspace(1.0, 60.0, 60)
+"""Candidate exponents b of A e^(-b SOC) + c."""
 NEGLIGIBLE = 1e-4
-"""Fraction of the offset that replaces a zero amplitude, which the function needs."""
-FARTHEST_DELTA = 0.01
-"""Capacitances are positive down to this SOC, (2.11), (2.12)."""
+"""Relative amplitude that replaces a fitted amplitude of 0. A cell file requires an amplitude above 0."""
+MAX_DELTA = 0.01
+"""Maximum delta1 and delta2: capacitances are positive down to this SOC, (2.11), (2.12)."""
 SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT), "r_tl": (1 + SHORT, RESISTANCES)}
-"""Section of the cell file -> which resistances of the ladder it sums up."""
+"""Section of the cell file -> first and end index of the ladder's resistances whose sum it holds."""
 
 
 def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
-    """Return the five sections of a cell file."""
+    """Return the five sections of a cell file that hold a1..a15."""
     total = (
         linear_interpolation_matrix(SOC, np.array(ladder.soc))
         @ (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).T
     )
-    made: dict[str, Resistance | Capacitance] = {}
+    sections: dict[str, Resistance | Capacitance] = {}
     for name, (first, end) in SECTIONS.items():
         ohm = np.maximum(total[:, first:end].sum(axis=1), 1e-4 * total.sum(axis=1))
         amplitude, exponent, offset = _exponential(ohm, 1.0)
-        made[name] = Resistance(amplitude_ohm=amplitude, exponent=exponent, offset_ohm=offset)
+        sections[name] = Resistance(amplitude_ohm=amplitude, exponent=exponent, offset_ohm=offset)
         if name != "r_s":
-            share = np.maximum(
-                total[:, first:end], 1e-6 * total.sum(axis=1, keepdims=True)
-            )  # none reported: assume equal ones
+            # a lower limit of each resistance: equal shares where all are 0
+            share = np.maximum(total[:, first:end], 1e-6 * total.sum(axis=1, keepdims=True))
             share /= share.sum(axis=1, keepdims=True)
             farad = np.exp(share @ LN_TAUS[first - 1 : end - 1]) / ohm
             amplitude, exponent, offset = _exponential(farad, -1.0)
-            made["c" + name[1:]] = Capacitance(amplitude_farad=amplitude, exponent=exponent, offset_farad=offset)
-    return made
+            sections["c" + name[1:]] = Capacitance(amplitude_farad=amplitude, exponent=exponent, offset_farad=offset)
+    return sections
 
 
 def _exponential(values: Floats, sign: float) -> tuple[float, float, float]:
-    """Amplitude, exponent and offset of sign A e^(-b SOC) + c nearest to ``values``, relative, all positive."""
+    """Fit ``sign`` A e^(-b SOC) + c to ``values`` by relative least squares; return A, b and c, all positive."""
     best = (np.inf, NEGLIGIBLE * float(np.median(values)), 10.0, float(np.median(values)))
     for exponent in EXPONENTS:
         curve = np.column_stack([sign * np.exp(-exponent * SOC), np.ones(SOC.size)]) / values[:, None]
-        (amplitude, offset), left = nnls(curve, np.ones(SOC.size))
-        positive = sign > 0.0 or amplitude * np.exp(-exponent * FARTHEST_DELTA) < offset
-        if left < best[0] and offset > 0.0 and positive:
-            best = (float(left), max(float(amplitude), NEGLIGIBLE * float(offset)), float(exponent), float(offset))
+        (amplitude, offset), residual = nnls(curve, np.ones(SOC.size))
+        positive = sign > 0.0 or amplitude * np.exp(-exponent * MAX_DELTA) < offset
+        if residual < best[0] and offset > 0.0 and positive:
+            best = (float(residual), max(float(amplitude), NEGLIGIBLE * float(offset)), float(exponent), float(offset))
     return best[1:]

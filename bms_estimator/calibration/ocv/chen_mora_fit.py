@@ -1,7 +1,7 @@
-"""Open-circuit voltage from points of relaxation tests in the form (2.10).
+"""Fit of the open-circuit voltage (2.10) to points of relaxation tests.
 
-``Points`` of one or more tests are fitted jointly. (5.1)-(5.2) average the parameters of single fits instead, which
-is offered for comparison: parameters that lean on each other do not average well.
+``Points`` of one or more tests are fitted jointly. For comparison, ``average`` averages the parameters of single fits as
+(5.1)-(5.2) do. The mean of strongly correlated parameters is a poor fit.
 """
 
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ from bms_estimator.model.cell import ChenMoraOcv
 
 NAMES = ("a16", "a17", "a18", "a19", "a20", "a21")
 LOWER = np.array([1e-6, 5.0, 1e-6, -np.inf, -np.inf, -np.inf])
-"""Least a16..a21. The thesis has all positive; the cubic of a real cell may want another sign of a19..a21, so those are
-free: the NCR18650 points fit to 9.6 mV RMS, with all positive to 10.6. Below an exponent of 5 the exponential covers
-all SOC and cannot be distinguished from the cubic."""
+"""Lower bounds of a16..a21. In the thesis all are positive. a19..a21 are unbounded here, because the cubic of a real cell
+may have negative coefficients: the NCR18650 points fit to 9.6 mV RMS, and to 10.6 mV with positive coefficients. Below an
+exponent of 5 the exponential covers all SOC and cannot be distinguished from the cubic."""
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
-"""Above an exponent of 300 the exponential is gone at SOC 0.01. a16 is bounded by the highest point: E_o(0) is not
-far below 0 V, even if the last points are steep."""
+"""Upper bounds of a16..a21. At an exponent of 300 the exponential has decayed by SOC 0.01. ``fit_chen_mora`` bounds a16 by
+the highest point, so that E_o(0) is not far below 0 V even if the last points are steep."""
 AT_BOUND_V = 1e-5
-"""An amplitude this near to its bound is at it: no converter reads so little [V]."""
+"""Distance from its bound below which an amplitude counts as at the bound: less than the resolution of converters [V]."""
 EXPONENTS = np.geomspace(5.0, 300.0, 60)
-"""Exponents a17 the search starts from."""
+"""Candidate exponents a17 from which the search starts."""
 
 
 @dataclass(frozen=True)
 class ChenMoraFit:
-    """a16..a21 of (2.10) by least squares.
+    """Result of a least-squares fit of (2.10).
 
     Attributes:
         a: Shape (6,), a16..a21.
@@ -42,7 +42,7 @@ class ChenMoraFit:
     residual_v: Floats
 
     def __call__(self, soc: Floats) -> Floats:
-        """E_o(SOC) [V]."""
+        """Return E_o(SOC) [V]."""
         return chen_mora(self.a, soc)
 
     @property
@@ -53,17 +53,17 @@ class ChenMoraFit:
 
 
 def chen_mora(a: Floats, soc: Floats) -> Floats:
-    """E_o(SOC) [V] for a = a16..a21, (2.10)."""
+    """Return E_o(SOC) [V] for a = a16..a21, (2.10)."""
     a16, a17, a18, a19, a20, a21 = a
     curve = -a16 * np.exp(-a17 * soc) + a18 + a19 * soc - a20 * soc**2 + a21 * soc**3  # (2.10)
     return np.asarray(curve, dtype=np.float64)
 
 
 def fit_chen_mora(points: Points) -> ChenMoraFit:
-    """Fit (2.10) to points: a16..a21 within their bounds, each point with the same weight.
+    """Fit (2.10) to equally weighted points, with a16..a21 within their bounds.
 
-    For a given exponent a17 the others are bounded linear least squares; the best of a grid of exponents starts
-    the fit of all six.
+    For a given exponent a17 the fit is a bounded linear least squares. The best exponent of a grid starts the nonlinear
+    fit of all six parameters.
 
     Raises:
         UserError: Too few points, or points that span too little SOC.
@@ -83,7 +83,7 @@ def fit_chen_mora(points: Points) -> ChenMoraFit:
 
 
 def _with_exponent(points: Points, exponent: float, upper: Floats) -> tuple[float, Floats]:
-    """Squared residual and a16..a21 with a17 given."""
+    """Fit (2.10) with a given a17; return the squared residual and a16..a21."""
     x = points.soc
     basis = np.column_stack([-np.exp(-exponent * x), np.ones_like(x), x, -(x**2), x**3])
     free = [0, 2, 3, 4, 5]
@@ -108,5 +108,5 @@ def _standard_errors(a: Floats, upper: Floats, soc: Floats, residual_v: Floats) 
 
 
 def average(fits: list[ChenMoraFit]) -> Floats:
-    """a16..a21 as the mean of single fits, (5.1)-(5.2). Shape (6,)."""
+    """Return a16..a21 as the mean of single fits, (5.1)-(5.2). Shape (6,)."""
     return np.asarray(np.mean([fit.a for fit in fits], axis=0), dtype=np.float64)  # (5.1), (5.2)

@@ -1,4 +1,4 @@
-"""The overpotential of a cell under a measured current, with parameters frozen: by its ladder, else by (2.2)-(2.9)."""
+"""Overpotential of a cell under a measured current, by its RC ladder or by (2.2)-(2.9), with frozen parameters."""
 
 import numpy as np
 
@@ -10,22 +10,23 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 
 KELVIN = 273.15
+"""0 C [K]."""
 
 
 def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:
-    """``kernels.cell_model.rc_ladder.arrhenius`` of many temperatures."""
+    """Return ``kernels.cell_model.rc_ladder.arrhenius`` for an array of temperatures."""
     return np.asarray(
         np.exp(energy_j / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / (REFERENCE_C + KELVIN))), dtype=np.float64
     )
 
 
 def linear_interpolation_matrix(soc: Floats, nodes: Floats) -> Floats:
-    """Linear interpolation between ``nodes`` as columns, constant beyond the ends. Shape (n, nodes)."""
+    """Return the weights of ``nodes`` in a linear interpolation that is constant beyond the ends. Shape (n, nodes)."""
     return np.column_stack([np.interp(soc, nodes, row) for row in np.eye(nodes.size)])
 
 
 def temperature_of(load: CleanCapture, otherwise_c: float = REFERENCE_C) -> Floats:
-    """Temperature at each sample, ``otherwise_c`` where there was no sensor [C]."""
+    """Return the temperature at each sample, ``otherwise_c`` without a sensor [C]."""
     return np.where(np.isfinite(load.temperature_c), load.temperature_c, otherwise_c)
 
 
@@ -33,8 +34,8 @@ def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
     """Return the drop of the voltage below E_o(SOC) at 25 C, with dE/dT and hysteresis [V].
 
     Args:
-        cell: Supplies its ladder, or otherwise a1..a15, which do not depend on the temperature.
-        load: Load that starts at rest.
+        cell: Cell with an RC ladder, or with a1..a15, which do not depend on the temperature.
+        load: Capture that starts at rest.
         soc: Shape (n,), counted.
     """
     temperature_c = temperature_of(load)
@@ -46,7 +47,7 @@ def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
 
 
 def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
-    """Return the change of E_o(SOC) by temperature and hysteresis [V]. The load begins after a charge."""
+    """Return the change of E_o(SOC) by temperature and hysteresis [V]. The hysteresis starts as after a charge."""
     ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(load)
     if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
         added_v += np.interp(soc, ocv.soc, ocv.per_kelvin_v) * (temperature_c - REFERENCE_C)
@@ -64,7 +65,7 @@ def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Fl
         current_a: Positive on discharge [A].
         soc: Shape (n,).
         temperature_c: Shape (n,) [C].
-        first: 0 is the ohmic one.
+        first: Index of the first resistance; 0 is the ohmic one.
     """
     weak_ohm, strong_ohm = (
         linear_interpolation_matrix(soc, np.array(ladder.soc)) @ np.array(part[first:]).sum(axis=0)
@@ -75,9 +76,9 @@ def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Fl
 
 
 def ladder_overpotential(ladder: Ladder, load: CleanCapture, soc: Floats, temperature_c: Floats) -> Floats:
-    """Overpotential of the ladder with its ohmic drop [V]."""
+    """Return the overpotential of the ladder, with its ohmic drop [V]."""
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
-    places = linear_interpolation_matrix(soc, np.array(ladder.soc))
-    weak_v = ((places @ np.array(ladder.weak_ohm).T) * currents).sum(axis=1)
-    strong_v = ((places @ np.array(ladder.strong_ohm).T) * currents).sum(axis=1)
+    node_weights = linear_interpolation_matrix(soc, np.array(ladder.soc))
+    weak_v = ((node_weights @ np.array(ladder.weak_ohm).T) * currents).sum(axis=1)
+    strong_v = ((node_weights @ np.array(ladder.strong_ohm).T) * currents).sum(axis=1)
     return np.asarray(arrhenius(WEAK_J, temperature_c) * weak_v + arrhenius(STRONG_J, temperature_c) * strong_v)

@@ -1,4 +1,4 @@
-"""Points of the open-circuit voltage, of one source or of several together."""
+"""Points of the open-circuit voltage from one or more sources."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -12,19 +12,19 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 
 RELAXED_V = 0.002
-"""Systematic error of rests of a warm cell [V]: relaxation continues for hours after the extrapolated quarter of an
-hour."""
+"""Systematic error of rests of a warm cell [V]. Relaxation continues for hours beyond the extrapolation of a rest of a
+quarter of an hour."""
 COLD_V, DOUBLING_K = 0.012, 25.0
-"""Additional error in the cold [V]: 12 mV at 0 C, 20 mV at -10 C, of rests up to an hour; relaxation takes twice as
-long for each ``DOUBLING_K``."""
-COLD_OWN = 0.3
-"""Part of it that is not alike in all sources."""
+"""Additional error of rests of up to an hour at 0 C [V], and the temperature decrease that doubles the relaxation time [K].
+The error at -10 C is 20 mV."""
+COLD_SOURCE_FRACTION = 0.3
+"""Fraction of the cold error that is independent between sources."""
 LONG_REST_S = 3600.0
-"""Length of rest beyond which its cold error decreases with the length [s]."""
+"""Duration of a rest beyond which the cold error decreases in inverse proportion [s]."""
 AFTER_CHARGE_V = 0.005
-"""Standard deviation that hysteresis gives a rest after charge when its size is not known, per cell in series [V]."""
+"""Std of the OCV of a rest after charge due to a hysteresis of unknown size, per cell in series [V]."""
 MIN_SPAN = 0.3
-"""SOC that the points must span at least."""
+"""Minimum SOC range of the points."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ class Points:
     Attributes:
         soc: Shape (n,), increasing, 0..1.
         ocv_v: Shape (n,) [V].
-        std_v: Shape (n,), standard deviation of ``ocv_v`` that is each point's own [V].
-        common_v: Shape (n,), standard deviation of what the point's source is off as a whole [V].
-        cold_v: Shape (n,), standard deviation of what cold leaves unrelaxed in all sources alike [V].
-        temperature_c: Shape (n,) [C]; NaN where it is not known.
-        way: Shape (n,), the hysteresis h that it was measured at: -1 after a discharge, 1 after a charge, 0 between.
-        source: Shape (n,), which source each is of, from 0.
-        empty_v: Voltage at SOC 0 if known [V]; NaN when it is not.
-        full_v: Voltage at SOC 1 if known [V]; NaN when it is not.
+        std_v: Shape (n,), standard deviation of ``ocv_v``, independent between points [V].
+        common_v: Shape (n,), standard deviation of the systematic error of the point's source [V].
+        cold_v: Shape (n,), standard deviation of the incomplete relaxation in the cold, common to all sources [V].
+        temperature_c: Shape (n,), temperature [C]; NaN if unknown.
+        direction: Shape (n,), hysteresis state h: -1 after a discharge, 1 after a charge, 0 for their mean.
+        source: Shape (n,), index of the point's source, from 0.
+        empty_v: Voltage at SOC 0 [V]; NaN if unknown.
+        full_v: Voltage at SOC 1 [V]; NaN if unknown.
     """
 
     soc: Floats
@@ -50,21 +50,21 @@ class Points:
     common_v: Floats = field(default_factory=lambda: np.zeros(0))
     cold_v: Floats = field(default_factory=lambda: np.zeros(0))
     temperature_c: Floats = field(default_factory=lambda: np.zeros(0))
-    way: Floats = field(default_factory=lambda: np.zeros(0))
+    direction: Floats = field(default_factory=lambda: np.zeros(0))
     source: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     empty_v: float = float("nan")
     full_v: float = float("nan")
 
     def __post_init__(self) -> None:
-        """Fill in defaults: no common error, no temperature, no hysteresis, one source."""
+        """Fill in defaults: no common error, unknown temperature, no hysteresis, one source."""
         if self.common_v.size == 0:
             object.__setattr__(self, "common_v", np.zeros(self.soc.size))
         if self.cold_v.size == 0:
             object.__setattr__(self, "cold_v", np.zeros(self.soc.size))
         if self.temperature_c.size == 0:
             object.__setattr__(self, "temperature_c", np.full(self.soc.size, np.nan))
-        if self.way.size == 0:
-            object.__setattr__(self, "way", np.zeros(self.soc.size))
+        if self.direction.size == 0:
+            object.__setattr__(self, "direction", np.zeros(self.soc.size))
         if self.source.size == 0:
             object.__setattr__(self, "source", np.zeros(self.soc.size, dtype=np.int64))
 
@@ -73,7 +73,7 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
     """Return the rests of one test as points.
 
     Args:
-        test: What ``relaxation_test`` found.
+        test: Result of ``relaxation_test``.
         series_count: Cells in series, for values per cell.
     """
     rests = test.rests
@@ -86,23 +86,23 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
         soc=test.soc[order],
         ocv_v=test.ocv_v[order],
         std_v=np.hypot(test.std_v, AFTER_CHARGE_V * series_count * after_charge)[order],
-        common_v=(series_count * (RELAXED_V + COLD_OWN * cold_v))[order],
+        common_v=(series_count * (RELAXED_V + COLD_SOURCE_FRACTION * cold_v))[order],
         cold_v=(series_count * cold_v)[order],
         temperature_c=temperature_c[order],
-        way=-1.0 * ~after_charge[order],  # a charge in between is too short to turn it
+        direction=-1.0 * ~after_charge[order],  # a charge between two discharges is too short to reverse the hysteresis
         empty_v=test.empty_v,
         full_v=test.full_v,
     )
 
 
 def coldness(temperature_c: Floats) -> Floats:
-    """Return how much slower a cell relaxes than at 25 C: 0 there, 1 at 0 C; 0 for an unknown temperature."""
+    """Return the relaxation time relative to that at 25 C, less 1: 1 at 0 C, 0 for an unknown temperature."""
     colder = np.maximum(REFERENCE_C - np.nan_to_num(temperature_c, nan=REFERENCE_C), 0.0)
     return np.asarray(2.0 ** (colder / DOUBLING_K) - 1.0, dtype=np.float64)
 
 
 def joined(sources: Sequence[Points]) -> Points:
-    """Join several sources to one set, in the order of SOC, numbered by source."""
+    """Return the points of several sources in the order of SOC, with the index of each point's source."""
     soc = np.concatenate([one.soc for one in sources])
     order = np.argsort(soc, kind="stable")
 
@@ -116,7 +116,7 @@ def joined(sources: Sequence[Points]) -> Points:
         common_v=column("common_v"),
         cold_v=column("cold_v"),
         temperature_c=column("temperature_c"),
-        way=column("way"),
+        direction=column("direction"),
         source=np.repeat(np.arange(len(sources)), [one.soc.size for one in sources])[order],
         empty_v=_mean([one.empty_v for one in sources]),
         full_v=_mean([one.full_v for one in sources]),
@@ -124,12 +124,12 @@ def joined(sources: Sequence[Points]) -> Points:
 
 
 def pooled(tests: Sequence[RelaxationTest]) -> Points:
-    """Merge the points of several tests into one set, ordered by SOC."""
+    """Return the points of several tests in the order of SOC."""
     return joined([points_of(test) for test in tests])
 
 
 def with_ends(points: Points, empty_std_v: float, full_std_v: float) -> Points:
-    """``empty_v`` and ``full_v`` as points, where they are known and lie outside the others."""
+    """Append ``empty_v`` and ``full_v`` as points if they are finite and lie outside the other points."""
     ends = [(0.0, points.empty_v, empty_std_v), (1.0, points.full_v, full_std_v)]
     known = [end for end in ends if np.isfinite(end[1]) and not points.soc[0] <= end[0] <= points.soc[-1]]
     for soc, ocv_v, std_v in known:
@@ -143,17 +143,17 @@ def with_ends(points: Points, empty_std_v: float, full_std_v: float) -> Points:
             common_v=np.insert(points.common_v, at, points.common_v[nearest]),
             cold_v=np.insert(points.cold_v, at, points.cold_v[nearest]),
             temperature_c=np.insert(points.temperature_c, at, points.temperature_c[nearest]),
-            way=np.insert(points.way, at, points.way[nearest]),
+            direction=np.insert(points.direction, at, points.direction[nearest]),
             source=np.insert(points.source, at, points.source[nearest]),
         )
     return points
 
 
 def check_points(points: Points) -> None:
-    """Enough points over enough SOC.
+    """Check the number of points and their SOC range.
 
     Raises:
-        UserError: There are not.
+        UserError: Too few points, or too small a range.
     """
     if points.soc.size < MIN_POINTS:
         raise UserError(
@@ -169,12 +169,12 @@ def check_points(points: Points) -> None:
 
 
 def rms_v(residual_v: Floats) -> float:
-    """Root mean square [V]."""
+    """Return the root mean square [V]."""
     return float(np.sqrt(np.mean(residual_v**2)))
 
 
 def max_v(residual_v: Floats) -> float:
-    """Largest magnitude [V]."""
+    """Return the largest magnitude [V]."""
     return float(np.abs(residual_v).max())
 
 

@@ -1,8 +1,8 @@
-"""Voltage relaxation test (5.2.1): from a capture of loads and rests to points of the open-circuit voltage.
+"""Voltage relaxation test (5.2.1): points of the open-circuit voltage from a capture of loads and rests.
 
-A cell discharged in steps with a rest after each shows its open-circuit voltage at the end of every rest, as far as it
-has relaxed by then. The remaining relaxation is extrapolated with an exponential; how far that can be trusted is part
-of the point.
+A cell is discharged in steps with a rest after each. At the end of a rest its voltage is near the open-circuit voltage.
+The remaining relaxation is extrapolated with an exponential, and the standard deviation of the point contains the error
+of the extrapolation.
 """
 
 from dataclasses import dataclass
@@ -23,27 +23,29 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 MIN_REST_S = 30.0
-"""A shorter rest shows the ohmic step and not the relaxation [s]."""
-LARGEST_STD_V = 0.02
-"""A rest whose extrapolation is less certain than this, per cell in series, is rejected [V]."""
-LATE_FROM = 0.5
-"""The extrapolation fits this latter part of a rest: the fast branch is over there."""
+"""Minimum duration of a rest [s]. A shorter rest shows only the ohmic step."""
+MAX_STD_V = 0.02
+"""Maximum standard deviation of an extrapolated voltage, per cell in series [V]."""
+FIT_FROM = 0.5
+"""Fraction of a rest's duration from which on the exponential is fitted, because the fast RC pair has decayed by then."""
 MIN_TAU, MAX_TAU, TAU_GRID = 0.05, 0.7, 40
-"""Time constants tried, in multiples of the rest. A slower one cannot be distinguished from a drift and extrapolates
-wildly."""
-FORM_ERROR = 0.6
-"""Part of the extrapolated voltage that is its standard deviation: relaxation is no pure exponential. Half-hour rests of
-a NCR18650 cut to a quarter of an hour miss their end by 2.4 mV RMS so extrapolated, and by 4.7 mV when not."""
+"""Range of candidate time constants, as fractions of the rest's duration, and their number. A slower exponential cannot be
+distinguished from a drift, so that its extrapolation diverges."""
+EXTRAPOLATION_ERROR = 0.6
+"""Std of the extrapolated change, as a fraction of the change, because relaxation is no pure exponential. Half-hour rests
+of a NCR18650, cut to a quarter of an hour, miss their end voltage by 2.4 mV RMS with extrapolation and by 4.7 mV without."""
 MIN_NOISE_V = 1e-4
-"""No voltage is read more exactly [V]."""
-SLOWEST_S = 600.0
-"""Time constant of a slow branch [s]; a rest shorter than this takes it for a faster one, and is judged by both."""
-SLOW_PART = 0.4
-"""Part of the difference between the two that is the standard deviation of such a rest."""
+"""Minimum noise of a voltage [V]."""
+SLOW_TAU_S = 600.0
+"""Time constant of a slow RC pair [s]. A shorter rest cannot distinguish it from a faster one, so that the std of its
+extrapolation contains the difference between both."""
+SLOW_TAU_FRACTION = 0.4
+"""Std of the extrapolation of a rest shorter than ``SLOW_TAU_S``, as a fraction of the difference between the fitted and
+the slow extrapolation."""
 MIN_STD_V = 5e-4
-"""No point is better known: half a step of the usual converter, and temperature [V]."""
+"""Minimum std of a point: half a step of a usual converter, and effects of temperature [V]."""
 NEAR_FULL, NEAR_EMPTY = 0.995, 0.02
-"""SOC from which a first sample counts as full, below which a last one counts as empty."""
+"""SOC above which the first sample counts as full, and SOC below which the last sample counts as empty."""
 MIN_POINTS = 6
 """Minimum number of points: the number of parameters of (2.10)."""
 
@@ -53,14 +55,14 @@ class Rest:
     """A rest of a relaxation test.
 
     Attributes:
-        start_s: Time of its first sample on the capture's clock [s].
+        start_s: Time of the first sample, on the capture's clock [s].
         duration_s: Duration [s].
         soc: State of charge 0..1 by coulomb counting.
-        voltage_v: Voltage at its end [V].
+        voltage_v: Voltage at the end of the rest [V].
         ocv_v: Voltage after an infinite rest, by exponential extrapolation [V].
         std_v: Standard deviation of ``ocv_v`` [V].
-        temperature_c: Mean over the rest [C]; NaN without a sensor.
-        after_charge: The cell was charged last.
+        temperature_c: Mean temperature [C]; NaN without a sensor.
+        after_charge: True if the last load before the rest was a charge.
     """
 
     start_s: float
@@ -74,7 +76,7 @@ class Rest:
 
     @property
     def remaining_v(self) -> float:
-        """Voltage left to relax at the end of the rest [V]."""
+        """Extrapolated change of the voltage after the end of the rest [V]."""
         return self.ocv_v - self.voltage_v
 
 
@@ -84,14 +86,14 @@ class RelaxationTest:
 
     Attributes:
         name: Name of the capture.
-        rests: In the order of time, those good for a point only.
-        rejected: Why other rests gave no point, one line each.
-        glitches: Samples dropped as faults of the instrument.
+        rests: Usable rests in the order of time.
+        rejected: Reasons why other rests gave no point, one line each.
+        glitches: Number of samples dropped as faults of the instrument.
         start_soc: SOC at the first sample.
         end_soc: SOC at the last sample.
-        empty_v: Open-circuit voltage at SOC 0 [V]: where the last load ended, plus what the load before it hid from the
-            rest after it. NaN when the capture ends above SOC 0.02.
-        full_v: Open-circuit voltage at SOC 1 [V]: the first sample's, when it is at rest and full; else NaN.
+        empty_v: Open-circuit voltage at SOC 0 [V]: the last loaded voltage plus the overpotential at the end of the
+            previous load. NaN when the capture ends above SOC 0.02.
+        full_v: Open-circuit voltage at SOC 1 [V]: the voltage of a first sample at rest and full, otherwise NaN.
     """
 
     name: str
@@ -105,9 +107,9 @@ class RelaxationTest:
 
     @property
     def temperature_c(self) -> float:
-        """Mean of the rests with a temperature [C]; NaN without a sensor."""
-        told = [rest.temperature_c for rest in self.rests if np.isfinite(rest.temperature_c)]
-        return float(np.mean(told)) if told else float("nan")
+        """Mean temperature of the rests [C]; NaN without a sensor."""
+        reported_c = [rest.temperature_c for rest in self.rests if np.isfinite(rest.temperature_c)]
+        return float(np.mean(reported_c)) if reported_c else float("nan")
 
     @property
     def soc(self) -> Floats:
@@ -133,17 +135,18 @@ def relaxation_test(
     initial_soc: float = 1.0,
     series_count: int = 1,
 ) -> RelaxationTest:
-    """Points of the open-circuit voltage from a capture of loads and rests.
+    """Extract points of the open-circuit voltage from a capture of loads and rests.
 
     Args:
-        samples: Dtype ``SAMPLE``, raw: glitches are dropped here.
+        samples: Raw samples, dtype ``SAMPLE``. This function removes glitches.
         capacity_ah: Capacity that SOC is counted against [Ah].
-        name: What to call the capture in messages.
+        name: Name of the capture for messages.
         initial_soc: SOC at the first sample, 0..1.
         series_count: Cells in series, for limits that are given per cell.
 
     Raises:
-        UserError: No relaxation test: no rests, too short ones, more charge in than out, wrong sign or capacity.
+        UserError: The capture has no or only short rests, charges more than it discharges, or contradicts the sign of
+            the current or the capacity.
     """
     good = remove_glitches(samples, name)
     soc = soc_by_counting(good, capacity_ah, initial_soc)
@@ -166,7 +169,7 @@ def relaxation_test(
 def find_rests(
     good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], series_count: int
 ) -> tuple[list[Rest], list[str]]:
-    """Return the usable rests of a capture as points, and a reason for each rejected rest.
+    """Return the usable rests of a capture, and a reason for each rejected rest.
 
     Args:
         good: Dtype ``SAMPLE``, without glitches.
@@ -184,8 +187,8 @@ def find_rests(
             )
             continue
         charged = first > 0 and bool(good["current_a"][first - 1] < 0.0)
-        rest = _relaxed(good[first:last], float(soc[last - 1]), after_charge=charged)
-        if rest.std_v > LARGEST_STD_V * series_count:
+        rest = _extrapolated_rest(good[first:last], float(soc[last - 1]), after_charge=charged)
+        if rest.std_v > MAX_STD_V * series_count:
             rejected.append(
                 f"rest at {rest.start_s:.0f} s: {duration_s:.0f} s is too short, its end voltage {rest.voltage_v:.4f} V "
                 f"extrapolates to {rest.ocv_v:.4f} +- {rest.std_v:.4f} V"
@@ -196,38 +199,42 @@ def find_rests(
 
 
 def _empty_v(good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], rests: list[Rest]) -> float:
-    """Open-circuit voltage at the end of a capture that ends empty and under load [V], else NaN."""
+    """Return the open-circuit voltage at the end of a capture that ends empty and under load [V], otherwise NaN."""
     if resting[-1] or abs(soc[-1]) > NEAR_EMPTY or not rests:
         return float("nan")
     first = int(np.searchsorted(good["time_s"], rests[-1].start_s))
-    hidden_v = rests[-1].ocv_v - float(good["voltage_v"][first - 1])
-    return min(float(good["voltage_v"][-1]) + hidden_v, rests[-1].ocv_v)
+    overpotential_v = rests[-1].ocv_v - float(good["voltage_v"][first - 1])
+    return min(float(good["voltage_v"][-1]) + overpotential_v, rests[-1].ocv_v)
 
 
 def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], capacity_ah: float) -> None:
-    """Sign of the current, capacity."""
+    """Check the sign of the current and the capacity.
+
+    Raises:
+        UserError: More charge goes in than out, or SOC leaves 0..1.
+    """
     change = np.where(resting[:-1], 0.0, np.diff(soc))  # noise at rest has both signs
-    given = np.maximum(-change, 0.0).sum()
-    taken = np.maximum(change, 0.0).sum()
-    if taken > given:
+    discharged = np.maximum(-change, 0.0).sum()
+    charged = np.maximum(change, 0.0).sum()
+    if charged > discharged:
         raise UserError(
-            f"{name}: current has the wrong sign or the capture charges: {given * capacity_ah:.3f} Ah out, "
-            f"{taken * capacity_ah:.3f} Ah in while the voltage went from {good['voltage_v'][0]:.3f} to "
+            f"{name}: current has the wrong sign or the capture charges: {discharged * capacity_ah:.3f} Ah out, "
+            f"{charged * capacity_ah:.3f} Ah in while the voltage went from {good['voltage_v'][0]:.3f} to "
             f"{good['voltage_v'][-1]:.3f} V; discharge must be positive (--current-sign)"
         )
     low, high = float(soc.min()), float(soc.max())
     if low < -SOC_SLACK or high > 1.0 + SOC_SLACK:
         raise UserError(
-            f"{name}: SOC runs from {soc[0]:.3f} to {low:.3f}, outside 0..1: {given * capacity_ah:.3f} Ah were drawn, "
+            f"{name}: SOC runs from {soc[0]:.3f} to {low:.3f}, outside 0..1: {discharged * capacity_ah:.3f} Ah were drawn, "
             f"more than a capacity of {capacity_ah:g} Ah holds; give the right capacity or initial SOC"
         )
 
 
 def initial_rest_v(samples: SampleBlock, name: str, capacity_ah: float) -> float:
-    """Voltage at the end of the rest that a capture starts with [V]; NaN when it starts under load.
+    """Return the voltage at the end of the rest that a capture starts with [V]; NaN when it starts under load.
 
     Raises:
-        UserError: As ``remove_glitches``.
+        UserError: No good samples, see ``remove_glitches``.
     """
     good = remove_glitches(samples, name)
     resting = resting_samples(good, capacity_ah)
@@ -235,32 +242,34 @@ def initial_rest_v(samples: SampleBlock, name: str, capacity_ah: float) -> float
     return float(good["voltage_v"][last - 1]) if first == 0 else float("nan")
 
 
-def _relaxed(rest: SampleBlock, soc: float, *, after_charge: bool) -> Rest:
-    """Extrapolate a rest to infinite time by an exponential fitted to its second half."""
+def _extrapolated_rest(rest: SampleBlock, soc: float, *, after_charge: bool) -> Rest:
+    """Extrapolate a rest to infinite time by an exponential fitted to the second half of the rest."""
     time_s = rest["time_s"] - rest["time_s"][0]
     duration_s = float(time_s[-1])
-    late = time_s >= LATE_FROM * duration_s
+    late = time_s >= FIT_FROM * duration_s
     ocv_v, spread_v = _extrapolate(time_s[late], rest["voltage_v"][late], duration_s)
     voltage_v = float(rest["voltage_v"][time_s >= 0.98 * duration_s].mean())
-    slow, _, _ = _with_tau(time_s[late], rest["voltage_v"][late], SLOWEST_S)  # what a short rest cannot rule out
-    unseen_v = SLOW_PART * (float(slow[0]) - ocv_v) if duration_s < SLOWEST_S else 0.0
+    slow, _, _ = _with_tau(time_s[late], rest["voltage_v"][late], SLOW_TAU_S)  # a short rest cannot rule it out
+    slow_std_v = SLOW_TAU_FRACTION * (float(slow[0]) - ocv_v) if duration_s < SLOW_TAU_S else 0.0
     return Rest(
         start_s=float(rest["time_s"][0]),
         duration_s=duration_s,
         soc=soc,
         voltage_v=voltage_v,
         ocv_v=ocv_v,
-        std_v=float(np.sqrt(spread_v**2 + unseen_v**2 + (FORM_ERROR * (ocv_v - voltage_v)) ** 2 + MIN_STD_V**2)),
+        std_v=float(
+            np.sqrt(spread_v**2 + slow_std_v**2 + (EXTRAPOLATION_ERROR * (ocv_v - voltage_v)) ** 2 + MIN_STD_V**2)
+        ),
         temperature_c=mean_temperature_c(rest),
         after_charge=after_charge,
     )
 
 
 def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[float, float]:
-    """Fit v = v_inf + b e^(-t/tau): v_inf and its standard deviation [V].
+    """Fit v = v_inf + b e^(-t/tau); return v_inf and its standard deviation [V].
 
-    For each tau of a grid, v_inf and b are linear least squares. The result is the mean over the taus, weighted by
-    their likelihoods: noise or few samples leave v_inf uncertain.
+    For each tau of a grid, v_inf and b are fitted by linear least squares. The result is the mean over the grid, weighted
+    by likelihood, so that the standard deviation contains the uncertainty of tau.
     """
     elapsed = time_s - time_s[0]
     taus = np.geomspace(MIN_TAU * duration_s, MAX_TAU * duration_s, TAU_GRID)
@@ -277,7 +286,7 @@ def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[
 
 
 def _with_tau(elapsed: Floats, voltage_v: Floats, tau_s: float) -> tuple[Floats, Floats, float]:
-    """Coefficients, basis and squared residual of the exponential with a given ``tau_s``."""
+    """Fit the exponential with time constant ``tau_s``; return coefficients, basis and squared residual."""
     basis = np.column_stack([np.ones_like(elapsed), np.exp(-elapsed / tau_s)])
     coefficients = np.linalg.lstsq(basis, voltage_v, rcond=None)[0]
     residual = voltage_v - basis @ coefficients
@@ -287,7 +296,11 @@ def _with_tau(elapsed: Floats, voltage_v: Floats, tau_s: float) -> tuple[Floats,
 def _check_rests(
     name: str, good: SampleBlock, rests: list[Rest], rejected: list[str], resting: NDArray[np.bool_]
 ) -> None:
-    """Enough rests, good enough."""
+    """Check that a capture has enough usable rests.
+
+    Raises:
+        UserError: No rests, or fewer usable ones than ``MIN_POINTS``.
+    """
     hours = (good["time_s"][-1] - good["time_s"][0]) / 3600.0
     if not resting.any():
         least = float(np.abs(good["current_a"]).min())

@@ -1,7 +1,7 @@
-"""Slow curves: open-circuit voltage from discharges and charges at a small constant current.
+"""Low-rate curves: open-circuit voltage from discharges and charges at a small constant current (pseudo-OCV).
 
-Halfway between the discharge and the charge of one cell lies its open-circuit voltage; half of their difference, less
-the ohmic part, is its hysteresis. A discharge without its charge gives the curve but for what hides in half of that.
+The open-circuit voltage is the mean of a discharge and a charge of one cell. The hysteresis is half of their difference
+less the ohmic drop. An unpaired discharge or charge gives the open-circuit voltage with an error of half the difference.
 """
 
 from collections.abc import Sequence
@@ -18,59 +18,62 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 MIN_S = 7.0 * 3600.0
-"""Minimum duration of a low-rate curve [s]: a full one at C/7. At C/10 half of the difference between discharge and
-charge is some 20 mV."""
-SAME_CURRENT = 0.05
-"""A current is constant within this part of it, and a standard deviation of its noise."""
+"""Minimum duration of a low-rate curve [s], that of a full one at C/7. At C/10 half of the difference between discharge
+and charge is some 20 mV."""
+CONSTANT_CURRENT = 0.05
+"""Maximum deviation of a constant current from its median, relative, beyond a standard deviation of its noise."""
 SMOOTH_SAMPLES = 31
-"""Length of the median filter [samples]: it removes faults and divides noise by five."""
-NOISE_OF_STEP = 1.05
-"""Standard deviation of white noise over the median step between its samples."""
-WHOLE_FALL = 0.01
-"""A discharge is whole when its voltage falls by this part in the last hundredth of its charge: it ends at empty."""
+"""Length of the median filter [samples]. It removes faults and divides the noise by about five."""
+STD_PER_MEDIAN_STEP = 1.05
+"""Standard deviation of white noise over the median absolute difference between its samples."""
+EMPTY_FALL = 0.01
+"""Minimum fall of the voltage over the last hundredth of the charge, relative, by which a discharge counts as full, that
+is down to empty."""
 PAIR_K, PAIR_CURRENT = 5.0, 0.3
-"""A discharge and a charge are a pair within this difference of temperature [K] and, relative, of current."""
-MISSING = 0.1
-"""SOC that a charge may lack of what its discharge gave: more is no whole charge, or its current is wrong."""
+"""Maximum differences between a discharge and a charge of a pair: temperature [K], and relative current."""
+MAX_MISSING_SOC = 0.1
+"""Maximum SOC by which a charge may end below full. A larger difference means an incomplete charge or a wrong current."""
 GRID = np.unique(
     np.round(np.r_[np.arange(0, 0.1, 0.005), np.arange(0.1, 0.95, 0.01), np.arange(0.95, 1.0, 0.005), 1], 4)
 )
-"""SOCs at which a slow curve is taken."""
-EVEN, HYSTERESIS_WIDTH = np.linspace(0.0, 1.0, 201), 0.01
-"""Grid of SOC, and width of the smoothing of the hysteresis: a knee that is at another SOC in charge is not
-hysteresis."""
-ENDS = (0.03, 0.98)
-"""Outside hysteresis is taken to be as it is there: the branches turn around."""
+"""SOC grid of the points of a low-rate curve."""
+EVEN_SOC, HYSTERESIS_WIDTH = np.linspace(0.0, 1.0, 201), 0.01
+"""SOC grid and std of the Gaussian that smooths the hysteresis. Without smoothing, a knee at different SOCs in charge and
+discharge would appear as hysteresis."""
+HYSTERESIS_SOC = (0.03, 0.98)
+"""SOC range of the measured hysteresis. Outside, the value at the end of the range is used, because the curves have
+end-point transients there."""
 POINT_V, POINT_SOC = 1e-3, 0.002
-"""Standard deviations of one point of a slow curve: of its voltage, per cell in series [V], and of its SOC."""
-PAIR_V, PAIR_PART = 1.5e-3, 0.1
-"""Systematic error of the mean of a paired curve per cell in series [V], and as a fraction of the half difference."""
-ALONE_PART = 0.5
-"""Fraction for an unpaired curve, whose difference is known only in the middle."""
-TURN = 0.03
-"""SOC within which a charge that ends early, at its highest voltage, is not the mean's other half."""
-LONE_V = 0.01
+"""Standard deviations of a point of a low-rate curve: of the voltage per cell in series [V], and of the SOC."""
+PAIR_V, PAIR_FRACTION = 1.5e-3, 0.1
+"""Systematic error of the mean of a pair per cell in series [V], and its part as a fraction of the half difference."""
+UNPAIRED_FRACTION = 0.5
+"""Systematic error as a fraction of the half difference, at SOCs where only one curve of a pair has data."""
+END_TRANSIENT_SOC = 0.03
+"""SOC range before the end of a charge that stops early. The voltage rises there before the end, so that the range is not
+averaged with the discharge."""
+UNPAIRED_V = 0.01
 """Systematic error of an unpaired curve without its ohmic part, per cell in series [V]."""
-COLD_PART = 0.25
-"""Fraction of the cold-relaxation error that remains after averaging charge and discharge; a lone branch has all of
+PAIR_COLD_FRACTION = 0.25
+"""Fraction of the cold-relaxation error that remains after averaging charge and discharge. An unpaired curve has all of
 it."""
 
 
 @dataclass(frozen=True)
 class SlowBranch:
-    """One slow discharge or charge.
+    """One low-rate discharge or charge.
 
     Attributes:
-        name: Name of its capture.
+        name: Name of the capture.
         charge: True for a charge, False for a discharge.
-        ah: Shape (n,), charge moved since its start, increasing [Ah].
-        voltage_v: Shape (n,) [V].
-        current_a: Mean magnitude [A].
-        temperature_c: Mean [C]; NaN without a sensor.
-        before_ah: What the capture discharged before it [Ah].
-        start_v: Voltage of the rest before it [V]; NaN without one.
-        step_v: What the voltage jumped by at the end of it that is at full [V]; NaN when no rest is there.
-        whole: A discharge down to empty.
+        ah: Shape (n,), charge moved since the start of the curve, increasing [Ah].
+        voltage_v: Shape (n,), terminal voltage [V].
+        current_a: Mean magnitude of the current [A].
+        temperature_c: Mean temperature [C]; NaN without a sensor.
+        before_ah: Net charge that the capture discharged before the start of the curve [Ah].
+        start_v: Voltage of the rest before the curve [V]; NaN without a rest.
+        step_v: Voltage jump between rest and current at the full end of the curve [V]; NaN without a rest there.
+        to_empty: True for a discharge down to empty.
     """
 
     name: str
@@ -82,10 +85,10 @@ class SlowBranch:
     before_ah: float
     start_v: float
     step_v: float
-    whole: bool
+    to_empty: bool
 
     def label(self, capacity_ah: float) -> str:
-        """Return a description such as C/20 discharge."""
+        """Return a description such as "C/20 discharge"."""
         return f"C/{capacity_ah / self.current_a:.0f} {'charge' if self.charge else 'discharge'}"
 
 
@@ -94,9 +97,9 @@ class SlowCurve:
     """Open-circuit voltage from a paired or unpaired low-rate curve.
 
     Attributes:
-        branches: One, or discharge and charge.
-        points: On a grid of SOC.
-        hysteresis_v: At ``GRID`` [V]; None of a lone branch.
+        branches: An unpaired discharge or charge, or a pair of both.
+        points: Points on ``GRID``.
+        hysteresis_v: Hysteresis at ``GRID`` [V]; None for an unpaired curve.
         notes: Remarks, one line each.
     """
 
@@ -107,7 +110,7 @@ class SlowCurve:
 
 
 def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
-    """Return the slow discharges and charges of a capture without glitches; empty for another kind of capture.
+    """Return the low-rate discharges and charges of a capture without glitches.
 
     Raises:
         UserError: The voltage changes in the wrong direction for the current.
@@ -117,13 +120,13 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
         return []
     smooth = good.copy()
     smooth["current_a"] = median_filter(good["current_a"], SMOOTH_SAMPLES, mode="nearest")
-    noise_a = NOISE_OF_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
+    noise_a = STD_PER_MEDIAN_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
     resting = resting_samples(smooth, float(np.ptp(moved_ah)))
     found = []
     for first, last in true_runs(~resting):
         current_a = smooth["current_a"][first:last]
         middle_a = float(np.median(current_a))
-        for a, b in true_runs(np.abs(current_a - middle_a) <= SAME_CURRENT * abs(middle_a) + noise_a):
+        for a, b in true_runs(np.abs(current_a - middle_a) <= CONSTANT_CURRENT * abs(middle_a) + noise_a):
             if good["time_s"][first + b - 1] - good["time_s"][first + a] >= MIN_S:
                 found.append(_branch(good, moved_ah, resting, first + a, first + b, name))
     return found
@@ -158,22 +161,22 @@ def _branch(
         before_ah=float(moved_ah[first]),
         start_v=float(good["voltage_v"][first - 1]) if first > 0 and resting[first - 1] else float("nan"),
         step_v=max(jump_v, 0.0),
-        whole=not charge and late_v > WHOLE_FALL * float(np.median(voltage_v)),
+        to_empty=not charge and late_v > EMPTY_FALL * float(np.median(voltage_v)),
     )
 
 
 def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
-    """Return the charge of the full slow discharge nearest to 25 C [Ah]; NaN without one."""
-    whole = [branch for branch in branches if branch.whole and branch.before_ah < 0.01 * branch.ah[-1]]
-    if not whole:
+    """Return the charge of the full low-rate discharge nearest to 25 C [Ah]; NaN without one."""
+    full = [branch for branch in branches if branch.to_empty and branch.before_ah < 0.01 * branch.ah[-1]]
+    if not full:
         return float("nan")
-    return float(min(whole, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0)).ah[-1])
+    return float(min(full, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0)).ah[-1])
 
 
 def slow_curves(
     branches: Sequence[SlowBranch], capacity_ah: float, *, initial_soc: float = 1.0, series_count: int = 1
 ) -> list[SlowCurve]:
-    """Pairs, and the remaining unpaired branches.
+    """Return the curves of pairs of a discharge and a charge, and of the remaining unpaired branches.
 
     Args:
         branches: Branches of all captures.
@@ -182,7 +185,7 @@ def slow_curves(
         series_count: Cells in series, for values per cell.
 
     Raises:
-        UserError: A discharge takes more than there is.
+        UserError: A discharge draws more than the capacity.
     """
     charges = [branch for branch in branches if branch.charge]
     found = []
@@ -196,22 +199,22 @@ def slow_curves(
             )
         charge = next((one for one in charges if _are_pair(discharge, one)), None)
         if charge is None:
-            found.append(_lone(discharge, soc, series_count, ()))
+            found.append(_unpaired(discharge, soc, series_count, ()))
             continue
         charges.remove(charge)
         up = soc[-1] + charge.ah / capacity_ah
-        if up[-1] < 1.0 - MISSING:
-            lacking = (
+        if up[-1] < 1.0 - MAX_MISSING_SOC:
+            incomplete = (
                 f"its charge {charge.name} left out: {charge.ah[-1]:.3f} Ah went in after {discharge.ah[-1]:.3f} Ah had "
-                "come out, so it is not whole or its current is wrong"
+                "come out, so the charge is incomplete or its current is wrong"
             )
-            found.append(_lone(discharge, soc, series_count, (lacking,)))
+            found.append(_unpaired(discharge, soc, series_count, (incomplete,)))
             continue
         if up[-1] > 1.0:
             up = soc[-1] + (1.0 - soc[-1]) * charge.ah / charge.ah[-1]
         found.append(_pair(discharge, soc, charge, up, series_count))
     return found + [
-        _lone(charge, 1.0 - (charge.ah[-1] - charge.ah) / capacity_ah, series_count, ("taken to end full",))
+        _unpaired(charge, 1.0 - (charge.ah[-1] - charge.ah) / capacity_ah, series_count, ("assumed to end full",))
         for charge in charges
     ]
 
@@ -223,53 +226,59 @@ def _are_pair(discharge: SlowBranch, charge: SlowBranch) -> bool:
 
 
 def _pair(down: SlowBranch, soc: Floats, up: SlowBranch, up_soc: Floats, series_count: int) -> SlowCurve:
-    """Average discharge and charge. Where one is missing, shift the other by half of their mean difference."""
+    """Return the mean of discharge and charge. Where one has no data, shift the other by half of the median difference."""
     low, high = max(soc[-1], up_soc[0]), min(soc[0], up_soc[-1])
-    high = high if high > ENDS[1] else high - TURN  # a charge that ends early rises before it ends
+    high = (
+        high if high > HYSTERESIS_SOC[1] else high - END_TRANSIENT_SOC
+    )  # a charge that stops early rises before its end
     both = GRID[(low <= GRID) & (high >= GRID)]
-    differ_v = 0.5 * (_at(both, up_soc, up.voltage_v) - _at(both, soc, down.voltage_v))
+    differ_v = 0.5 * (_voltage_at(both, up_soc, up.voltage_v) - _voltage_at(both, soc, down.voltage_v))
     middle_v = float(np.median(differ_v))
     half_v = np.where((low <= GRID) & (high >= GRID), np.interp(GRID, both, differ_v), middle_v)
     grid = GRID[(min(soc[-1], up_soc[0]) <= GRID) & (max(soc[0], up_soc[-1]) >= GRID)]
     half = np.interp(grid, GRID, half_v)
     known = (grid >= soc[-1]) & (grid <= soc[0])
-    ocv_v = np.where(known, _at(grid, soc, down.voltage_v) + half, _at(grid, up_soc, up.voltage_v) - half)
+    ocv_v = np.where(
+        known, _voltage_at(grid, soc, down.voltage_v) + half, _voltage_at(grid, up_soc, up.voltage_v) - half
+    )
     steps = [branch.step_v for branch in (down, up) if np.isfinite(branch.step_v)]
     ohmic_v = float(np.mean(steps)) if steps else 0.0
-    points = _points(grid, ocv_v, PAIR_V * series_count, COLD_PART, down.temperature_c, series_count)
-    alone = (grid < low) | (grid > high)
+    points = _points(grid, ocv_v, PAIR_V * series_count, PAIR_COLD_FRACTION, down.temperature_c, series_count)
+    unpaired = (grid < low) | (grid > high)
     return SlowCurve(
         branches=(down, up),
-        points=replace(points, common_v=points.common_v + np.where(alone, ALONE_PART, PAIR_PART) * np.abs(half)),
+        points=replace(
+            points, common_v=points.common_v + np.where(unpaired, UNPAIRED_FRACTION, PAIR_FRACTION) * np.abs(half)
+        ),
         hysteresis_v=_smooth(half_v - ohmic_v),
-        notes=() if steps else ("hysteresis with its ohmic part",),
+        notes=() if steps else ("hysteresis includes the ohmic drop",),
     )
 
 
-def _lone(branch: SlowBranch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
+def _unpaired(branch: SlowBranch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
     grid = GRID[(soc.min() <= GRID) & (soc.max() >= GRID)]
     sign = -1.0 if branch.charge else 1.0
     ohmic_v = float(np.nan_to_num(branch.step_v))
-    ocv_v = _at(grid, soc, branch.voltage_v) + sign * ohmic_v
-    common_v = LONE_V * series_count + 0.5 * ohmic_v
+    ocv_v = _voltage_at(grid, soc, branch.voltage_v) + sign * ohmic_v
+    common_v = UNPAIRED_V * series_count + 0.5 * ohmic_v
     points = replace(
-        _points(grid, ocv_v, common_v, 1.0, branch.temperature_c, series_count), way=-sign * np.ones(grid.size)
+        _points(grid, ocv_v, common_v, 1.0, branch.temperature_c, series_count), direction=-sign * np.ones(grid.size)
     )
     return SlowCurve((branch,), points, None, notes)
 
 
-def _at(grid: Floats, soc: Floats, voltage_v: Floats) -> Floats:
-    """Voltage of a branch at SOCs [V]."""
+def _voltage_at(grid: Floats, soc: Floats, voltage_v: Floats) -> Floats:
+    """Return the voltage of a branch at the SOCs ``grid`` [V]."""
     order = np.argsort(soc, kind="stable")
     return np.asarray(np.interp(grid, soc[order], voltage_v[order]))
 
 
 def _points(
-    grid: Floats, ocv_v: Floats, common_v: float, cold_part: float, temperature_c: float, series_count: int
+    grid: Floats, ocv_v: Floats, common_v: float, cold_fraction: float, temperature_c: float, series_count: int
 ) -> Points:
     std_v = np.hypot(POINT_V * series_count, POINT_SOC * np.gradient(ocv_v, grid))
     everywhere = np.ones(grid.size)
-    cold_v = cold_part * COLD_V * series_count * coldness(temperature_c * everywhere)
+    cold_v = cold_fraction * COLD_V * series_count * coldness(temperature_c * everywhere)
     return Points(
         soc=grid,
         ocv_v=ocv_v,
@@ -281,7 +290,7 @@ def _points(
 
 
 def _smooth(hysteresis_v: Floats) -> Floats:
-    """Hysteresis at ``GRID``, not below 0, without the turns at the ends."""
-    inside = np.clip(np.interp(np.clip(EVEN, *ENDS), GRID, hysteresis_v), 0.0, None)
-    smooth = gaussian_filter1d(inside, HYSTERESIS_WIDTH / (EVEN[1] - EVEN[0]), mode="nearest")
-    return np.asarray(np.interp(GRID, EVEN, smooth))
+    """Return a smooth hysteresis at ``GRID``, at least 0, constant outside ``HYSTERESIS_SOC``."""
+    inside = np.clip(np.interp(np.clip(EVEN_SOC, *HYSTERESIS_SOC), GRID, hysteresis_v), 0.0, None)
+    smooth = gaussian_filter1d(inside, HYSTERESIS_WIDTH / (EVEN_SOC[1] - EVEN_SOC[0]), mode="nearest")
+    return np.asarray(np.interp(GRID, EVEN_SOC, smooth))

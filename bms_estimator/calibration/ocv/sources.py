@@ -24,29 +24,31 @@ from bms_estimator.model.cell import Ladder
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-STARTS_ALIKE_V = 0.02
-"""Captures whose first rests differ by less start at the same SOC: full charges vary by as much, per cell [V]."""
+SAME_START_V = 0.02
+"""Maximum difference of the first rests of captures that start at the same SOC, per cell [V]. Full charges vary by as
+much."""
 GIVEN_V, GIVEN_COMMON_V = 1e-3, 2e-3
-"""Standard deviation of each point of a given curve, and of its common error, per cell [V]."""
+"""Std of each point of a given curve, and of the curve's systematic error, per cell [V]."""
 REST_SHARE, REST_SHARE_STD = 0.7, 0.3
-"""Part of the half difference of slow curves that a rest after a discharge keeps, the other is polarisation; and its
-standard deviation: 0.4 and 0.5 seen of an NCA cell, 1.0 of an LFP cell."""
+"""Fraction of the half difference of low-rate curves that is hysteresis and remains in a rest after a discharge, and the
+std of the fraction. The remainder is polarisation. Measured fractions are 0.4 and 0.5 for an NCA cell, 1.0 for an LFP
+cell."""
 PLATEAU_SHARE, PLATEAU_V, PLATEAU_SOC = 0.9, 0.15, 0.05
-"""Hysteresis as a fraction of the half difference for a curve with a plateau: a slope below this per cell and unit of
-SOC [V], over this range of SOC. Two coexisting phases keep it (Dreyer et al., Nature Materials 9, 2010, 448).
-Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
-USUAL_STD = 0.6
-"""Relative standard deviation of a hysteresis that is no more than usual."""
+"""Fraction that remains in a rest for a curve with a plateau; maximum slope dOCV/dSOC of a plateau per cell [V], and its
+SOC range. Two coexisting phases preserve the hysteresis (Dreyer et al., Nature Materials 9, 2010, 448). Drives of an LFP
+cell at 25, 5 and -15 C show 0.9 to 1.0."""
+TYPICAL_HYSTERESIS_STD = 0.6
+"""Relative std of a hysteresis taken from typical cells."""
 MIN_SHARE, SHARE_POINTS, SHARE_K, SHARE_SOC = 0.1, 6, 10.0, (0.1, 0.95)
-"""Minimum fraction, number of rests, distance from the curves' temperature [K] and range of SOC with which rests
-determine it themselves."""
-OTHER_CAPACITY = 0.05
-"""A capacity that differs by more from what a slow discharge measured is remarked on, relative."""
+"""Conditions for measuring the fraction by rests: lower limit of the result, minimum number of rests, maximum difference
+from the curves' temperature [K], and SOC range."""
+MAX_CAPACITY_DIFFERENCE = 0.05
+"""Relative difference between the given and the measured capacity above which a source has a remark."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A capture: its name and raw samples, dtype ``SAMPLE``."""
+    """Name and raw samples of a capture, dtype ``SAMPLE``."""
 
     name: str
     samples: SampleBlock
@@ -54,7 +56,14 @@ class Recording:
 
 @dataclass(frozen=True)
 class ExternalCurve:
-    """Curve from another source: soc 0..1, ocv_v [V], hysteresis_v [V] or None; shape (n,) each."""
+    """Given OCV curve.
+
+    Attributes:
+        name: Name for messages.
+        soc: Shape (n,), increasing, 0..1.
+        ocv_v: Shape (n,), open-circuit voltage [V].
+        hysteresis_v: Shape (n,), hysteresis [V]; None if unknown.
+    """
 
     name: str
     soc: Floats
@@ -67,13 +76,14 @@ class Source:
     """One source of points.
 
     Attributes:
-        name: Name of its captures.
+        name: Names of the captures.
         kind: Recognized kind, such as "38 rests".
-        points: Points.
-        temperature_c: Mean [C]; NaN where it is not known.
-        hysteresis_v: At ``GRID`` [V]; None if unknown.
+        points: Points of the open-circuit voltage.
+        temperature_c: Mean temperature [C]; NaN if unknown.
+        hysteresis_v: Hysteresis at ``GRID`` [V]; None if unknown.
         notes: Remarks.
-        lone: The slow curve that it is, if its other half is missing; what the branches take is still in ``points``.
+        unpaired: Low-rate curve of an unpaired source whose ``points`` contain the overpotential of the RC pairs;
+            otherwise None.
     """
 
     name: str
@@ -82,23 +92,22 @@ class Source:
     temperature_c: float
     hysteresis_v: Floats | None
     notes: tuple[str, ...]
-    lone: SlowBranch | None = None
+    unpaired: SlowBranch | None = None
 
 
 @dataclass(frozen=True)
 class OcvSources:
-    """All of them.
+    """All sources of the open-circuit voltage of a cell.
 
     Attributes:
-        capacity_ah: Given, else measured [Ah].
-        measured_ah: Capacity by a full slow discharge [Ah]; NaN without one.
-        sources: Slow curves, given curves, rests.
+        capacity_ah: Given capacity, otherwise ``measured_ah`` [Ah].
+        measured_ah: Capacity by a full low-rate discharge [Ah]; NaN without one.
+        sources: Low-rate curves, given curves, and rests.
         tests: Relaxation tests among ``sources``.
-        hysteresis_v: At ``NODES`` and 25 C [V], from the nearest source that shows it, as far as rests keep it; None
-            when
-            none does.
-        hysteresis_std_v: Standard deviation [V].
-        usual_hysteresis: It is no source's: ``center_on_typical_hysteresis``.
+        hysteresis_v: Hysteresis of a rested cell at ``NODES`` and 25 C [V], from the source nearest to 25 C that shows
+            hysteresis; None without such a source.
+        hysteresis_std_v: Standard deviation of ``hysteresis_v`` [V].
+        usual_hysteresis: True if ``hysteresis_v`` is that of typical cells (``center_on_typical_hysteresis``).
     """
 
     capacity_ah: float
@@ -128,13 +137,13 @@ def find_sources(
     Args:
         recordings: Captures.
         curves: Given curves.
-        capacity_ah: Capacity that rests are counted against [Ah]; None: as a whole slow discharge measures it. Slow curves
-            are counted against their own.
-        initial_soc: SOC at the first sample, 0..1, of those captures that start at the highest voltage.
+        capacity_ah: Capacity that the SOC of rests is counted against [Ah]; None: the capacity by a full low-rate
+            discharge. The SOC of low-rate curves is counted against the measured capacity if there is one.
+        initial_soc: SOC at the first sample, 0..1, of the captures that start at the highest voltage.
         series_count: Cells in series.
 
     Raises:
-        UserError: A capture is neither kind, or no capacity is known.
+        UserError: A capture is neither a relaxation test nor a low-rate curve, or no capacity is given or measured.
     """
     good = [Recording(one.name, remove_glitches(one.samples, one.name)) for one in recordings]
     branches = {one.name: slow_branches(one.samples, one.name) for one in good}
@@ -150,22 +159,24 @@ def find_sources(
     sources = [_of_slow(curve, slow_ah, known_ah) for curve in slow] + [_of_given(one, series_count) for one in curves]
     rests = [one for one in recordings if not branches[one.name]]
     found = _rests(rests, sources, every, known_ah, initial_soc, series_count)
-    telling = _informative(sources)
+    hysteresis_source = _hysteresis_source(sources)
     hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
-    if telling is not None and telling.hysteresis_v is not None:
-        share = _share(telling, found)
-        half_v = telling.hysteresis_v / _colder(telling.temperature_c)
-        kept_v = half_v * (_usual_share(telling, series_count) if share is None else share)
-        given = telling in sources[len(slow) :] and share is None  # given curves are used as they are
-        hysteresis_v = np.interp(NODES, GRID, half_v if given else kept_v)
+    if hysteresis_source is not None and hysteresis_source.hysteresis_v is not None:
+        share = _measured_share(hysteresis_source, found)
+        half_v = hysteresis_source.hysteresis_v / _hysteresis_factor(hysteresis_source.temperature_c)
+        hysteresis_at_rest_v = half_v * (_typical_share(hysteresis_source, series_count) if share is None else share)
+        given = hysteresis_source in sources[len(slow) :] and share is None  # given curves are used as they are
+        hysteresis_v = np.interp(NODES, GRID, half_v if given else hysteresis_at_rest_v)
         hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_v)
         found = [
-            (test, _amid_hysteresis(points, kept_v * _colder(test.temperature_c), REST_SHARE_STD))
+            (test, _centered(points, hysteresis_at_rest_v * _hysteresis_factor(test.temperature_c), REST_SHARE_STD))
             for test, points in found
         ]
         if share is not None:
             sources = [
-                replace(one, notes=(*one.notes, f"rests keep {share:.2f} of its hysteresis")) if one is telling else one
+                replace(one, notes=(*one.notes, f"rests keep {share:.2f} of its hysteresis"))
+                if one is hysteresis_source
+                else one
                 for one in sources
             ]
     of_rests = [_of_test(test, points) for test, points in found]
@@ -181,10 +192,10 @@ def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
         kind = f"{first.label(slow_ah)} and charge, {first.ah[-1]:.3f} and {others[0].ah[-1]:.3f} Ah"
         name = first.name if others[0].name == first.name else f"{first.name}, {others[0].name}"
     notes = curve.notes
-    if abs(slow_ah / capacity_ah - 1.0) > OTHER_CAPACITY:
+    if abs(slow_ah / capacity_ah - 1.0) > MAX_CAPACITY_DIFFERENCE:
         notes = (*notes, f"counted against its own {slow_ah:.3f} Ah, not {capacity_ah:g} Ah")
-    lone = None if others else first
-    return Source(name, kind, curve.points, first.temperature_c, curve.hysteresis_v, notes, lone)
+    unpaired = None if others else first
+    return Source(name, kind, curve.points, first.temperature_c, curve.hysteresis_v, notes, unpaired)
 
 
 def _of_given(curve: ExternalCurve, series_count: int) -> Source:
@@ -192,50 +203,62 @@ def _of_given(curve: ExternalCurve, series_count: int) -> Source:
     points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, common_v=GIVEN_COMMON_V * everywhere)
     hysteresis_v = None
     if curve.hysteresis_v is None:
-        points = replace(points, way=np.full(curve.soc.size, -1.0))
+        points = replace(points, direction=np.full(curve.soc.size, -1.0))
     if curve.hysteresis_v is not None:
         hysteresis_v = np.clip(np.interp(GRID, curve.soc, curve.hysteresis_v), 0.0, None)
     return Source(curve.name, f"given curve, {curve.soc.size} points", points, float("nan"), hysteresis_v, ())
 
 
-def _informative(sources: Sequence[Source]) -> Source | None:
+def _hysteresis_source(sources: Sequence[Source]) -> Source | None:
     """Return the source nearest to 25 C that shows hysteresis."""
-    telling = [source for source in sources if source.hysteresis_v is not None]
-    return min(telling, key=lambda one: _from_reference(one.temperature_c), default=None)
+    with_hysteresis = [source for source in sources if source.hysteresis_v is not None]
+    return min(with_hysteresis, key=lambda one: _from_reference(one.temperature_c), default=None)
 
 
 def _from_reference(temperature_c: float) -> float:
     return abs(float(np.nan_to_num(temperature_c, nan=REFERENCE_C)) - REFERENCE_C)
 
 
-def _colder(temperature_c: float) -> float:
-    """Hysteresis at a temperature over that at 25 C; NaN is 25 C."""
+def _hysteresis_factor(temperature_c: float) -> float:
+    """Return the hysteresis at a temperature relative to that at 25 C; 1 for NaN."""
     return float(arrhenius(HYSTERESIS_J, float(np.nan_to_num(temperature_c, nan=REFERENCE_C))))
 
 
-def _share(telling: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> float | None:
-    """Part of the hysteresis that rests after discharge keep: the median over them; None when there are too few."""
+def _measured_share(hysteresis_source: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> float | None:
+    """Return the median fraction of the hysteresis that remains in rests after discharge; None for too few rests."""
     low, high = SHARE_SOC
     shares: list[float] = []
     for test, points in found:
-        if _from_reference(test.temperature_c) > SHARE_K + _from_reference(telling.temperature_c):
+        if _from_reference(test.temperature_c) > SHARE_K + _from_reference(hysteresis_source.temperature_c):
             continue
         size_v = np.interp(
-            points.soc, GRID, np.zeros(GRID.size) if telling.hysteresis_v is None else telling.hysteresis_v
+            points.soc,
+            GRID,
+            np.zeros(GRID.size) if hysteresis_source.hysteresis_v is None else hysteresis_source.hysteresis_v,
         )
-        below_v = np.interp(points.soc, telling.points.soc, telling.points.ocv_v) - points.ocv_v
-        tells = (points.soc > low) & (points.soc < high) & (points.way < 0.0) & (size_v > 0.0)
-        shares += (below_v[tells] / size_v[tells]).tolist()
+        below_v = np.interp(points.soc, hysteresis_source.points.soc, hysteresis_source.points.ocv_v) - points.ocv_v
+        usable = (points.soc > low) & (points.soc < high) & (points.direction < 0.0) & (size_v > 0.0)
+        shares += (below_v[usable] / size_v[usable]).tolist()
     return float(np.clip(np.median(shares), MIN_SHARE, 1.0)) if len(shares) >= SHARE_POINTS else None
 
 
-def _usual_share(telling: Source, series_count: int) -> float:
-    """Return the usual share of the hysteresis where no rest shows it."""
-    return PLATEAU_SHARE if has_plateau(telling.points.soc, telling.points.ocv_v, series_count) else REST_SHARE
+def _typical_share(hysteresis_source: Source, series_count: int) -> float:
+    """Return the typical fraction of the hysteresis that remains in a rest."""
+    return (
+        PLATEAU_SHARE
+        if has_plateau(hysteresis_source.points.soc, hysteresis_source.points.ocv_v, series_count)
+        else REST_SHARE
+    )
 
 
 def has_plateau(soc: Floats, ocv_v: Floats, series_count: int) -> bool:
-    """Return True if the curve is so flat somewhere that two phases coexist; ``soc`` increasing, voltage in V."""
+    """Return True if the curve has a plateau, where two phases coexist.
+
+    Args:
+        soc: Shape (n,), increasing.
+        ocv_v: Shape (n,), open-circuit voltage [V].
+        series_count: Cells in series.
+    """
     edges = np.linspace(*SHARE_SOC, 1 + round(np.ptp(SHARE_SOC) / PLATEAU_SOC))
     slope_v = np.diff(np.interp(edges, soc, ocv_v)) / np.diff(edges)
     return float(slope_v.min()) < PLATEAU_V * series_count
@@ -249,10 +272,13 @@ def _rests(
     initial_soc: float,
     series_count: int,
 ) -> list[tuple[RelaxationTest, Points]]:
-    """Relaxation tests and their points; a capture that starts lower than the others gets its SOC from their curve."""
+    """Return the relaxation tests and their points.
+
+    A capture that starts at a lower voltage than the others gets its initial SOC from the curve of the others.
+    """
     starts = [initial_rest_v(one.samples, one.name, capacity_ah) for one in recordings]
     highest_v = np.nanmax([*starts, *(branch.start_v for branch in branches if not branch.charge), -np.inf])
-    low = [start < highest_v - STARTS_ALIKE_V * series_count for start in starts]
+    low = [start < highest_v - SAME_START_V * series_count for start in starts]
 
     def test(one: Recording, soc: float) -> tuple[RelaxationTest, Points]:
         found = relaxation_test(one.samples, capacity_ah, initial_soc=soc, series_count=series_count, name=one.name)
@@ -272,19 +298,19 @@ def _soc_at(curve: TableFit, voltage_v: float) -> float:
     return float(np.interp(voltage_v, curve(grid), grid))
 
 
-def _amid_hysteresis(points: Points, kept_v: Floats, relative_std: float) -> Points:
-    """Move points halfway between discharge and charge: ``kept_v`` above those after discharge, with that as their error."""
-    size_v = np.interp(points.soc, GRID, kept_v)
+def _centered(points: Points, hysteresis_at_rest_v: Floats, relative_std: float) -> Points:
+    """Move points to the mean of discharge and charge by the hysteresis ``hysteresis_at_rest_v``, with an error of ``relative_std``."""
+    size_v = np.interp(points.soc, GRID, hysteresis_at_rest_v)
     return replace(
         points,
-        ocv_v=points.ocv_v - points.way * size_v,
-        std_v=np.hypot(points.std_v, np.where(points.way == 0.0, size_v, 0.0)),
+        ocv_v=points.ocv_v - points.direction * size_v,
+        std_v=np.hypot(points.std_v, np.where(points.direction == 0.0, size_v, 0.0)),
         common_v=np.hypot(points.common_v, relative_std * size_v),
     )
 
 
 def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
-    """Lone slow curves without what their current takes in the branches: a pair has it twice, with both signs.
+    """Subtract the steady overpotential of the RC pairs from unpaired low-rate curves. In a pair it cancels.
 
     Args:
         found: Result of ``find_sources``.
@@ -294,22 +320,26 @@ def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
 
 
 def _without_branches(source: Source, ladder: Ladder) -> Source:
-    if source.lone is None:
+    if source.unpaired is None:
         return source
-    points, first = source.points, 1 if np.isfinite(source.lone.step_v) else 0  # a jump has shown the ohmic part
+    points, first = (
+        source.points,
+        1 if np.isfinite(source.unpaired.step_v) else 0,
+    )  # a measured jump was already subtracted
     temperature_c = np.nan_to_num(points.temperature_c, nan=REFERENCE_C)
-    drop_v = steady_drop(ladder, source.lone.current_a, points.soc, temperature_c, first)
+    drop_v = steady_drop(ladder, source.unpaired.current_a, points.soc, temperature_c, first)
     points = replace(
         points,
-        ocv_v=points.ocv_v - points.way * drop_v,
+        ocv_v=points.ocv_v - points.direction * drop_v,
         common_v=np.hypot(points.common_v, ladder.std * drop_v),
     )
-    note = f"{1e3 * drop_v.mean():.0f} mV, by what such cells have, taken out for {'its' if first else 'ohmic drop and'} branches"
-    return replace(source, points=points, lone=None, notes=(*source.notes, note))
+    removed = "the RC pairs" if first else "series resistance and RC pairs"
+    note = f"{1e3 * drop_v.mean():.0f} mV subtracted for {removed}, as typical of such cells"
+    return replace(source, points=points, unpaired=None, notes=(*source.notes, note))
 
 
 def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSources:
-    """Shift sources that do not show hysteresis by half of a typical one, because discharges alone lie below the mean.
+    """Move sources without measured hysteresis to the mean of discharge and charge by a typical hysteresis.
 
     Args:
         found: Result of ``find_sources``.
@@ -317,11 +347,17 @@ def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSourc
     """
     on_grid_v = np.interp(GRID, NODES, usual_v)
     moved = tuple(
-        replace(one, points=_amid_hysteresis(one.points, on_grid_v * _colder(one.temperature_c), USUAL_STD))
+        replace(
+            one, points=_centered(one.points, on_grid_v * _hysteresis_factor(one.temperature_c), TYPICAL_HYSTERESIS_STD)
+        )
         for one in found.sources
     )
     return replace(
-        found, sources=moved, hysteresis_v=usual_v, hysteresis_std_v=USUAL_STD * usual_v, usual_hysteresis=True
+        found,
+        sources=moved,
+        hysteresis_v=usual_v,
+        hysteresis_std_v=TYPICAL_HYSTERESIS_STD * usual_v,
+        usual_hysteresis=True,
     )
 
 

@@ -5,10 +5,11 @@ One linear Gaussian model over all points (a smoothing spline with random effect
 
     v = f(SOC) + (T - 25 C) u(SOC) + c(T) w(SOC) + f'(SOC) (s + q (1 - SOC)) + d(SOC) + noise
 
-f is a cubic spline with the curvature of real cells. u is dE/dT. w is the error of cold, unrelaxed rests; it is
-common to all sources and hardly distinguishable from u, so that the priors divide the observed difference between
-both. s and q are each source's errors
-of its first SOC and of its capacity. d is the systematic error of a source. Priors pull all but f to 0. The curve's standard deviation is that of the model: wide in gaps.
+f is a cubic spline with a prior of the curvature of real cells. u is dE/dT. w is the error of cold, unrelaxed rests. w is
+common to all sources and hardly distinguishable from u, so that the priors divide the observed difference between both.
+s and q are the errors of a source's first SOC and of its capacity. d is the systematic error of a source. The priors of
+u, w, s, q and d have mean 0. The curve's standard deviation follows from the posterior covariance and is large in gaps
+between points.
 """
 
 import itertools
@@ -27,42 +28,45 @@ from bms_estimator.model.cell import TableOcv
 KNOTS: Floats = np.unique(
     np.r_[np.arange(0.0, 0.06, 0.015), np.arange(0.06, 0.25, 0.03), np.arange(0.25, 0.96, 0.045), 0.97, 0.985, 0.993, 1]
 )
-"""Knots of the spline: a finer curve of a layered oxide shows only the errors of its points."""
+"""Knots of the spline in SOC. With more knots, the curve of a layered oxide reproduces the errors of the points."""
 NODES: Floats = np.unique(
     np.round(np.r_[np.arange(0.0, 0.1, 0.01), np.arange(0.1, 0.96, 0.02), np.arange(0.96, 1.001, 0.01)], 4)
 )
-"""SOCs of the table."""
-BEND_V, BEND_REACH = 2.0, 0.12
-"""Prior standard deviation of d2V/dSOC2 [V], and SOC range within which the slope may change by all of it, because
-steep parts bend more."""
-EMPTY_SLOPE_V, EMPTY_REACH = 60.0, 0.02
-"""Every curve may be so steep at empty, and how far that reaches in SOC [V]."""
+"""SOC nodes of the table."""
+BEND_V, BEND_SOC = 2.0, 0.12
+"""Prior std of d2V/dSOC2 on flat parts per ``CELL_V`` [V], and SOC range over which the slope may change by its own size,
+which adds to that std, because steep parts bend more."""
+EMPTY_SLOPE_V, EMPTY_SOC = 60.0, 0.02
+"""Slope that every curve may have at SOC 0 per ``CELL_V`` [V], and the SOC over which that slope decays."""
 FIRST_SLOPE_V = 0.8
-"""Slope that the first pass assumes [V]."""
+"""Slope dV/dSOC that the first iteration assumes per ``CELL_V`` [V]."""
 BEND_LENGTH = 0.05
-"""SOC over which one bend has nothing to do with the next."""
+"""Correlation length of the curvature in SOC."""
 MIN_SLOPE_V = 1e-3
-"""Least slope of the curve, per cell of 4 V and 1 of SOC: monotone means invertible [V]."""
+"""Minimum slope dV/dSOC per ``CELL_V``, so that the curve is invertible [V]."""
 CELL_V = 4.0
-"""Voltage of the cell that the voltages above refer to [V]."""
+"""Cell voltage to which the constants above are scaled [V]."""
 TEMPERATURE_SPAN_C = 10.0
 """Minimum temperature difference of sources for dE/dT [K]."""
 ENTROPY_V_PER_K, ENTROPY_NODES = 3.5e-4, np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
-"""Size of dE/dT before anything is measured [V/K]: 0.1 to 0.5 mV/K in published entropy profiles; where it may bend."""
+"""Prior std of dE/dT [V/K], as published entropy profiles have 0.1 to 0.5 mV/K, and SOC nodes of dE/dT."""
 DEVIATION_NODES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
-"""SOC nodes at which the systematic error of a source may change."""
-ROUGH = 0.7
-"""Part of it that changes faster: of each point on its own."""
+"""SOC nodes of the systematic error of a source."""
+ROUGHNESS = 0.7
+"""Independent error of each point, as a fraction of the systematic error of its source. It covers the part of the
+systematic error that varies between the nodes."""
 SOC_STD, CAPACITY_STD = 0.004, 0.01
-"""Standard deviations of a source's first SOC and of its capacity, relative: charging ends differ, cells age."""
+"""Prior std of the error of a source's first SOC, because charges end differently, and relative std of its capacity,
+because cells age."""
 EMPTY_STD_V, FULL_STD_V = 0.05, 0.005
 """Std of the voltages at SOC 0 and 1 without a rest there, per cell [V]."""
-STEEPEST_V = 2.0
-"""The slope that turns an error of SOC into one of voltage is no larger: at the ends it is not known well enough [V]."""
+MAX_SLOPE_V = 2.0
+"""Upper limit of the slope f' that converts an error of SOC to one of voltage, per ``CELL_V`` [V]. At the ends of the curve
+the slope is too uncertain."""
 STD_OF_MEDIAN = 1.48
-"""Standard deviation of a normal distribution over the median of its magnitude: a few bad points do not count."""
-PASSES = 4
-"""The slope f' and the errors of the sources are those of the previous iteration."""
+"""Standard deviation of a normal distribution over the median of its magnitude. The median is robust against outliers."""
+ITERATIONS = 4
+"""Number of iterations. Each uses the slope f' and the errors of the sources of the previous iteration."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ class TableFit:
         error_v: Standard deviations of ``ocv_v`` [V].
         per_kelvin_v: dE/dT at the nodes [V/K]; None if the temperatures of the points do not determine it.
         residual_v: Shape (n,), points less curve [V].
-        deviation_v: RMS of the common error of each source [V].
+        deviation_v: RMS of the systematic error of each source [V].
     """
 
     soc: Floats
@@ -86,7 +90,7 @@ class TableFit:
     deviation_v: Floats
 
     def __call__(self, soc: Floats) -> Floats:
-        """E_o(SOC) [V], PCHIP."""
+        """Return E_o(SOC) by PCHIP interpolation of the table [V]."""
         return np.asarray(PchipInterpolator(self.soc, self.ocv_v)(soc), dtype=np.float64)
 
     def error_at(self, soc: Floats) -> Floats:
@@ -97,7 +101,7 @@ class TableFit:
         """Return the ``[ocv]`` section of a cell file.
 
         Args:
-            hysteresis_v: At the nodes [V]; None: not known.
+            hysteresis_v: Hysteresis at the nodes [V]; None: unknown.
             hysteresis_std_v: Standard deviation of the hysteresis, which adds to the curve's error [V].
         """
         return TableOcv(
@@ -112,15 +116,21 @@ class TableFit:
 
 @dataclass(frozen=True)
 class _Model:
-    """Rows of the linear model: points and priors.
+    """Rows of the linear model.
 
-    Columns: spline coefficients; entropy and cold nodes, if any; then for each source its deviation's nodes, s and q.
+    The columns are the spline coefficients, the nodes of u and w if any, and for each source the nodes of d, s and q.
+
+    Attributes:
+        points: Rows of the points, not yet divided by their standard deviations.
+        prior: Rows of the priors, divided by their standard deviations.
+        splines: Number of spline coefficients.
+        temperature_columns: Number of nodes of u and w.
     """
 
     points: Floats
     prior: Floats
     splines: int
-    warmths: int
+    temperature_columns: int
 
 
 def fit_table(points: Points) -> TableFit:
@@ -136,17 +146,17 @@ def fit_table(points: Points) -> TableFit:
     sources = int(points.source.max()) + 1
     noise, common = np.ones(sources), 1.0
     middles = _middles()
-    falling_v = cells * EMPTY_SLOPE_V * np.exp(-middles / EMPTY_REACH)
+    falling_v = cells * EMPTY_SLOPE_V * np.exp(-middles / EMPTY_SOC)
     steepness_v: Floats = np.full(middles.size, cells * FIRST_SLOPE_V)
     slope_v: Floats = np.zeros(points.soc.size)
-    for _ in range(PASSES):
-        bends = _bend_rows(cells * BEND_V + (steepness_v + falling_v) / BEND_REACH)
+    for _ in range(ITERATIONS):
+        bends = _bend_rows(cells * BEND_V + (steepness_v + falling_v) / BEND_SOC)
         model = _model(points, slope_v, common, bends, cells)
-        std_v = np.hypot(points.std_v, ROUGH * points.common_v) * noise[points.source]
-        x = _solved(model, points, std_v, cells)
-        slope_v = np.clip(_spline(points.soc, 1) @ x[: model.splines], 0.0, STEEPEST_V * cells)
+        std_v = np.hypot(points.std_v, ROUGHNESS * points.common_v) * noise[points.source]
+        x = _solve(model, points, std_v, cells)
+        slope_v = np.clip(_spline(points.soc, 1) @ x[: model.splines], 0.0, MAX_SLOPE_V * cells)
         steepness_v = _spline(middles, 1) @ x[: model.splines]
-        noise, common = _sizes(points, model, x, common)
+        noise, common = _error_factors(points, model, x, common)
     basis, entropy = _spline(NODES), linear_interpolation_matrix(NODES, ENTROPY_NODES)
     rows = np.vstack([model.points / std_v[:, None], model.prior])
     covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)[: model.splines, : model.splines]
@@ -157,14 +167,14 @@ def fit_table(points: Points) -> TableFit:
         soc=NODES,
         ocv_v=ocv_v,
         error_v=np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance, basis)),
-        per_kelvin_v=entropy @ u if model.warmths else None,
+        per_kelvin_v=entropy @ u if model.temperature_columns else None,
         residual_v=given.ocv_v - fit(given.soc),
         deviation_v=_deviations(points, model, x),
     )
 
 
 def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells: float) -> _Model:
-    """Return the rows of the model; rows of points are not yet divided by their standard deviations."""
+    """Return the rows of the model."""
     spline = _spline(points.soc)
     warmer = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
     columns, stds = [spline], [np.zeros(0)]
@@ -172,7 +182,7 @@ def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells:
         by_soc = linear_interpolation_matrix(points.soc, ENTROPY_NODES)
         columns += [warmer[:, None] * by_soc, points.cold_v[:, None] * by_soc]
         stds += [np.full(ENTROPY_NODES.size, ENTROPY_V_PER_K * cells), np.ones(ENTROPY_NODES.size)]
-    warmths = sum(one.size for one in stds)
+    temperature_columns = sum(one.size for one in stds)
     for source in range(int(points.source.max()) + 1):
         own = (points.source == source)[:, None]
         off_v = common * points.common_v[:, None] * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
@@ -182,21 +192,21 @@ def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells:
     prior = np.zeros((bends.shape[0] + weights.size, spline.shape[1] + weights.size))
     prior[: bends.shape[0], : spline.shape[1]] = bends
     prior[bends.shape[0] :, spline.shape[1] :] = np.diag(weights)
-    return _Model(np.hstack(columns), prior, spline.shape[1], warmths)
+    return _Model(np.hstack(columns), prior, spline.shape[1], temperature_columns)
 
 
 def _shifts(soc: Floats, slope_v: Floats) -> Floats:
-    """Return the derivatives of a voltage by the first SOC and by the capacity. Shape (n, 2)."""
+    """Return the derivatives of a voltage by s and by q. Shape (n, 2)."""
     return np.column_stack([slope_v, slope_v * (1.0 - soc)])
 
 
-def _solved(model: _Model, points: Points, std_v: Floats, cells: float) -> Floats:
-    """Solve for the model's coefficients under increasing spline coefficients, which make the spline increase.
+def _solve(model: _Model, points: Points, std_v: Floats, cells: float) -> Floats:
+    """Solve for the model's coefficients with increasing spline coefficients, so that the spline increases.
 
-    The systematic error of a source shows only beside another source: 0 if there is only one.
+    The errors of a single source cannot be distinguished from the curve, so that they are 0.
     """
-    told = model.splines + model.warmths if points.source.max() == 0 else model.points.shape[1]
-    rows = np.vstack([model.points / std_v[:, None], model.prior])[:, :told]
+    columns = model.splines + model.temperature_columns if points.source.max() == 0 else model.points.shape[1]
+    rows = np.vstack([model.points / std_v[:, None], model.prior])[:, :columns]
     target = np.r_[points.ocv_v / std_v, np.zeros(model.prior.shape[0])]
     sums = np.tril(np.ones((model.splines, model.splines)))  # coefficients from their increments
     rows[:, : model.splines] = rows[:, : model.splines] @ sums
@@ -205,22 +215,22 @@ def _solved(model: _Model, points: Points, std_v: Floats, cells: float) -> Float
     orthogonal, triangle = np.linalg.qr(rows)
     increments = lsq_linear(triangle, orthogonal.T @ target, bounds=(lowest, np.inf), method="bvls").x
     x = np.zeros(model.points.shape[1])
-    x[: model.splines], x[model.splines : told] = sums @ increments[: model.splines], increments[model.splines :]
+    x[: model.splines], x[model.splines : columns] = sums @ increments[: model.splines], increments[model.splines :]
     return x
 
 
-def _sizes(points: Points, model: _Model, x: Floats, common: float) -> tuple[Floats, float]:
-    """Return how much larger than declared each source's scatter and the systematic errors of all are; at least 1."""
-    left = (points.ocv_v - model.points @ x) / np.hypot(points.std_v, ROUGH * points.common_v)
+def _error_factors(points: Points, model: _Model, x: Floats, common: float) -> tuple[Floats, float]:
+    """Return the ratio of observed to declared errors, at least 1: scatter of each source, systematic error of all."""
+    normalized = (points.ocv_v - model.points @ x) / np.hypot(points.std_v, ROUGHNESS * points.common_v)
     sources = int(points.source.max()) + 1
-    noise = [max(1.0, STD_OF_MEDIAN * float(np.median(np.abs(left[points.source == k])))) for k in range(sources)]
-    own = x[model.splines + model.warmths :].reshape(sources, -1)[:, : DEVIATION_NODES.size]
+    noise = [max(1.0, STD_OF_MEDIAN * float(np.median(np.abs(normalized[points.source == k])))) for k in range(sources)]
+    own = x[model.splines + model.temperature_columns :].reshape(sources, -1)[:, : DEVIATION_NODES.size]
     return np.array(noise), max(1.0, common * float(np.sqrt(np.mean(own**2))))
 
 
 def _deviations(points: Points, model: _Model, x: Floats) -> Floats:
-    """RMS over its points of what each source is off as a whole [V]."""
-    own = model.points[:, model.splines + model.warmths :] @ x[model.splines + model.warmths :]
+    """Return the RMS of the systematic error over the points of each source [V]."""
+    own = model.points[:, model.splines + model.temperature_columns :] @ x[model.splines + model.temperature_columns :]
     sources = int(points.source.max()) + 1
     return np.array([rms_v(own[points.source == k]) for k in range(sources)])
 
@@ -236,14 +246,14 @@ def _centres() -> Floats:
 
 
 def _spline(soc: Floats, derivative: int = 0) -> Floats:
-    """Cubic B-splines, or a derivative of them, at ``soc``. Shape (n, splines)."""
+    """Return the cubic B-splines, or their derivatives, at ``soc``. Shape (n, splines)."""
     knots = _knots()
     curves = BSpline(knots, np.eye(knots.size - 4), 3)
     return np.asarray(curves(np.clip(soc, 0.0, 1.0), nu=derivative), dtype=np.float64)
 
 
 def _edges() -> Floats:
-    """Return the ends of the intervals over which curvature is penalized: a quarter of the knot spacing."""
+    """Return the edges of the intervals of the curvature prior, four for each knot interval."""
     edges: Floats = np.unique(np.concatenate([np.linspace(a, b, 5) for a, b in itertools.pairwise(KNOTS)]))
     return edges
 
@@ -254,6 +264,6 @@ def _middles() -> Floats:
 
 
 def _bend_rows(size_v: Floats) -> Floats:
-    """d2V/dSOC2 of each stretch over its size [V], weighted by the share of ``BEND_LENGTH`` that the stretch is."""
+    """Return the rows of the curvature prior with std ``size_v``, weighted by interval length over ``BEND_LENGTH``."""
     weight = np.sqrt(np.diff(_edges()) / BEND_LENGTH) / size_v
     return np.asarray(_spline(_middles(), 2) * weight[:, None])

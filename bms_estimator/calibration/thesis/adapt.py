@@ -1,4 +1,4 @@
-"""The thesis's procedure as a calibration: steps 2 and 3 on captures, then the same judgment as `identify`."""
+"""Calibration by the thesis's procedure: steps 2 and 3 on captures, and the replay scores of `identify`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ from bms_estimator.model.cell import CellModel, Ladder, Resistance
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 
-SMALLEST_ERROR_V = 1e-5
-"""Lower limit of the error that is written [V]."""
+MIN_ERROR_V = 1e-5
+"""Minimum model error written to a cell file [V]. A cell file requires a value above 0."""
 
 
 @dataclass(frozen=True)
 class AdaptedCapture:
-    """Figures of one capture.
+    """Errors and scores of one capture.
 
     Attributes:
         name: Name of the capture.
@@ -35,7 +35,7 @@ class AdaptedCapture:
         voltage_rms_v: RMS error of the voltage, open loop, above SOC 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN for a capture that is too short.
         score_after: Interval score with the adapted cell [%].
-        held_back: The capture had no part in the cell of ``score_after``.
+        held_back: True if ``score_after`` is of a cell adapted without this capture.
     """
 
     name: str
@@ -51,9 +51,9 @@ class Adaptation:
     """An adapted cell.
 
     Attributes:
-        cell: The cell with a1..a15 and a ladder of its two branches.
+        cell: The cell with a1..a15 and an equivalent RC ladder.
         steps: Result of steps 2 and 3 over all captures.
-        captures: Figures of each capture, in the order given.
+        captures: Errors and scores of each capture, in the order given.
         score_before: Geometric mean of the interval scores with the given cell [%]; NaN when no capture is long enough.
         score_after: Geometric mean with the adapted cell [%].
     """
@@ -66,13 +66,13 @@ class Adaptation:
 
 
 def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = None) -> Adaptation:
-    """Estimate a1..a15 as the thesis does.
+    """Estimate a1..a15 by the thesis's procedure.
 
-    Bounds of (3.18) that the cell file does not have are those of Table 10, scaled to the cell's capacity.
+    Bounds of (3.18) missing in the cell file are those of Table 10, scaled to the cell's capacity.
 
     Args:
         captures: Raw samples, rows of dtype ``SAMPLE``; each starts from rest.
-        cell: Capacity, limits, OCV, and bounds of (3.18) where it has any.
+        cell: Capacity, limits, OCV, and optional bounds of (3.18).
         soc: SOC 0..1 at the first sample of each capture; None: from its first rest.
 
     Raises:
@@ -88,26 +88,26 @@ def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = N
     starts = [
         Start(remove_glitches(capture.rows, capture.name), start) for capture, start in zip(captures, socs, strict=True)
     ]
-    steps, adapted = _adapted(cell, starts)
-    judged = tuple(_judged(cell, adapted, loads, starts, j) for j in range(len(starts)))
-    before, after = (_mean([getattr(c, name) for c in judged]) for name in ("score_before", "score_after"))
+    steps, adapted = _adapted_cell(cell, starts)
+    scored = tuple(_scored_capture(cell, adapted, loads, starts, j) for j in range(len(starts)))
+    before, after = (_geometric_mean([getattr(c, name) for c in scored]) for name in ("score_before", "score_after"))
     if after > NO_WORSE * before:
         raise UserError(
             f"nothing is written: replays started in mid-load get worse, their interval score (smaller is better) goes "
             f"from {before:.2f} to {after:.2f} % of SOC; use `identify`, or give captures of more currents"
         )
-    return Adaptation(adapted, steps, judged, before, after)
+    return Adaptation(adapted, steps, scored, before, after)
 
 
-def _adapted(cell: CellModel, starts: Sequence[Start]) -> tuple[AdaptedElements, CellModel]:
-    """Return the result of steps 2 and 3, and the cell with it."""
+def _adapted_cell(cell: CellModel, starts: Sequence[Start]) -> tuple[AdaptedElements, CellModel]:
+    """Return the result of steps 2 and 3, and the cell with that result."""
     bounded = cell.model_copy(update={"adaptation": printed_bounds(cell) | cell.adaptation})
     steps = steps_2_and_3(bounded, starts, LOWEST_SOC)
     return steps, _with_elements(cell, steps, starts)
 
 
 def _with_elements(cell: CellModel, steps: AdaptedElements, starts: Sequence[Start]) -> CellModel:
-    """Return the cell with a1..a15 and with an RC network of its two branches that carries their errors."""
+    """Return the cell with a1..a15 and an equivalent RC ladder with the errors of the fit."""
     a, update = steps.a, dict[str, object]()
     for name, first in (("r_ts", 1), ("r_tl", 4), ("c_ts", 7), ("c_tl", 10)):
         section = getattr(cell, name)
@@ -122,19 +122,19 @@ def _with_elements(cell: CellModel, steps: AdaptedElements, starts: Sequence[Sta
         weak_ohm=_rows(weak * ohm),
         strong_ohm=_rows((1.0 - weak) * ohm),
         std=BRANCHES_STD,
-        error_v=max(float(np.sqrt(np.mean(errors**2))), SMALLEST_ERROR_V),
+        error_v=max(float(np.sqrt(np.mean(errors**2))), MIN_ERROR_V),
         temperature_c=_temperatures(starts),
     )
     return new.model_copy(update={"ladder": ladder})
 
 
-def _judged(
+def _scored_capture(
     cell: CellModel, adapted: CellModel, loads: list[CleanCapture], starts: list[Start], j: int
 ) -> AdaptedCapture:
-    """Figures of capture ``j``, by a cell that did not see it where other captures were given."""
+    """Return the scores of capture ``j``, by a cell adapted to the other captures if there are any."""
     load, start = loads[j], starts[j]
     others = [s for k, s in enumerate(starts) if k != j]
-    judge = _adapted(cell, others)[1] if others else adapted
+    held_out = _adapted_cell(cell, others)[1] if others else adapted
     soc = start.soc - load.discharged_ah / cell.cell.capacity_ah
     error_v = predict(adapted, start.samples, start.soc, lowest_soc=LOWEST_SOC).error_v
     return AdaptedCapture(
@@ -142,22 +142,22 @@ def _judged(
         initial_soc=start.soc,
         voltage_rms_v=float(np.sqrt(np.mean(error_v**2))),
         score_before=interval_score(cell, load, soc),
-        score_after=interval_score(judge, load, soc),
+        score_after=interval_score(held_out, load, soc),
         held_back=bool(others),
     )
 
 
 def _temperatures(starts: Sequence[Start]) -> tuple[float, float]:
-    """Lowest and highest temperature of the captures, those of a room without a sensor [C]."""
+    """Return the lowest and highest temperature of the captures [C]; ``ROOM_C`` without a sensor."""
     temperature_c = np.concatenate([s.samples["temperature_c"] for s in starts])
     known = temperature_c[np.isfinite(temperature_c)]
     return (float(known.min()), float(known.max())) if known.size else ROOM_C
 
 
-def _mean(scores: Sequence[float]) -> float:
-    """Geometric mean of the scores that are known; NaN without any."""
-    known = [score for score in scores if np.isfinite(score)]
-    return float(np.exp(np.mean(np.log(known)))) if known else float("nan")
+def _geometric_mean(scores: Sequence[float]) -> float:
+    """Return the geometric mean of the finite scores; NaN without any."""
+    finite = [score for score in scores if np.isfinite(score)]
+    return float(np.exp(np.mean(np.log(finite)))) if finite else float("nan")
 
 
 def _rows(ohm: Floats) -> tuple[tuple[float, ...], ...]:

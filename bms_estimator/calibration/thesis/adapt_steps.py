@@ -1,6 +1,6 @@
 """Steps 2 and 3 of the thesis on captures: Algorithm 1 with (3.19) gives a1..a12, (4.2) gives a13..a15.
 
-Step 1, the open-circuit voltage, is in the cell that is given: `ocv` fits it to rests.
+Step 1, the fit of the open-circuit voltage to rests, is the command `ocv`. Its result is part of the given cell.
 """
 
 from collections.abc import Sequence
@@ -23,12 +23,12 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
 
 VOLTAGE_STEP_V = 1e-3
-"""Resolution of the voltage when the capture's is not known [V]."""
+"""Assumed resolution of a capture's voltage [V]."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """A capture without glitches and the SOC that it starts from.
+    """Samples of a capture without glitches, and its initial SOC.
 
     Attributes:
         samples: Dtype ``SAMPLE``.
@@ -60,14 +60,14 @@ class AdaptedElements:
 
 
 def steps_2_and_3(cell: CellModel, captures: Sequence[Start], lowest_soc: float) -> AdaptedElements:
-    """Adapt a1..a12 to the capture of the smallest mean current, then fit a13..a15 to all captures.
+    """Adapt a1..a12 to the capture with the smallest mean current, then fit a13..a15 to all captures.
 
-    Algorithm 1 needs a very small current; (4.2) needs several.
+    Algorithm 1 needs a very small current; (4.2) needs several currents.
 
     Args:
         cell: Capacity, open-circuit voltage, and the bounds of (3.18).
         captures: Captures that start from rest.
-        lowest_soc: SOC below which (4.2) is not evaluated, because the open-circuit voltage is a guess there.
+        lowest_soc: SOC below which (4.2) is not evaluated, because the open-circuit voltage is uncertain there.
 
     Raises:
         UserError: No good sample, no current, or too small a range of SOC for a13..a15.

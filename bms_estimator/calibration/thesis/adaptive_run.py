@@ -1,7 +1,7 @@
 """Step 2: adaptive estimation of a1..a15 over a capture, Algorithm 1 and schemes 1 to 3.
 
-The observer runs over the whole capture; it stops adapting at the stability conditions (Fig. 19). The result says
-whether it converged, and if not why.
+The observer runs over the whole capture and stops adapting at the stability conditions (Fig. 19). The result contains
+"converged" or the reason for a failure.
 """
 
 import itertools
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, settled
+from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, averaging_window
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import crossing, delta
 from bms_estimator.model.arrays import Floats
@@ -17,9 +17,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 SNAPSHOTS = 3000
-"""Recording interval of a_i(t) over a run, after its first samples."""
+"""Maximum number of equidistant snapshots of a_i(t) over a run, in addition to ``FIRST_SAMPLES``."""
 FIRST_SAMPLES = 200
-"""Number of first samples, over which a_i(t) moves from its initial value to its limit, that are all recorded."""
+"""Number of first samples that are all recorded, because a_i(t) moves from its initial value to its limit there."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Crossing:
     Attributes:
         parameter: "a8" or "a11".
         soc: delta1 or delta2 of the parameters at the end of adaptation.
-        time_s: When SOC got there; None when the capture ends above.
+        time_s: Time at which SOC reached ``soc`` [s]; None when the capture ends above.
     """
 
     parameter: str
@@ -43,20 +43,20 @@ class AdaptiveRun:
 
     Attributes:
         time_s: Time of the snapshots [s].
-        soc: Counted, 0..1.
-        current_a: Positive on discharge [A].
-        voltage_v: y [V].
-        voltage_estimate_v: y^ of the run, time-varying parameters [V].
-        error_v: e (3.15), the largest in magnitude since the snapshot before [V].
+        soc: SOC by coulomb counting, 0..1.
+        current_a: Current, positive on discharge [A].
+        voltage_v: Measured voltage y [V].
+        voltage_estimate_v: Estimated voltage y^ of the run, with time-varying parameters [V].
+        error_v: Tracking error e (3.15), the largest in magnitude since the previous snapshot [V].
         k: Adaptive gain state (3.13).
         gain: N(k).
         a: Shape (n, 16), a1..a15 at index 1..15.
         window: t_int and t_unst of (3.19).
-        average: Shape (16,), (3.19).
+        average: Shape (16,), averages (3.19) of a1..a15 at index 1..15.
         crossings: Crossings of a8 and a11.
         epsilon_v: eps2 of Algorithm 1 [V].
-        lock_losses: Number of times that the observer lost track.
-        outcome: "converged", or why not.
+        lock_losses: Number of times that the observer lost the lock.
+        outcome: "converged", or the reason for a failure.
     """
 
     time_s: Floats
@@ -76,7 +76,7 @@ class AdaptiveRun:
     outcome: str
 
     def condition(self, parameter: str) -> Floats:
-        """Return the bound that a8 (a11) must exceed over time: right side of the condition in Lemma 4.1.1, Fig. 19."""
+        """Return the bound of a8 or a11 over time: the right side of the condition in Lemma 4.1.1, Fig. 19."""
         amplitude, offset = {"a8": (7, 9), "a11": (10, 12)}[parameter]
         rows = zip(self.soc, self.a[:, offset], self.a[:, amplitude], strict=True)
         return np.array([crossing(max(soc, 1e-6), low, high) for soc, low, high in rows])
@@ -88,10 +88,10 @@ def adaptive_run(
     """Run the observer over a capture.
 
     Args:
-        estimator: Fresh, or with a state to go on from.
+        estimator: New estimator, or one whose state the run resumes from.
         samples: Dtype ``SAMPLE``.
-        t_int_s: t_int of (3.19), instead of the one found [s].
-        t_unst_s: As above.
+        t_int_s: t_int of (3.19) [s]; None: determined from the run.
+        t_unst_s: t_unst of (3.19) [s]; None: determined from the run.
 
     Raises:
         UserError: No sample was accepted, or t_int or t_unst lies outside the run.
@@ -121,7 +121,7 @@ def adaptive_run(
     error, parameters = np.array(error_v), np.array(a)
     epsilon_v = float(estimator.settings["epsilon_v"][0])
     margin = found["stability_margin"] - float(estimator.settings["margin_guard"][0])
-    window = settled(
+    window = averaging_window(
         found["time_s"], error, found["voltage_v"], margin, parameters, epsilon_v, t_int_s=t_int_s, t_unst_s=t_unst_s
     )
     lock_losses = int(estimator.state["lock_losses"][0])
@@ -148,7 +148,7 @@ def adaptive_run(
 
 
 def _crossing(parameter: str, a: Floats, soc: Floats, time_s: Floats) -> Crossing:
-    """Return the SOC at which ``parameter`` meets its condition."""
+    """Return the point of the run at which ``parameter`` meets its stability condition."""
     i = int(parameter[1:])
     at = float(delta(a[i], a[i + 1], a[i - 1]))
     below = np.flatnonzero(soc <= at)
@@ -156,7 +156,7 @@ def _crossing(parameter: str, a: Floats, soc: Floats, time_s: Floats) -> Crossin
 
 
 def _outcome(window: AveragingWindow, time_s: Floats, error_v: Floats, epsilon_v: float, lock_losses: int) -> str:
-    """Lines 8 to 14 of Algorithm 1, with |e| (E10)."""
+    """Evaluate lines 8 to 14 of Algorithm 1, with |e| in place of e (erratum 10)."""
     inside = (time_s >= window.t_int_s) & (time_s <= window.t_unst_s)
     if inside.sum() < 2:
         worst = float(np.abs(error_v[time_s <= window.t_unst_s]).max(initial=0.0))

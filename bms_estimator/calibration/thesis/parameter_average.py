@@ -1,4 +1,4 @@
-"""Parameters as a mean over the settled part of a run, (3.19), with t_int and t_unst found from the run."""
+"""Average of the parameters over the settled part of a run, (3.19), with t_int and t_unst determined from the run."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ from bms_estimator.model.errors import UserError
 SETTLED_SHARE = 0.99
 """Fraction of the samples after t_int whose error must be within the bound."""
 SETTLED_PARAMETER = 1e-3
-"""A parameter this near to its median, relatively, has settled."""
-WINDOWS = 100
-"""The voltage's slope is taken over this part of the run."""
+"""Maximum relative deviation of a settled parameter from its median."""
+SLOPE_WINDOWS = 100
+"""Number of windows of a run over which the slope of the voltage is computed."""
 KNEE_SLOPE = 5.0
-"""A voltage that falls this many times as fast as in the middle of the run, until its end, has passed its knee."""
+"""Slope of the voltage after its knee, in multiples of the median slope of the run."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class AveragingWindow:
 
     Attributes:
         t_int_s: Time from which the error stays small [s].
-        t_unst_s: Here the battery becomes unstable [s].
-        start_reason: What set t_int.
-        end_reason: What set t_unst.
+        t_unst_s: Time at which the battery becomes unstable [s].
+        start_reason: Criterion that determined t_int.
+        end_reason: Criterion that determined t_unst.
     """
 
     t_int_s: float
@@ -34,7 +34,7 @@ class AveragingWindow:
     end_reason: str
 
 
-def settled(
+def averaging_window(
     time_s: Floats,
     error_v: Floats,
     voltage_v: Floats,
@@ -47,9 +47,9 @@ def settled(
 ) -> AveragingWindow:
     """Find t_int and t_unst of (3.19).
 
-    t_unst: the margin SOC - max(delta1, delta2) reaches zero, or the voltage its knee, whichever is first.
-    t_int: from here to t_unst, 99 % of the errors are within ``epsilon_v``, and each a_i within 0.1 % of its
-    median: a mean from the first sample on would hold the way from a_i(t0) to there.
+    t_unst is the time at which the margin SOC - max(delta1, delta2) reaches zero or the voltage reaches its knee,
+    whichever is first. From t_int to t_unst, 99 % of the errors are within ``epsilon_v`` and each a_i is within 0.1 % of
+    its median. An average from the first sample on would contain the transient from a_i(t0).
 
     Args:
         time_s: Shape (n,) [s].
@@ -57,12 +57,12 @@ def settled(
         voltage_v: y(t) [V].
         margin: SOC - max(delta1, delta2), less the guard.
         a: Shape (n, 16), a1..a15 at index 1..15.
-        epsilon_v: What counts as settled [V].
-        t_int_s: Given by the user instead [s].
-        t_unst_s: Given by the user instead [s].
+        epsilon_v: Maximum error of a settled observer [V].
+        t_int_s: t_int given by the user [s]; None: determined from the run.
+        t_unst_s: t_unst given by the user [s]; None: determined from the run.
 
     Raises:
-        UserError: One that is given lies outside the run, or t_int after t_unst.
+        UserError: A given time lies outside the run, or t_int after t_unst.
     """
     if t_unst_s is not None:
         _check_inside("t_unst", t_unst_s, time_s[0], time_s[-1])
@@ -72,8 +72,8 @@ def settled(
         return AveragingWindow(t_int_s, end_s, "given", end_reason)
     inside = time_s <= end_s
     beyond = np.abs(error_v[inside]) > epsilon_v
-    left = np.arange(beyond.size, 0, -1)
-    share = np.cumsum(beyond[::-1])[::-1] / left  # of the samples from here on
+    remaining = np.arange(beyond.size, 0, -1)
+    share = np.cumsum(beyond[::-1])[::-1] / remaining  # fraction of large errors in each sample and its successors
     good = (share <= 1.0 - SETTLED_SHARE) & ~beyond
     if not good.any():
         reason = f"the error never settles within {1e3 * epsilon_v:.2f} mV"
@@ -81,24 +81,23 @@ def settled(
     error_from = int(np.argmax(good))
     a_from = _settled_from(a[inside])
     if a_from > error_from:
-        reason = f"every a_i is within {100 * SETTLED_PARAMETER:g} % of its median from here on"
+        reason = f"every later a_i is within {100 * SETTLED_PARAMETER:g} % of its median"
         return AveragingWindow(float(time_s[inside][a_from]), end_s, reason, end_reason)
-    reason = f"99 % of the errors from here on are within {1e3 * epsilon_v:.2f} mV"
+    reason = f"99 % of the later errors are within {1e3 * epsilon_v:.2f} mV"
     return AveragingWindow(float(time_s[inside][error_from]), end_s, reason, end_reason)
 
 
 def _check_inside(name: str, given_s: float, first_s: float, last_s: float) -> None:
-    """Refuse a time that leaves (3.19) nothing to average."""
+    """Check that a given time lies within the run."""
     if not first_s <= given_s <= last_s:
         raise UserError(f"{name} = {given_s:g} s: must lie within {first_s:g} to {last_s:g} s of the run")
 
 
 def _settled_from(a: Floats) -> int:
-    """Index from which on every parameter stays near its median of the latter half."""
-    usual = np.median(a[a.shape[0] // 2 :], axis=0)
-    off = (np.abs(a - usual) > SETTLED_PARAMETER * np.abs(usual)).any(axis=1)
-    last = np.flatnonzero(off)
-    return min(int(last[-1]) + 1, a.shape[0] - 1) if last.size else 0
+    """Return the index from which on every parameter stays near its median over the second half."""
+    median = np.median(a[a.shape[0] // 2 :], axis=0)
+    unsettled = np.flatnonzero((np.abs(a - median) > SETTLED_PARAMETER * np.abs(median)).any(axis=1))
+    return min(int(unsettled[-1]) + 1, a.shape[0] - 1) if unsettled.size else 0
 
 
 def _unstable_from(time_s: Floats, voltage_v: Floats, margin: Floats) -> tuple[float, str]:
@@ -114,13 +113,13 @@ def _unstable_from(time_s: Floats, voltage_v: Floats, margin: Floats) -> tuple[f
 
 def _knee(time_s: Floats, voltage_v: Floats) -> float | None:
     """Return the time at which the last fall of the voltage begins [s]; None without one."""
-    edges = np.linspace(0, time_s.size - 1, WINDOWS + 1).astype(int)
+    edges = np.linspace(0, time_s.size - 1, SLOPE_WINDOWS + 1).astype(int)
     if np.unique(edges).size < edges.size:
         return None
     fall = -np.diff(voltage_v[edges]) / np.diff(time_s[edges])
-    usual = float(np.median(fall))
-    steep = fall > KNEE_SLOPE * usual
-    if usual <= 0.0 or not steep[-1]:
+    median = float(np.median(fall))
+    steep = fall > KNEE_SLOPE * median
+    if median <= 0.0 or not steep[-1]:
         return None
     gentle = np.flatnonzero(~steep)
     first = int(gentle[-1]) + 1 if gentle.size else 0
@@ -136,7 +135,7 @@ def averaged(time_s: Floats, a: Floats, window: AveragingWindow) -> Floats:
         window: t_int and t_unst.
 
     Returns:
-        Shape (16,). The last values when no sample lies between t_int and t_unst.
+        Shape (16,). If fewer than two samples lie between t_int and t_unst, the last values.
     """
     inside = (time_s >= window.t_int_s) & (time_s <= window.t_unst_s)
     if inside.sum() < 2:

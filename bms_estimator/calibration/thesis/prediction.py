@@ -1,6 +1,7 @@
 """Terminal voltage of a model with frozen parameters under a measured current: validation (5.3), chapter 6.
 
-The dynamic model has elements that follow SOC; the static one has them frozen at one SOC. Both keep E_o(SOC).
+The dynamic model has elements that depend on SOC. The static model has constant elements, those at one SOC. In both,
+E_o depends on SOC.
 """
 
 from dataclasses import dataclass, fields
@@ -17,21 +18,21 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 GRID = np.linspace(0.0, 1.0, 4001)
-
-EMPTY = 0.0
-"""SOC where a prediction ends: below it the curves of the model mean nothing."""
-JUMP = 0.1
-"""A change of the current between two samples is a jump above this share of the largest current."""
+"""SOC grid on which E_o(SOC) is inverted."""
+EMPTY_SOC = 0.0
+"""SOC at which a prediction ends. The curves of the model are undefined below."""
+JUMP_FRACTION = 0.1
+"""Minimum change of current between two samples of a jump, as a fraction of the largest current."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Measured and predicted voltage of one capture, glitches left out. All arrays have shape (n,).
+    """Measured and predicted voltage of one capture without glitches. All arrays have shape (n,).
 
     Attributes:
-        time_s: On the capture's clock [s].
-        current_a: Positive on discharge [A].
-        voltage_v: Measured [V].
+        time_s: Times on the capture's clock [s].
+        current_a: Current, positive on discharge [A].
+        voltage_v: Measured voltage [V].
         predicted_v: Predicted voltage [V].
         soc: SOC by coulomb counting, 0..1.
         overpotential_v: x2 + x3 of the model [V].
@@ -46,12 +47,12 @@ class Prediction:
 
     @property
     def error_v(self) -> Floats:
-        """Measured less predicted, (3.15) [V]."""
+        """Measured less predicted voltage, (3.15) [V]."""
         return self.voltage_v - self.predicted_v
 
     @property
     def error_percent(self) -> Floats:
-        """Magnitude of the error, of the measured voltage [%]."""
+        """Absolute error relative to the measured voltage [%]."""
         return 100.0 * np.abs(self.error_v) / self.voltage_v
 
     @property
@@ -61,9 +62,9 @@ class Prediction:
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """All samples but the first after a jump of the current: many a logger's voltage there is from before it."""
+        """Mask without the first samples after current jumps, where many loggers report a voltage from before the jump."""
         jump_a = np.abs(np.diff(self.current_a, prepend=self.current_a[0]))
-        return np.asarray(jump_a <= JUMP * np.abs(self.current_a).max())
+        return np.asarray(jump_a <= JUMP_FRACTION * np.abs(self.current_a).max())
 
     @property
     def max_percent(self) -> float:
@@ -71,25 +72,25 @@ class Prediction:
         return float(self.error_percent[self.aligned].max())
 
     def above(self, soc: float) -> "Prediction":
-        """Return the samples until SOC falls to ``soc``; at least the first sample."""
+        """Return the prediction up to the sample at which SOC falls to ``soc``; at least the first sample."""
         end = max(int(np.argmax(np.r_[self.soc <= soc, True])), 1)
         return Prediction(**{column.name: getattr(self, column.name)[:end] for column in fields(self)})
 
 
 def predict(
-    cell: CellModel, samples: SampleBlock, initial_soc: float, *, a: Floats | None = None, lowest_soc: float = EMPTY
+    cell: CellModel, samples: SampleBlock, initial_soc: float, *, a: Floats | None = None, lowest_soc: float = EMPTY_SOC
 ) -> Prediction:
-    """Run the frozen model over a capture, from rest.
+    """Simulate the frozen model over a capture, from rest.
 
     Args:
-        cell: Capacity and OCV, and the elements when ``a`` is left out.
-        samples: Dtype ``SAMPLE``, raw.
+        cell: Capacity and OCV, and the elements without ``a``.
+        samples: Raw samples, dtype ``SAMPLE``.
         initial_soc: SOC 0..1 at the first sample.
-        a: a1..a15 at index 1..15, to take in place of the cell's.
-        lowest_soc: The prediction ends where SOC falls below it; the model's delta1, delta2 end it as well.
+        a: a1..a15 at index 1..15; None: the cell's.
+        lowest_soc: SOC below which the prediction ends. It also ends at the model's delta1 or delta2.
 
     Raises:
-        UserError: No sample is good, or SOC is too low from the first one on.
+        UserError: No sample is good, or SOC is too low at the first one.
     """
     name = f"capture for {cell.cell.name}"
     good = remove_glitches(samples, name)
@@ -119,13 +120,13 @@ def predict(
 
 
 def open_circuit(cell: CellModel, soc: Floats) -> Floats:
-    """E_o(SOC) of the cell [V], on the kernels' curve."""
+    """Return E_o(SOC) of the cell by the interpolation of the kernels [V]."""
     grid = ocv_grid(cell)
     return np.array([ocv(x, *grid) for x in soc])
 
 
 def static_elements(a: Floats, soc: float) -> Floats:
-    """a1..a15 of a model with constant elements, those at ``soc``: the static model of chapter 6."""
+    """Return a1..a15 of the static model of chapter 6, whose elements are those at ``soc``."""
     frozen = np.array(a)
     for offset, element in ((3, r_ts), (6, r_tl), (9, c_ts), (12, c_tl), (15, r_s)):
         frozen[offset] = element(soc, a)
@@ -134,19 +135,19 @@ def static_elements(a: Floats, soc: float) -> Floats:
 
 
 def _unstable_below(a: Floats) -> float:
-    """SOC below which a capacitance is negative, (2.11), (2.12); 0 when none is."""
+    """Return the SOC below which a capacitance is negative, (2.11), (2.12), with a margin of 5 %; 0 if none is."""
     worst = max(delta(a[i + 1], a[i + 2], a[i]) for i in (7, 10))
     return 1.05 * worst + 1e-4 if worst > 0.0 else 0.0
 
 
 def soc_by_interpolation(cell: CellModel, run: Prediction) -> tuple[Floats, Floats]:
-    """SOC from the measured voltage and the model's overpotentials.
+    """Return SOC by the measured voltage and the model's overpotentials.
 
-    E_o = y + x2 + x3 + i R_s (2.4), looked up in the inverse of E_o(SOC). R_s and the overpotentials depend on SOC but
-    weakly, they are taken at the counted one.
+    E_o = y + x2 + x3 + i R_s (2.4) is inverted to SOC. R_s and the overpotentials are those at the counted SOC, because
+    they depend on SOC only weakly.
 
     Returns:
-        SOC (0..1) and E_o [V], each of the run's shape. Outside the curve the nearest end of it.
+        SOC (0..1) and E_o [V], each of the run's shape. Outside the curve, SOC is that of the nearest end.
     """
     a = cell.a
     ohmic_v = run.current_a * np.array([r_s(x, a) for x in run.soc])

@@ -1,12 +1,12 @@
-"""Step 3: R_s from the model's other elements by (4.2), and a13..a15 fitted to it, from several currents.
+"""Step 3: R_s by (4.2) from several currents, and a13..a15 fitted to R_s.
 
-(4.2) is printed with the opposite sign: solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive.
-x2 and x3 are those of the model with frozen a1..a12: the observer's own settle so that (4.1) meets y, and leave nothing
-for R_s.
+(4.2) is printed with the opposite sign: solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive. x2 and
+x3 are those of the model with frozen a1..a12. The observer's x2 and x3 would absorb i R_s, because (4.1) drives the
+estimated voltage to y.
 
-(4.2) as printed divides by the current: an error of the open-circuit voltage of 10 mV is 65 mohm at C/20 and 2 mohm at
-1.5C, and a plain mean over currents takes both for the same (E19). Here R_s is least squares on the voltage that is
-missing, i R_s: each value of (4.2) weighs as its current squared.
+(4.2) as printed divides by the current: an error of the open-circuit voltage of 10 mV becomes 65 mohm at C/20 and 2 mohm
+at 1.5C. A plain mean over currents weights both equally (erratum 19). Here R_s is fitted to i R_s by least squares, so
+that each value of (4.2) has its squared current as weight.
 """
 
 from collections.abc import Sequence
@@ -16,28 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.thesis.prediction import Prediction, open_circuit
-from bms_estimator.kernels.observer.series_resistance import BINS, SMALLEST_CURRENT_C
+from bms_estimator.kernels.observer.series_resistance import BINS, MIN_CURRENT_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Resistance
 from bms_estimator.model.errors import UserError
 
 LOWEST_SOC = 0.1
-"""(4.2) is not fitted below this SOC: the elements leave their form there."""
+"""SOC below which (4.2) is not fitted, because real elements deviate from (2.5)-(2.9) there."""
 EXPONENTS = np.geomspace(2.0, 200.0, 200)
-"""Exponents a14 tried."""
-TINY = 1e-300
-"""Lower limit of the determinant of the normal equations; avoids division by zero."""
+"""Candidate exponents a14."""
+MIN_DETERMINANT = 1e-300
+"""Lower limit of the determinant of the normal equations, against division by zero."""
 MIN_BINS = 5
 """Minimum number of bins for a fit of three parameters."""
 
 
 @dataclass(frozen=True)
 class SeriesResistance:
-    """R_s over SOC, one value for each of ``BINS`` that holds data. All arrays have shape (n,).
+    """R_s over SOC, one value for each of ``BINS`` with data. All arrays have shape (n,).
 
     Attributes:
         soc: Mean SOC of the bin's samples, 0..1.
-        r_s_ohm: (4.2) over the bin, by least squares on the voltage [ohm].
+        r_s_ohm: R_s (4.2) of the bin, by least squares on the voltage [ohm].
         weight: Mean of the current squared over the bin, summed over the loads [A^2].
     """
 
@@ -52,8 +52,8 @@ class SeriesResistanceFit:
 
     Attributes:
         a: a13 [ohm], a14, a15 [ohm].
-        std: Standard errors; NaN for one at its bound.
-        rms_ohm: RMS of the residual, weighted as the fit is [ohm].
+        std: Standard errors; NaN for a parameter at its bound.
+        rms_ohm: RMS of the residual with the weights of the fit [ohm].
     """
 
     a: Floats
@@ -61,7 +61,7 @@ class SeriesResistanceFit:
     rms_ohm: float
 
     def __call__(self, soc: Floats) -> Floats:
-        """R_s(SOC) [ohm], (2.9)."""
+        """Return R_s(SOC) [ohm], (2.9)."""
         return np.asarray(self.a[0] * np.exp(-self.a[1] * soc) + self.a[2], dtype=np.float64)
 
     @property
@@ -72,22 +72,22 @@ class SeriesResistanceFit:
 
 
 def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
-    """R_s by (4.2) for all samples with current.
+    """Return R_s by (4.2) over all samples with current.
 
     Args:
-        cell: Supplies the open-circuit voltage.
-        run: A capture with the x2 + x3 that frozen a1..a12 give under its current.
+        cell: Cell with the open-circuit voltage.
+        run: Prediction with x2 + x3 of frozen a1..a12.
 
     Raises:
         UserError: No current flows.
     """
-    flowing = np.abs(run.current_a) > SMALLEST_CURRENT_C * cell.cell.capacity_ah
+    flowing = np.abs(run.current_a) > MIN_CURRENT_C * cell.cell.capacity_ah
     if not flowing.any():
         raise UserError(
-            f"R_s by (4.2) needs a current: none above {SMALLEST_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
+            f"R_s by (4.2) needs a current: none above {MIN_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
             f"{np.abs(run.current_a).max():.3f} A"
         )
-    missing_v = (open_circuit(cell, run.soc) - run.overpotential_v - run.voltage_v)[flowing]
+    resistive_v = (open_circuit(cell, run.soc) - run.overpotential_v - run.voltage_v)[flowing]
     soc, current_a = run.soc[flowing], run.current_a[flowing]
     bins = _bins(soc)
     count = np.bincount(bins)
@@ -95,13 +95,13 @@ def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
     squares = np.bincount(bins, current_a**2)[used]
     return SeriesResistance(
         soc=np.bincount(bins, soc)[used] / count[used],
-        r_s_ohm=np.bincount(bins, current_a * missing_v)[used] / squares,  # (4.2), with the sign of (2.4)
+        r_s_ohm=np.bincount(bins, current_a * resistive_v)[used] / squares,  # (4.2), with the sign of (2.4)
         weight=squares / count[used],
     )
 
 
 def mean_of(curves: Sequence[SeriesResistance]) -> SeriesResistance:
-    """Return the weighted mean over several currents where at least one has data: Fig. 22 and 31."""
+    """Return the weighted mean over captures at several currents, in each bin with data: Fig. 22 and 31."""
     soc, r_s, weight = (np.concatenate([getattr(c, name) for c in curves]) for name in ("soc", "r_s_ohm", "weight"))
     bins = _bins(soc)
     total: Floats = np.bincount(bins, weight).astype(np.float64)
@@ -118,7 +118,7 @@ def _bins(soc: Floats) -> NDArray[np.int64]:
 
 
 def summed(record: np.void) -> SeriesResistance:
-    """Return the curve from the sums of an estimator; SOC is the middle of each bin.
+    """Return R_s over SOC by the sums in an estimator's state, at the middle of each bin.
 
     Args:
         record: Record of dtype ESTIMATOR_STATE.
@@ -130,17 +130,17 @@ def summed(record: np.void) -> SeriesResistance:
 
 
 def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> SeriesResistanceFit:
-    """Fit (2.9) by non-negative weighted linear least squares for each of ``EXPONENTS``; the best fit is returned.
+    """Fit (2.9) by non-negative weighted linear least squares for each of ``EXPONENTS``; return the best fit.
 
     Raises:
-        UserError: Too few bins of SOC with data.
+        UserError: Too few SOC bins with data.
     """
     used = curve.soc >= lowest_soc
     soc, r_s = curve.soc[used], curve.r_s_ohm[used]
     if soc.size < MIN_BINS:
         raise UserError(f"R_s is known in {soc.size} steps of SOC, at least {MIN_BINS} are needed for a13..a15")
     weight = curve.weight[used] / curve.weight[used].mean()
-    a13, exponent, a15 = _best(soc, r_s, weight)
+    a13, exponent, a15 = _best_fit(soc, r_s, weight)
     a, root = np.array([a13, exponent, a15]), np.sqrt(weight)
     norm = float(np.linalg.norm(root * (r_s - a13 * np.exp(-exponent * soc) - a15)))
     decay = np.exp(-exponent * soc)
@@ -152,17 +152,17 @@ def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> S
     return SeriesResistanceFit(a=a, std=std, rms_ohm=norm / float(np.sqrt(soc.size)))
 
 
-def _best(soc: Floats, r_s: Floats, weight: Floats) -> tuple[float, float, float]:
+def _best_fit(soc: Floats, r_s: Floats, weight: Floats) -> tuple[float, float, float]:
     """Return a13 >= 0, a14 and a15 >= 0 with the smallest weighted sum of squares, by normal equations."""
     decay = np.exp(-EXPONENTS[:, None] * soc)
     dd, d1, dr = decay**2 @ weight, decay @ weight, decay @ (weight * r_s)
     one, r1 = weight.sum(), (weight * r_s).sum()
-    determinant = np.maximum(dd * one - d1**2, TINY)
+    determinant = np.maximum(dd * one - d1**2, MIN_DETERMINANT)
     inside = (dr * one - d1 * r1) / determinant, (dd * r1 - d1 * dr) / determinant
     flat = np.zeros_like(dd), np.full_like(dd, max(r1 / one, 0.0))
     falling = np.maximum(dr / dd, 0.0), np.zeros_like(dd)
     a13, a15 = (np.stack(parts) for parts in zip(inside, flat, falling, strict=True))
     cost = a13**2 * dd + 2.0 * a13 * a15 * d1 + a15**2 * one - 2.0 * (a13 * dr + a15 * r1)
     cost[(a13 < 0.0) | (a15 < 0.0)] = np.inf
-    edge, j = np.unravel_index(np.argmin(cost), cost.shape)
-    return float(a13[edge, j]), float(EXPONENTS[j]), float(a15[edge, j])
+    case, j = np.unravel_index(np.argmin(cost), cost.shape)
+    return float(a13[case, j]), float(EXPONENTS[j]), float(a15[case, j])

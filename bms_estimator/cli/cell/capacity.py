@@ -106,7 +106,7 @@ def _anchor(anchor: Anchor, off: float) -> AnchorResult:
         time_s=anchor.time_s,
         rest_s=anchor.rest.duration_s,
         ocv_v=anchor.rest.ocv_v,
-        ocv_std_v=anchor.own_v,
+        ocv_std_v=anchor.own_std_v,
         soc=anchor.soc,
         soc_std=anchor.soc_std,
         counted_ah=anchor.counted_ah,

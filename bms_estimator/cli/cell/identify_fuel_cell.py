@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.cli.options.capture_options import name_of, unlike
-from bms_estimator.kernels.kalman_filter.temperature import COLDEST_C, HOTTEST_C
+from bms_estimator.kernels.kalman_filter.temperature import MAX_PLAUSIBLE_C, MIN_PLAUSIBLE_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
@@ -53,8 +53,10 @@ def identify_fuel_cell(
     as_json: bool,
 ) -> None:
     """Identify, write the file and print the outcome; arguments as of ``identify_command``."""
-    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
-        raise UserError(f"--temperature-c {temperature_c:g}: must lie within {COLDEST_C:g} and {HOTTEST_C:g} C")
+    if temperature_c is not None and not MIN_PLAUSIBLE_C <= temperature_c <= MAX_PLAUSIBLE_C:
+        raise UserError(
+            f"--temperature-c {temperature_c:g}: must lie within {MIN_PLAUSIBLE_C:g} and {MAX_PLAUSIBLE_C:g} C"
+        )
     start = load_fuel_cell(cell)
     names = unlike([name_of(path) for path in paths], paths)
     sources = [_source(*one, start, temperature_c, current_sign) for one in zip(names, paths, strict=True)]
@@ -66,7 +68,7 @@ def identify_fuel_cell(
             value=getattr(fit.model.fuel_cell, key),
             std=fit.model.std[key] * getattr(fit.model.fuel_cell, key) if key in fit.model.std else None,
             of_start=getattr(start.fuel_cell, key),
-            reason=fit.not_told.get(key),
+            reason=fit.undetermined.get(key),
         )
         for key in KEYS
     }
@@ -96,7 +98,7 @@ def _source(
     good = _usable(path, model, current_a, voltage_v)
     if time_s is not None:
         good &= np.diff(time_s, prepend=-np.inf) > 0.0
-    sensed = (sensed_c >= COLDEST_C) & (sensed_c <= HOTTEST_C)
+    sensed = (sensed_c >= MIN_PLAUSIBLE_C) & (sensed_c <= MAX_PLAUSIBLE_C)
     celsius = np.where(sensed, sensed_c, math.nan if temperature_c is None else temperature_c)
     return Source(
         name=name,
@@ -127,7 +129,7 @@ def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floa
 
 def _remarks(cell: str, fit: FuelCellFit) -> list[str]:
     fits = ", ".join(f"{name} ({1e3 * rms_v:.1f} mV RMS)" for name, rms_v in fit.rms_v.items())
-    kept = f"As in the file, because the data do not tell: {', '.join(fit.not_told)}." if fit.not_told else ""
+    kept = f"As in the file, because the data do not tell: {', '.join(fit.undetermined)}." if fit.undetermined else ""
     return [line for line in (f"Identified from {fits}, begun at {Path(cell).name}.", kept) if line]
 
 
@@ -140,4 +142,4 @@ def _tables(out: Path, values: dict[str, Value], fit: FuelCellFit, seconds: floa
         std = "as before" if v.std is None else f"{v.std:.2g}"
         table.add_row(key, f"{v.value:.{DIGITS}g}", std, f"{v.of_start:.{DIGITS}g}")
     left = [f"{name}: {1e3 * rms_v:.1f} mV RMS" for name, rms_v in fit.rms_v.items()]
-    return Group(table, *left, *(f"{key}: {reason}" for key, reason in fit.not_told.items()), f"{seconds:.1f} s")
+    return Group(table, *left, *(f"{key}: {reason}" for key, reason in fit.undetermined.items()), f"{seconds:.1f} s")

@@ -14,7 +14,7 @@ from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.restore import copy_known_fields
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
-from bms_estimator.kernels.packed_record import WORD_BYTES, pack, room, symmetry_map, unpack
+from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 
 Fields = Mapping[str, NDArray[Any]]
@@ -70,7 +70,7 @@ class WorkRecord:
         self.record: NDArray[np.void] = np.zeros(1, dtype)
         self._words = self.record.view(np.uint64)
         self._mirror = symmetry_map(dtype)
-        self._packed = room(self._words.size)
+        self._packed = packed_buffer(self._words.size)
 
     @property
     def delivery(self) -> np.void:

@@ -1,4 +1,4 @@
-"""Charge and energy through the terminals from sample to sample."""
+"""Sums of the charge and energy through the terminals."""
 
 import numpy as np
 
@@ -8,27 +8,27 @@ from bms_estimator.numba_cache import njit
 
 FLOW_SUMS = np.dtype(
     [
-        ("charge_as", "f8"),  # since the last reading, positive on discharge [A s]
-        ("energy_ws", "f8"),  # the same [W s]
-        ("last_s", "f8"),  # the last sample: its time stamp [s], ...
-        ("last_a", "f8"),  # ... current [A] ...
-        ("last_w", "f8"),  # ... and power [W]
-        ("step_s", "f8"),  # to it from the one before [s]
-        ("counted", "i8"),  # 1: there is a last sample
+        ("charge_as", "f8"),  # charge since the last reading of the sums, positive on discharge [A s]
+        ("energy_ws", "f8"),  # energy since the last reading of the sums, positive on discharge [W s]
+        ("last_s", "f8"),  # time stamp of the last sample [s]
+        ("last_a", "f8"),  # current of the last sample [A]
+        ("last_w", "f8"),  # power of the last sample [W]
+        ("step_s", "f8"),  # time between the last two samples [s]
+        ("counted", "i8"),  # 1: a last sample exists
     ],
     align=True,
 )
-"""All zero: no sample yet."""
+"""Running sums. A record of zeros has had no sample."""
 
 
 @njit(cache=True)
 def accumulate_charge_energy(sums: Records, trace: Records, gap_s: float) -> None:
-    """Add accepted samples: straight between them, nothing over a gap nor where the clock was set back.
+    """Add accepted samples by trapezoids, without gaps and steps of a clock that was set back.
 
     Args:
         sums: Shape (1,), dtype FLOW_SUMS; updated in place.
         trace: Shape (n,), dtype TRACE.
-        gap_s: A longer step is a gap, unless the one before was about as long [s]; as ``kernels.step.is_gap``.
+        gap_s: Minimum duration of a gap, unless the previous step was about as long [s]; as in ``kernels.step.is_gap``.
     """
     s = sums[0]
     for j in range(trace.shape[0]):

@@ -1,4 +1,4 @@
-"""Sums over an hour of a pack, block by block."""
+"""Sums over the samples of one hour of a pack."""
 
 import math
 
@@ -10,20 +10,20 @@ from bms_estimator.numba_cache import njit
 
 HOUR_SUMS = np.dtype(
     [
-        ("store", "u8"),  # store of the last block; another one has another clock; 0: no block yet
-        ("last_s", "f8"),  # the last sample: its time stamp [s],
-        ("last_a", "f8"),  # current [A]
-        ("last_w", "f8"),  # and power [W]; these and what follows go on from hour to hour
-        ("step_s", "f8"),  # to it from the one before [s]
+        ("store", "u8"),  # store of the last block, because each store has its own clock; 0: no block yet
+        ("last_s", "f8"),  # time stamp of the last sample [s]
+        ("last_a", "f8"),  # current of the last sample [A]
+        ("last_w", "f8"),  # power of the last sample [W]
+        ("step_s", "f8"),  # time between the last two samples [s]
         ("rest_s", "f8"),  # time with almost no current [s]
-        ("outliers_before", "i8"),  # counters of the estimator at the hour's begin
-        ("searches_before", "i8"),
-        ("samples", "i8"),  # accepted; from here on of this hour alone
-        ("dropped", "i8"),  # samples that were not
-        ("gaps", "i8"),  # steps over which nothing is counted
+        ("outliers_before", "i8"),  # outlier counter of the estimator at the start of the hour
+        ("searches_before", "i8"),  # counter of SOC re-initializations at the start of the hour
+        ("samples", "i8"),  # accepted samples; this field and all later ones restart with each hour (OF_HOUR)
+        ("dropped", "i8"),  # rejected samples
+        ("gaps", "i8"),  # steps over which charge and energy are not counted
         ("lost_blocks", "i8"),  # blocks that were never received
         ("seen_s", "f8"),  # measured time [s]
-        ("out_as", "f8"),  # charge [A s] and energy [W s], each step in its direction
+        ("out_as", "f8"),  # charge [A s] and energy [W s], separately for discharging (out) and charging (in) steps
         ("in_as", "f8"),
         ("out_ws", "f8"),
         ("in_ws", "f8"),
@@ -33,17 +33,17 @@ HOUR_SUMS = np.dtype(
         ("sum_a", "f8"),
         ("min_a", "f8"),
         ("max_a", "f8"),
-        ("temperatures", "i8"),  # samples with a value
+        ("temperatures", "i8"),  # samples with a temperature
         ("sum_c", "f8"),
         ("min_c", "f8"),
         ("max_c", "f8"),
-        ("innovations", "i8"),  # samples with one
+        ("innovations", "i8"),  # samples with an innovation
         ("sum_innovation_v2", "f8"),
         ("min_margin", "f8"),  # soc - max(delta_1, delta_2)
     ],
     align=True,
 )
-"""All zero: no sample yet."""
+"""Running sums. A record of zeros has had no sample."""
 OF_HOUR = tuple(HOUR_SUMS.names or ())[(HOUR_SUMS.names or ()).index("samples") :]
 """Fields that restart with each hour."""
 
@@ -55,33 +55,33 @@ def accumulate_hour(sums: Records, trace: Records, new_clock: bool, gap_s: float
     Args:
         sums: Shape (1,), dtype HOUR_SUMS; updated in place.
         trace: Shape (n,), dtype TRACE.
-        new_clock: The time stamps have nothing to do with those before.
-        gap_s: A longer step is a gap, unless the one before was about as long [s].
-        rest_a: Currents below this count as zero [A].
+        new_clock: True if the time stamps have another time base than those of earlier blocks.
+        gap_s: Minimum duration of a gap, unless the previous step was about as long [s].
+        rest_a: Maximum current that counts as zero [A].
     """
     h = sums[0]
-    known = h.store != 0 and not new_clock
+    has_previous = h.store != 0 and not new_clock
     for j in range(trace.shape[0]):
         x = trace[j]
-        add_step(h, x, known, gap_s, rest_a)
+        add_step(h, x, has_previous, gap_s, rest_a)
         add_values(h, x)
-        known = True
+        has_previous = True
 
 
 @njit(cache=True)
-def add_step(h: Record, x: Record, known: bool, gap_s: float, rest_a: float) -> None:
-    """Charge, energy and time since the sample before: straight between the two, nothing over a gap.
+def add_step(h: Record, x: Record, has_previous: bool, gap_s: float, rest_a: float) -> None:
+    """Add charge, energy and time since the previous sample by a trapezoid; over a gap only count the gap.
 
     Args:
         h: Record of HOUR_SUMS.
         x: Record of TRACE.
-        known: There is one before, on the same clock.
+        has_previous: True if a previous sample with an equal time base exists.
         gap_s: As in ``accumulate_hour``.
         rest_a: As in ``accumulate_hour``.
     """
     power_w, dt_s = x.voltage_v * x.current_a, x.time_s - h.last_s
-    seen = known and 0.0 < dt_s <= max(gap_s, GAP_RATIO * h.step_s)
-    if seen:
+    measured = has_previous and 0.0 < dt_s <= max(gap_s, GAP_RATIO * h.step_s)
+    if measured:
         charge_as, energy_ws = 0.5 * dt_s * (h.last_a + x.current_a), 0.5 * dt_s * (h.last_w + power_w)
         h.seen_s += dt_s
         h.out_as += max(charge_as, 0.0)
@@ -90,14 +90,14 @@ def add_step(h: Record, x: Record, known: bool, gap_s: float, rest_a: float) -> 
         h.in_ws += max(-energy_ws, 0.0)
     elif h.store != 0:
         h.gaps += 1
-    h.step_s = dt_s if known and dt_s > 0.0 else 0.0
-    h.rest_s = h.rest_s + dt_s if seen and abs(x.current_a) <= rest_a else 0.0
+    h.step_s = dt_s if has_previous and dt_s > 0.0 else 0.0
+    h.rest_s = h.rest_s + dt_s if measured and abs(x.current_a) <= rest_a else 0.0
     h.last_s, h.last_a, h.last_w = x.time_s, x.current_a, power_w
 
 
 @njit(cache=True)
 def add_values(h: Record, x: Record) -> None:
-    """Means and extremes. Records as in ``add_step``."""
+    """Add a sample to the sums and extremes. Records as in ``add_step``."""
     first = h.samples == 0
     h.samples += 1
     h.sum_v += x.voltage_v
@@ -111,8 +111,8 @@ def add_values(h: Record, x: Record) -> None:
         h.innovations += 1
         h.sum_innovation_v2 += x.innovation_v * x.innovation_v
     if math.isfinite(x.temperature_c):
-        told = h.temperatures > 0
+        has_extremes = h.temperatures > 0
         h.temperatures += 1
         h.sum_c += x.temperature_c
-        h.min_c = min(h.min_c, x.temperature_c) if told else x.temperature_c
-        h.max_c = max(h.max_c, x.temperature_c) if told else x.temperature_c
+        h.min_c = min(h.min_c, x.temperature_c) if has_extremes else x.temperature_c
+        h.max_c = max(h.max_c, x.temperature_c) if has_extremes else x.temperature_c

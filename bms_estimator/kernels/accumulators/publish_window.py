@@ -10,16 +10,16 @@ from bms_estimator.numba_cache import njit
 WINDOW_SUMS = np.dtype(
     [
         ("samples", "i8"),
-        ("first_s", "f8"),  # time stamp of the first [s]
+        ("first_s", "f8"),  # time stamp of the first sample [s]
         ("voltage_v", "f8"),
         ("current_a", "f8"),
         ("power_w", "f8"),
-        ("temperatures", "i8"),  # samples with a value
+        ("temperatures", "i8"),  # samples with a temperature
         ("temperature_c", "f8"),
     ],
     align=True,
 )
-"""All zero: no sample yet."""
+"""Running sums. A record of zeros has had no sample."""
 
 
 @njit(cache=True)

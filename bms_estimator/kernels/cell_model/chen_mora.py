@@ -1,4 +1,4 @@
-"""The cell of Chen and Mora: its elements over SOC and its exact response to a held current.
+"""Cell model of Chen and Mora: elements over SOC, and exact response to a constant current.
 
 Parameters have their own index: ``a[1]`` is a1, ``a[0]`` is unused. Voltages in V, currents in A
 (positive on discharge), resistances in ohm, capacitances in F, SOC 0..1.
@@ -12,58 +12,58 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 PARAMETERS = 16
-"""a1..a15 at their own index; index 0 is unused."""
+"""Length of an array with a1..a15 at index 1..15; index 0 is unused."""
 
 State = tuple[float, float, float]
 """SOC (0..1), v_ts [V], v_tl [V]."""
 
 OCV_POINTS = 401
-"""Nodes of the OCV grid, evenly spaced over SOC 0..1."""
+"""Number of nodes of the OCV grid, evenly spaced over SOC 0..1."""
 INVERSE_ERROR_V = 1e-10
 """Tolerance of the voltage when the OCV is inverted [V]."""
 
 
 @njit(cache=True)
 def r_ts(soc: float, a: Floats) -> float:
-    """Short-term resistance R_ts(SOC) [ohm], (2.5)."""
+    """Return the short-term resistance R_ts(SOC) [ohm], (2.5)."""
     return a[1] * math.exp(-a[2] * soc) + a[3]  # (2.5)
 
 
 @njit(cache=True)
 def r_tl(soc: float, a: Floats) -> float:
-    """Long-term resistance R_tl(SOC) [ohm], (2.6)."""
+    """Return the long-term resistance R_tl(SOC) [ohm], (2.6)."""
     return a[4] * math.exp(-a[5] * soc) + a[6]  # (2.6)
 
 
 @njit(cache=True)
 def c_ts(soc: float, a: Floats) -> float:
-    """Short-term capacitance C_ts(SOC) [F], (2.7); negative below delta1."""
+    """Return the short-term capacitance C_ts(SOC) [F], (2.7); negative below delta1."""
     return -a[7] * math.exp(-a[8] * soc) + a[9]  # (2.7)
 
 
 @njit(cache=True)
 def c_tl(soc: float, a: Floats) -> float:
-    """Long-term capacitance C_tl(SOC) [F], (2.8); negative below delta2."""
+    """Return the long-term capacitance C_tl(SOC) [F], (2.8); negative below delta2."""
     return -a[10] * math.exp(-a[11] * soc) + a[12]  # (2.8)
 
 
 @njit(cache=True)
 def r_s(soc: float, a: Floats) -> float:
-    """Series resistance R_s(SOC) [ohm], (2.9)."""
+    """Return the series resistance R_s(SOC) [ohm], (2.9)."""
     return a[13] * math.exp(-a[14] * soc) + a[15]  # (2.9)
 
 
 @njit(cache=True)
 def emf(soc: float, a: Floats) -> float:
-    """Open-circuit EMF E_o(SOC) [V], (2.10)."""
+    """Return the open-circuit EMF E_o(SOC) [V], (2.10)."""
     return -a[16] * math.exp(-a[17] * soc) + a[18] + a[19] * soc - a[20] * soc**2 + a[21] * soc**3  # (2.10)
 
 
 @njit(cache=True)
 def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
-    """Open-circuit voltage [V] at ``soc`` from a grid of values and slopes (cubic Hermite).
+    """Return the open-circuit voltage [V] at ``soc`` by cubic Hermite interpolation of a grid of values and slopes.
 
-    Beyond 0..1 the curve continues with its end slope, so that a drifting SOC still has a finite, increasing curve.
+    Beyond 0..1 the curve continues with its end slope, so that it is finite and increasing for a drifting SOC.
 
     Args:
         soc: State of charge.
@@ -85,9 +85,10 @@ def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
 
 @njit(cache=True)
 def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
-    """SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of the grid, thesis 7.1.
+    """Return the SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of ``ocv``, thesis 7.1.
 
-    Bisection of the nodes, false position (Illinois) between two: right for every increasing curve, and the nearest end outside its range.
+    The search bisects the nodes and uses false position (Illinois) between two nodes. It converges for every increasing
+    curve. Outside the curve's range the result is the nearest end.
     """
     last = ocv_v.shape[0] - 1
     if voltage_v <= ocv_v[0]:
@@ -102,41 +103,41 @@ def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
         else:
             above = middle
     low, high = below / last, above / last
-    miss_low, miss_high = ocv_v[below] - voltage_v, ocv_v[above] - voltage_v
+    error_low, error_high = ocv_v[below] - voltage_v, ocv_v[above] - voltage_v
     side = 0
     soc = low
     for _ in range(50):
-        soc = (low * miss_high - high * miss_low) / (miss_high - miss_low)
-        miss = ocv(soc, ocv_v, ocv_slope_v) - voltage_v
-        if abs(miss) < INVERSE_ERROR_V:
+        soc = (low * error_high - high * error_low) / (error_high - error_low)
+        error = ocv(soc, ocv_v, ocv_slope_v) - voltage_v
+        if abs(error) < INVERSE_ERROR_V:
             break
-        if miss < 0.0:
-            low, miss_low = soc, miss
-            miss_high *= 0.5 if side == -1 else 1.0
+        if error < 0.0:
+            low, error_low = soc, error
+            error_high *= 0.5 if side == -1 else 1.0
             side = -1
         else:
-            high, miss_high = soc, miss
-            miss_low *= 0.5 if side == 1 else 1.0
+            high, error_high = soc, error
+            error_low *= 0.5 if side == 1 else 1.0
             side = 1
     return soc
 
 
 @njit(cache=True)
 def rc_step(v_rc: float, current_a: float, r_ohm: float, tau_s: float, dt_s: float) -> float:
-    """Voltage of an RC branch after ``dt_s`` under constant current, (2.2)-(2.3) solved exactly [V]."""
+    """Return the voltage of an RC pair after ``dt_s`` under constant current, (2.2)-(2.3) solved exactly [V]."""
     decay = math.exp(-dt_s / tau_s)
     return v_rc * decay + current_a * r_ohm * (1.0 - decay)
 
 
 @njit(cache=True)
 def cell_step(x: State, current_a: float, dt_s: float, capacity_as: float, a: Floats) -> State:
-    """State x = (soc, v_ts, v_tl) after ``dt_s`` under constant current, (2.1)-(2.3).
+    """Return the state x = (soc, v_ts, v_tl) after ``dt_s`` under constant current, (2.1)-(2.3).
 
-    The elements are held at the SOC of mid-step, which makes the step second order in ``dt_s``.
+    The elements are those at the SOC in the middle of the step, which makes the step second order in ``dt_s``.
 
     Args:
         x: SOC (0..1), v_ts [V], v_tl [V].
-        current_a: Discharge current [A], held over the step.
+        current_a: Discharge current over the step [A].
         dt_s: Step [s].
         capacity_as: Capacity C_c [A s].
         a: a1..a21 at index 1..21.
@@ -155,19 +156,19 @@ def cell_step(x: State, current_a: float, dt_s: float, capacity_as: float, a: Fl
 
 @njit(cache=True)
 def terminal_voltage(x: State, current_a: float, a: Floats) -> float:
-    """Terminal voltage y [V] of state x under ``current_a``, (2.4)."""
+    """Return the terminal voltage y [V] of state x under ``current_a``, (2.4)."""
     soc, v_ts, v_tl = x
     return emf(soc, a) - v_ts - v_tl - current_a * r_s(soc, a)  # (2.4)
 
 
 @njit(cache=True)
 def simulate_cell(x: State, time_s: Floats, current_a: Floats, capacity_as: float, a: Floats) -> tuple[Floats, Floats]:
-    """Terminal voltage [V] and SOC at every ``time_s`` under a current held between samples, (2.1)-(2.4).
+    """Simulate terminal voltage [V] and SOC under a current that is constant between samples, (2.1)-(2.4).
 
     Args:
         x: State at the first sample: SOC (0..1), v_ts [V], v_tl [V].
         time_s: Shape (n,), increasing [s].
-        current_a: Shape (n,), discharge positive [A]; ``current_a[j]`` holds from ``time_s[j]`` on.
+        current_a: Shape (n,), discharge positive [A]; ``current_a[j]`` flows from ``time_s[j]`` to ``time_s[j + 1]``.
         capacity_as: Capacity C_c [A s].
         a: a1..a21 at index 1..21.
 
@@ -187,7 +188,7 @@ def simulate_cell(x: State, time_s: Floats, current_a: Floats, capacity_as: floa
 
 @njit(cache=True)
 def delta(exponent: float, offset: float, amplitude: float) -> float:
-    """SOC below which a capacitance -amplitude e^(-exponent SOC) + offset is negative: (2.11), (2.12).
+    """Return the SOC below which a capacitance -amplitude e^(-exponent SOC) + offset is negative: (2.11), (2.12).
 
     delta1 = delta(a8, a9, a7), delta2 = delta(a11, a12, a10). Negative when the capacitance is
     positive over the whole of 0..1.
@@ -197,5 +198,5 @@ def delta(exponent: float, offset: float, amplitude: float) -> float:
 
 @njit(cache=True)
 def crossing(soc: float, offset: float, amplitude: float) -> float:
-    """Return the bound that a8 (a11) must exceed at ``soc``: right side of the condition in Lemma 4.1.1, Fig. 19."""
+    """Return the bound of a8 or a11 at ``soc``: the right side of the condition in Lemma 4.1.1, Fig. 19."""
     return -math.log(offset / amplitude) / soc

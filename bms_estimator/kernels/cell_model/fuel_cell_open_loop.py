@@ -1,4 +1,4 @@
-"""Response of a fuel cell to a measured current; the voltage is not used."""
+"""Open-loop response of a fuel cell to a measured current."""
 
 import numpy as np
 
@@ -12,13 +12,13 @@ from bms_estimator.numba_cache import njit
 def open_loop(
     file: Floats, theta: Floats, time_s: Floats, current_a: Floats, temperature_c: Floats
 ) -> tuple[Floats, Floats]:
-    """Voltage at each sample, from the state that the first current settles to.
+    """Simulate the voltage at each sample, from the steady state under the first current.
 
     Args:
-        file: What the file gives, shape (16,).
+        file: Constants of the file, shape (16,).
         theta: ln of each parameter over the file's, shape (8,).
         time_s: Shape (n,), increasing [s].
-        current_a: Shape (n,), positive when the stack delivers [A].
+        current_a: Shape (n,), positive when the stack delivers power [A].
         temperature_c: Shape (n,), NaN without a sensor [C].
 
     Returns:
@@ -40,7 +40,7 @@ def open_loop(
 
 @njit(cache=True)
 def polarisation(file: Floats, theta: Floats, current_a: Floats, temperature_c: Floats) -> tuple[Floats, Floats]:
-    """Voltage that the stack settles to under each current; arguments and result as of ``open_loop``."""
+    """Return the steady-state voltage under each current. Arguments and result are those of ``open_loop``."""
     n = current_a.size
     voltage_v, psi = np.empty(n), np.zeros((n, theta.size))
     x, dx, given = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)

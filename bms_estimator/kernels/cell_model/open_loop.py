@@ -1,7 +1,7 @@
-"""Response of a cell's branches to a measured current, from rest; the voltage is not used.
+"""Open-loop response of a cell's RC pairs to a measured current, from rest.
 
-Between two samples the current is taken as the filter takes it (``interpolated_current``, ``ramp_correction``), of a source that is no slower
-than one a minute.
+The current between two samples is interpolated as in the filter (``interpolated_current``, ``ramp_correction``) for a
+source with a period of at most a minute.
 """
 
 import math
@@ -20,12 +20,12 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 MIN_CAPACITANCE = 1e-3
-"""C_ts, C_tl are held at this fraction of a9, a12 below delta1, delta2, where (2.7), (2.8) turn negative."""
+"""Lower limit of C_ts and C_tl, as fractions of a9 and a12. (2.7) and (2.8) are negative below delta1 and delta2."""
 
 
 @njit(cache=True)
 def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
-    """Filter the current by each time constant of the RC network.
+    """Filter the current with each time constant of the RC ladder.
 
     Args:
         time_s: Shape (n,), increasing [s].
@@ -37,28 +37,28 @@ def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
     x = np.zeros((time_s.size, BRANCHES))
     for j in range(1, time_s.size):
         dt_s = time_s[j] - time_s[j - 1]
-        held_a = interpolated_current(dt_s, current_a[j - 1], current_a[j])
-        straight_a = current_a[j] - current_a[j - 1] if SLOW_S < dt_s <= UNMEASURED_S else 0.0
+        mean_a = interpolated_current(dt_s, current_a[j - 1], current_a[j])
+        ramp_a = current_a[j] - current_a[j - 1] if SLOW_S < dt_s <= UNMEASURED_S else 0.0
         for k in range(BRANCHES):
             decay = math.exp(-dt_s / TAUS[k])
-            x[j, k] = held_a + (x[j - 1, k] - held_a) * decay + ramp_correction(straight_a, dt_s / TAUS[k], decay)
+            x[j, k] = mean_a + (x[j - 1, k] - mean_a) * decay + ramp_correction(ramp_a, dt_s / TAUS[k], decay)
     return x
 
 
 @njit(cache=True)
 def hysteresis(time_s: Floats, soc: Floats, length: float, first: float) -> Floats:
-    """Hysteresis h over counted SOC: towards 1 in a charge, towards -1 in a discharge.
+    """Return the hysteresis state h over the counted SOC: towards 1 in a charge, towards -1 in a discharge.
 
-    It follows the current's trend, that of branch ``TREND``, as in the filter.
+    As in the filter, h follows the SOC filtered with the time constant of RC pair ``TREND``.
 
     Args:
         time_s: Shape (n,), increasing [s].
         soc: Shape (n,), counted.
-        length: Charge that leads from one branch to the other [SOC].
-        first: At the first sample.
+        length: Charge constant of the exponential approach to 1 or -1 [SOC].
+        first: h at the first sample.
 
     Returns:
-        Shape (n,).
+        h, shape (n,).
     """
     h = np.full(soc.size, first)
     lagging = soc[0]
@@ -72,9 +72,9 @@ def hysteresis(time_s: Floats, soc: Floats, length: float, first: float) -> Floa
 
 @njit(cache=True)
 def two_branches(time_s: Floats, current_a: Floats, soc: Floats, a: Floats) -> Floats:
-    """Overpotential of (2.2)-(2.9) with the ohmic drop, the current held from each sample on.
+    """Return the overpotential (2.2)-(2.9) with the ohmic drop, under a current that is constant between samples.
 
-    Below SOC 0 the elements stay as they are at 0: their exponentials would run away.
+    Below SOC 0 the elements are those at 0, because their exponentials diverge.
 
     Args:
         time_s: Shape (n,), increasing [s].
@@ -83,7 +83,7 @@ def two_branches(time_s: Floats, current_a: Floats, soc: Floats, a: Floats) -> F
         a: a1..a15 at index 1..15.
 
     Returns:
-        Shape (n,) [V].
+        Overpotential, shape (n,) [V].
     """
     drop_v = np.empty(time_s.size)
     v_ts = v_tl = 0.0

@@ -1,7 +1,7 @@
-"""The overpotential as a ladder: a series resistance and six RC branches of fixed, log-spaced time constants.
+"""RC ladder of the overpotential: a series resistance and six RC pairs with fixed, log-spaced time constants.
 
-A branch is the current filtered with its time constant, x_k [A], times its resistance R_k(SOC, T). Diffusion has no time
-constant of its own; a ladder covers it from a second to an hour, and is linear in the unknown R_k.
+The voltage of an RC pair is the current filtered with its time constant, x_k [A], times its resistance R_k(SOC, T).
+Diffusion has no single time constant. A ladder approximates it from a second to an hour and is linear in the unknown R_k.
 """
 
 import math
@@ -12,50 +12,53 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 TAU_S = (1.0, 6.0, 30.0, 120.0, 500.0, 2000.0)
-"""Time constants of the branches [s]."""
+"""Time constants of the RC pairs [s]."""
 BRANCHES = len(TAU_S)
+"""Number of RC pairs."""
 RESISTANCES = 1 + BRANCHES
-"""The series resistance, then each branch's."""
+"""Number of resistances: the series resistance, then that of each RC pair."""
 WEAK_J, STRONG_J = 12e3, 45e3
-"""Activation energies of the two parts of each resistance [J/mol]: of the electrolyte, and of reaction and diffusion."""
+"""Activation energies of the two parts of each resistance [J/mol]: weak as in the electrolyte, strong as in reaction and
+diffusion."""
 HYSTERESIS_J = 8e3
 """Activation energy of the hysteresis [J/mol]: the hysteresis between C/30 curves of an LFP cell, without the drop of
 its RC network, was 1.2 and 1.7 times as large at 5 and -15 C as at 25 C."""
 GAS_J = 8.314462618
-"""[J/(mol K)]"""
+"""Molar gas constant [J/(mol K)]."""
 REFERENCE_C = 25.0
-"""Resistances and the OCV are given at this temperature [C]."""
+"""Temperature of the resistances and the OCV in a cell file [C]."""
 GRID = 41
-"""Nodes of resistances, entropy and hysteresis, evenly spaced over SOC 0..1."""
+"""Number of nodes of resistances, entropy and hysteresis, evenly spaced over SOC 0..1."""
 
 WEAK_SHARE = (0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57)
-"""Fraction of each resistance that grows as ``WEAK_J``, if captures at one temperature do not show it: that of an
-18650 NCA cell from -10 to 33 C, mean over SOC 0.3 to 1; of an LFP cell from -15 to 25 C 0.8, 1, 0.9, 0.75, 0.7, 0.6,
-0.6."""
-WEAK_LEFT_SOC, WEAK_LEFT = (0.0, 0.1, 0.2, 0.3, 0.45), (0.45, 0.5, 0.8, 0.9, 1.0)
-"""Fraction of the weak part that is left near empty, over SOC: at SOC 0.2 and 0.1 it was 0.73 and 0.14 in that cell,
-0.97 and 0.92 in the LFP cell."""
+"""Default fraction of each resistance with activation energy ``WEAK_J``, for captures at a single temperature. The values
+are those of an 18650 NCA cell from -10 to 33 C, mean over SOC 0.3 to 1. An LFP cell from -15 to 25 C has 0.8, 1, 0.9,
+0.75, 0.7, 0.6, 0.6."""
+WEAK_FACTOR_SOC, WEAK_FACTOR = (0.0, 0.1, 0.2, 0.3, 0.45), (0.45, 0.5, 0.8, 0.9, 1.0)
+"""SOC nodes, and factor on ``WEAK_SHARE`` near empty. At SOC 0.2 and 0.1 the measured factor is 0.73 and 0.14 in the NCA
+cell, 0.97 and 0.92 in the LFP cell."""
 
 TREND = 3
-"""RC pair whose current decides between charge and discharge: that of 120 s."""
+"""Index of the RC pair whose filtered current decides between charge and discharge: that of 120 s."""
 
 TAUS = np.array(TAU_S)
+"""Time constants of the RC pairs as an array [s]."""
 
 
 def weak_share(soc: Floats) -> Floats:
-    """Usual weak part of each resistance at ``soc``, shape (RESISTANCES, n)."""
-    return np.outer(WEAK_SHARE, np.interp(soc, WEAK_LEFT_SOC, WEAK_LEFT))
+    """Return the default weak fraction of each resistance at ``soc``, shape (RESISTANCES, n)."""
+    return np.outer(WEAK_SHARE, np.interp(soc, WEAK_FACTOR_SOC, WEAK_FACTOR))
 
 
 @njit(cache=True)
 def arrhenius(energy_j: float, temperature_c: float) -> float:
-    """Factor on a resistance of activation energy ``energy_j`` [J/mol]; 1 at 25 C."""
+    """Return the factor on a resistance with activation energy ``energy_j`` [J/mol]; 1 at 25 C."""
     return math.exp(energy_j / GAS_J * (1.0 / (temperature_c + 273.15) - 1.0 / (REFERENCE_C + 273.15)))
 
 
 @njit(cache=True)
 def on_grid(soc: float, values: Floats) -> float:
-    """Value at ``soc`` of one that is given at ``GRID`` nodes; beyond the ends that of the end."""
+    """Interpolate ``values`` at ``GRID`` nodes linearly at ``soc``; constant beyond the ends."""
     position = min(max(soc, 0.0), 1.0) * (GRID - 1)
     i = min(int(position), GRID - 2)
     return values[i] + (position - i) * (values[i + 1] - values[i])
@@ -63,12 +66,12 @@ def on_grid(soc: float, values: Floats) -> float:
 
 @njit(cache=True)
 def resistances(soc: float, weak_ohm: Floats, strong_ohm: Floats, weak: float, strong: float, ohm: Floats) -> None:
-    """R_0..R_6 at ``soc`` [ohm] into ``ohm``.
+    """Write R_0..R_6 at ``soc`` [ohm] to ``ohm``.
 
     Args:
         soc: State of charge.
-        weak_ohm: Shape (GRID, RESISTANCES), the part of activation energy ``WEAK_J`` at 25 C [ohm].
-        strong_ohm: Resistances that grow as ``STRONG_J`` [ohm].
+        weak_ohm: Shape (GRID, RESISTANCES), part with activation energy ``WEAK_J``, at 25 C [ohm].
+        strong_ohm: Shape (GRID, RESISTANCES), part with activation energy ``STRONG_J``, at 25 C [ohm].
         weak: ``arrhenius(WEAK_J, T)``.
         strong: ``arrhenius(STRONG_J, T)``.
         ohm: Shape (RESISTANCES,), written.

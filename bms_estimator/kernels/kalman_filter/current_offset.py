@@ -1,9 +1,8 @@
-"""A sensor that shows no current while the pack rests is right: it takes a coincidence to hide an offset.
+"""Update of the current sensor's offset at rest.
 
-The sensor shows the sum of true current and offset. That both are zero is common, that one makes up for the other is
-not.
-A rest that shows 50 mA gives no information: it may be the sensor's offset or a load. How small a current a
-sensor shows at all, behind its steps and its dead band, is seen from the smallest that it has shown.
+The sensor reports the sum of true current and offset. If it reports zero, both are almost certainly zero, because a load
+rarely cancels the offset. A rest with a report of 50 mA gives no information, because the current may be an offset or a
+load. The smallest current reported so far bounds the dead band and the resolution of the sensor.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -14,27 +13,28 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 REST_C, REST_S = 0.01, 60.0
-"""Maximum current, second by second [C], and minimum duration [s] of a rest."""
+"""Maximum current in each window [C] and minimum duration [s] of a rest."""
 ZERO_C = 0.002
 """Maximum mean current of a rest at which the current counts as zero [C]."""
-FORGOTTEN = 4.0
-"""Growth of the offset's variance since a rest after which the next rest updates it again. Successive rests have a
-common error."""
+MIN_VARIANCE_RATIO = 4.0
+"""Minimum ratio of the offset's variance to that of a rest's information for an update. Successive rests have a common
+error, so that a rest does not update the offset again before its variance has grown."""
 
 
 @njit(cache=True)
 def track_smallest_current(s: Record, current_a: float) -> None:
-    """Keep the smallest current that was shown twice in a row and is not 0: one sample may be the mean over an edge."""
-    shown_a = max(abs(current_a), abs(s.current_a))
-    if current_a != 0.0 and s.current_a != 0.0 and (s.smallest_a == 0.0 or shown_a < s.smallest_a):
-        s.smallest_a = shown_a
+    """Store the smallest nonzero current reported twice in succession. A single sample may be a mean over a step."""
+    reported_a = max(abs(current_a), abs(s.current_a))
+    if current_a != 0.0 and s.current_a != 0.0 and (s.smallest_a == 0.0 or reported_a < s.smallest_a):
+        s.smallest_a = reported_a
 
 
 @njit(cache=True)
 def update_offset_at_rest(s: Record, p: Record) -> None:
-    """Update the offset of every hypothesis after each minute of rest, to ``p.zero_std_c`` or the hidden current.
+    """Update the offset of every hypothesis after each minute of rest.
 
-    What little it shows may be the sensor's or that of a load: half of it is the offset, give or take the other half.
+    The std of the information is ``p.zero_std_c`` combined with the current hidden by resolution and dead band. A small
+    reported current may be offset or load, so that the offset is half of it, with the other half as std.
     """
     w, one_c = s.window, p.capacity_as / 3600.0
     moved_as2 = w.charge_as * w.charge_as + w.between_as2 + w.unknown_as * w.unknown_as
@@ -50,8 +50,8 @@ def update_offset_at_rest(s: Record, p: Record) -> None:
     if s.smallest_a == 0.0 or abs(half_a) > 0.5 * ZERO_C * one_c:
         return
     hidden_a = max(s.smallest_a, p.current_step_a, p.dead_band_a)
-    left_a2 = (p.zero_std_c * one_c) ** 2 + hidden_a * hidden_a / 3.0 + half_a * half_a
+    information_a2 = (p.zero_std_c * one_c) ** 2 + hidden_a * hidden_a / 3.0 + half_a * half_a
     for q in range(s.count):
-        known_a2 = s.covariance[q, OFFSET, OFFSET]
-        if known_a2 > FORGOTTEN * left_a2:
-            update_state_directly(s, q, OFFSET, half_a, known_a2 * left_a2 / (known_a2 - left_a2))
+        offset_a2 = s.covariance[q, OFFSET, OFFSET]
+        if offset_a2 > MIN_VARIANCE_RATIO * information_a2:
+            update_state_directly(s, q, OFFSET, half_a, offset_a2 * information_a2 / (offset_a2 - information_a2))

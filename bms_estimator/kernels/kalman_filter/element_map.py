@@ -1,9 +1,8 @@
-"""Map of each element over SOC as identified, and the thesis's functions fitted to it.
+"""Map of the identified elements over SOC, and fit of the thesis's functions to the map.
 
-The identifier estimates the elements at the present SOC. A map stores, for each SOC bin, the information-weighted
-mean
-of the estimates there. (2.5)-(2.9) are fitted to the map: one nonlinear exponent, searched; amplitude and offset,
-linear.
+The identifier estimates the elements at the present SOC. The map stores the information-weighted mean of these estimates
+for each SOC bin. (2.5)-(2.9) are fitted to the map by a search over the nonlinear exponent and linear least squares for
+amplitude and offset.
 """
 
 import math
@@ -15,23 +14,27 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 BINS = 25
-"""Bins of equal width over SOC 0..1."""
+"""Number of bins of equal width over SOC 0..1."""
 ELEMENT_NAMES = ("r_ts_ohm", "r_tl_ohm", "c_ts_farad", "c_tl_farad", "r_s_ohm")
-"""Names in the order of their parameters: a1..a3, a4..a6, a7..a9, a10..a12, a13..a15."""
+"""Names of the elements in the order of their parameters: a1..a3, a4..a6, a7..a9, a10..a12, a13..a15."""
 ELEMENTS = len(ELEMENT_NAMES)
+"""Number of elements."""
 CAPACITANCES = (2, 3)
-"""C_ts, C_tl among the elements."""
-LEARNED_VARIANCE = 0.5**2
-"""A logarithm known worse than this (50 %) adds nothing to the map."""
+"""Rows of C_ts and C_tl in the map."""
+MAX_LN_VARIANCE = 0.5**2
+"""Maximum variance of the logarithm of an estimate that is added to the map: a relative std of 50 %."""
 MODEL_ERROR = 0.02
-"""An element is no closer to (2.5)-(2.9) than this, relative."""
+"""Relative error with which (2.5)-(2.9) describe a real element."""
 PRIOR_ERROR = 0.7
 """Relative error of the configured function in SOC bins that were not visited, after scaling to the visited ones."""
 EXPONENT_MIN, EXPONENT_MAX = 0.5, 300.0
+"""Range of the exponents."""
 SEARCH_POINTS = 24
+"""Number of exponents in the logarithmic search."""
 REFINEMENTS = 12
+"""Number of golden section steps around the best point of the search."""
 ALTERNATIONS = 12
-"""Amplitude and offset within bounds, each in its turn."""
+"""Number of iterations that fit amplitude and offset alternately within their bounds."""
 
 ELEMENT_MAP = np.dtype(
     [
@@ -46,11 +49,11 @@ ELEMENT_MAP = np.dtype(
 ELEMENT_FIT = np.dtype(
     [
         ("a", "f8", PARAMETERS),  # a1..a15 at their own index
-        ("std", "f8", PARAMETERS),  # standard errors, NaN where nothing was learned
-        ("bins", "i8", ELEMENTS),  # bins that the element was seen in
-        ("soc", "f8", BINS),  # what the last fit was made to: SOC,
-        ("value", "f8", BINS),  # the element there
-        ("weight", "f8", BINS),  # and one over its variance
+        ("std", "f8", PARAMETERS),  # standard errors, NaN without data
+        ("bins", "i8", ELEMENTS),  # number of bins with data of the element
+        ("soc", "f8", BINS),  # data of the last fit: SOC
+        ("value", "f8", BINS),  # data of the last fit: element at ``soc``
+        ("weight", "f8", BINS),  # data of the last fit: inverse variance of ``value``
     ],
     align=True,
 )
@@ -58,12 +61,12 @@ ELEMENT_FIT = np.dtype(
 
 @njit(cache=True)
 def add_observation(m: Record, element: int, soc: float, ln_value: float, variance: float, dt_s: float) -> bool:
-    """Add an estimate of one element at ``soc`` to its bin: ln of its value and the variance of that.
+    """Add an estimate of ln of one element, with its variance, to the bin of ``soc``.
 
     Returns:
-        Whether it was known well enough to be added.
+        True if the variance was small enough for the map.
     """
-    if not 0.0 < variance < LEARNED_VARIANCE:
+    if not 0.0 < variance < MAX_LN_VARIANCE:
         return False
     b = min(max(int(soc * BINS), 0), BINS - 1)
     m.weight[element, b] += dt_s / variance
@@ -75,7 +78,7 @@ def add_observation(m: Record, element: int, soc: float, ln_value: float, varian
 
 @njit(cache=True)
 def decay_weights(m: Record, e: int, factor: float) -> None:
-    """Let row ``e`` of the map forget: multiply its weights by ``factor``."""
+    """Multiply the weights of row ``e`` of the map by ``factor``."""
     for b in range(BINS):
         m.weight[e, b] *= factor
         m.moment[e, b] *= factor
@@ -85,12 +88,12 @@ def decay_weights(m: Record, e: int, factor: float) -> None:
 
 @njit(cache=True)
 def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
-    """Fit the function of one element, of (2.5)-(2.9), to its row of the map.
+    """Fit the function of one element, (2.5)-(2.9), to its row of the map.
 
     Args:
         m: Record of ELEMENT_MAP.
         e: Row of the map, 0..4.
-        prior: Configured a1..a15 at index 1..15: weak prior where the map is empty.
+        prior: Configured a1..a15 at index 1..15, a weak prior for empty bins.
         fit: Record of ELEMENT_FIT, written.
     """
     x, y, w = fit.soc, fit.value, fit.weight
@@ -110,12 +113,12 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
 
 @njit(cache=True)
 def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float, float, float]:
-    """Amplitude, exponent and offset of the element fitted last, within bounds.
+    """Return amplitude, exponent and offset of the element fitted last, within bounds.
 
-    Where a bound holds one of them, the others are fitted again, because clipping each by itself would give another function.
+    If a bound limits one of them, the others are fitted again, because clipping each by itself would give a poor fit.
 
     Args:
-        fit: Record of ELEMENT_FIT, as ``fit_element`` left it for this element.
+        fit: Record of ELEMENT_FIT after ``fit_element`` for this element.
         e: Row of the map, 0..4.
         lower: Bounds of a1..a15 at index 1..15.
         upper: Upper bounds.
@@ -138,13 +141,13 @@ def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float
 
 @njit(cache=True)
 def _sign(e: int) -> float:
-    """Capacitances rise with SOC, (2.7), (2.8): theirs is -1."""
+    """Return the sign of the amplitude in (2.5)-(2.9): -1 for capacitances, which rise with SOC."""
     return -1.0 if e in CAPACITANCES else 1.0
 
 
 @njit(cache=True)
 def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: Floats, y: Floats, w: Floats) -> int:
-    """SOC, value and weight of the element in each bin; returns how many bins were visited."""
+    """Write SOC, value and weight of the element in each bin to ``x``, ``y`` and ``w``; return the number of visited bins."""
     visited = 0
     ratios = weights = 0.0
     for b in range(BINS):
@@ -156,7 +159,7 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
         w[b] = 0.0
         if m.weight[e, b] > 0.0:
             visited += 1
-            # samples of one pass are not independent, so the mean variance is kept, not the variance of the mean
+            # samples of one pass are not independent: the weight uses the mean variance, not the variance of the mean
             w[b] = 1.0 / (m.dwell_s[e, b] / m.weight[e, b] + MODEL_ERROR**2)
             ratios += w[b] * (m.moment[e, b] / m.weight[e, b] - math.log(y[b]))
             weights += w[b]
@@ -173,7 +176,7 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
 
 @njit(cache=True)
 def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -> float:
-    """Return the exponent of least cost: a logarithmic search, then golden sections around its best point."""
+    """Return the exponent of least cost by a logarithmic search and golden section around its best point."""
     ratio = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
     lowest, highest = math.log(EXPONENT_MIN), math.log(EXPONENT_MAX)
     best = min(max(math.log(start), lowest), highest)
@@ -204,7 +207,7 @@ def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -
 def _sums(
     exponent: float, sign: float, x: Floats, y: Floats, w: Floats
 ) -> tuple[float, float, float, float, float, float]:
-    """Weighted sums of 1, g, g g, y, g y, y y with g = sign e^(-exponent x)."""
+    """Return the weighted sums of 1, g, g g, y, g y, y y with g = sign e^(-exponent x)."""
     sw = sg = sgg = sy = sgy = syy = 0.0
     for b in range(BINS):
         g = sign * math.exp(-exponent * x[b])
@@ -219,7 +222,7 @@ def _sums(
 
 @njit(cache=True)
 def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) -> tuple[float, float, float]:
-    """Amplitude and offset, both positive, of least weighted squares for this exponent; and the cost."""
+    """Return positive amplitude and offset by weighted least squares for this exponent, and the cost."""
     sw, sg, sgg, sy, sgy, syy = _sums(exponent, sign, x, y, w)
     det = sw * sgg - sg * sg
     offset = sy / sw
@@ -235,9 +238,9 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
 
 @njit(cache=True)
 def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats) -> None:
-    """Square roots of the diagonal of (J' W J)^-1, by elimination; NaN where that matrix is singular."""
+    """Write the standard errors, roots of the diagonal of (J' W J)^-1, by elimination; NaN if the matrix is singular."""
     amplitude, exponent, offset = fit.a[base], fit.a[base + 1], fit.a[base + 2]
-    # a parameter without data in the map is known to a factor e^3
+    # prior: each parameter has a std of 3 times its value
     h00, h11, h22 = (3.0 * amplitude) ** -2, (3.0 * exponent) ** -2, (3.0 * offset) ** -2
     h01 = h02 = h12 = 0.0
     for b in range(BINS):

@@ -1,7 +1,7 @@
-"""The two branches of (2.2)-(2.3) that the ladder of the filter amounts to, here and now, with their errors.
+"""Two RC pairs of (2.2)-(2.3) that are equivalent to the filter's ladder at the present SOC and temperature.
 
-Branches up to ``SHORT_S`` make R_ts, the slower ones R_tl: resistances in series add, and the time constant is the
-geometric mean weighted by resistance.
+Ladder resistances with time constants up to ``SHORT_S`` add to R_ts, the slower ones to R_tl. Each time constant is the
+geometric mean of the ladder's time constants, weighted by resistance.
 
 ``f`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS, ``e`` of EQUIVALENT.
 """
@@ -30,27 +30,29 @@ R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
 SHORT_S = 60.0
 """Limit between the time constants published as R_ts C_ts and as R_tl C_tl [s]."""
 SHORT = sum(tau_s < SHORT_S for tau_s in TAU_S)
+"""Number of the ladder's RC pairs that belong to R_ts."""
 SHAPE_STD = 0.03
-"""Relative std of the file's series resistance, scaled to the cell, at one SOC and temperature."""
-MAX_S = 2.0
-"""Samples further apart show no step of the current [s]."""
-KNOWN = 0.5
-"""A scale of the resistances was identified when its variance is below this part of the first one."""
+"""Relative std of the file's series resistance at one SOC and temperature, after scaling to the cell."""
+MAX_STEP_S = 2.0
+"""Maximum time between two samples that show a current step [s]."""
+IDENTIFIED_FRACTION = 0.5
+"""Fraction of its initial variance below which a scale of the resistances counts as identified."""
 LN_TAUS = np.log(np.array(TAU_S))
+"""Logarithms of the ladder's time constants in seconds."""
 
 EQUIVALENT = np.dtype(
     [
-        ("ohm", "f8", RESISTANCES),  # of the ladder, as the filter has scaled them
+        ("ohm", "f8", RESISTANCES),  # resistances of the ladder, scaled by the filter
         ("value", "f8", 7),  # R_s, R_ts [ohm], tau_ts [s], C_ts [F], R_tl, tau_tl, C_tl
-        ("ln_variance", "f8", 7),  # of their logarithms
+        ("ln_variance", "f8", 7),  # variance of the logarithm of each value
     ],
     align=True,
 )
 
 
 @njit(cache=True)
-def equivalent(f: Record, p: Record, e: Record) -> None:
-    """Resistances and two branches at SOC and temperature of the likeliest filter into ``e``."""
+def write_equivalent_circuit(f: Record, p: Record, e: Record) -> None:
+    """Write the resistances and two RC pairs at SOC and temperature of the likeliest hypothesis to ``e``."""
     x, cov = f.mean[f.best], f.covariance[f.best]
     resistances(x[SOC], p.weak_ohm, p.strong_ohm, f.weak, f.strong, e.ohm)
     file_ohm, others = e.ohm[0], math.exp(x[LN_R])
@@ -61,23 +63,27 @@ def equivalent(f: Record, p: Record, e: Record) -> None:
     half_ohm = 0.5 * branch_rise_within_sample(f, e)
     e.value[R_S] = file_ohm * math.exp(ratio) + half_ohm
     e.ln_variance[R_S] = variance + (half_ohm / e.value[R_S]) ** 2
-    one_branch(e, 0, SHORT, R_TS, cov[LN_R, LN_R], p.r_std)
-    one_branch(e, SHORT, BRANCHES, R_TL, cov[LN_R, LN_R], p.r_std)
+    write_rc_pair(e, 0, SHORT, R_TS, cov[LN_R, LN_R], p.r_std)
+    write_rc_pair(e, SHORT, BRANCHES, R_TL, cov[LN_R, LN_R], p.r_std)
 
 
 @njit(cache=True)
 def ln_r_s_ratio(f: Record, p: Record) -> tuple[float, float]:
-    """Ln of R_s over R_0 of the file at the same SOC and temperature, and its variance: by steps, else as the filter has it."""
+    """Return ln of R_s over the file's R_0 at equal SOC and temperature, and its variance.
+
+    The ratio is that of current steps if these have determined it, otherwise that of the filter.
+    """
     if r_s_identified_by_steps(f, p):
         return f.step.ln_ratio, f.step.variance + SHAPE_STD**2
     return f.mean[f.best, LN_R0], f.covariance[f.best, LN_R0, LN_R0] + SHAPE_STD**2
 
 
 @njit(cache=True)
-def one_branch(e: Record, first: int, end: int, at: int, scale_variance: float, r_std: float) -> None:
-    """R, tau and C of branches ``first`` to before ``end`` into ``e.value[at : at + 3]``.
+def write_rc_pair(e: Record, first: int, end: int, at: int, scale_variance: float, r_std: float) -> None:
+    """Write R, tau and C equivalent to the ladder's RC pairs ``first`` to ``end`` - 1 to ``e.value[at : at + 3]``.
 
-    All have one scale of variance ``scale_variance``; beside it each is wrong by ``r_std`` on its own, which errs in tau.
+    The resistances have a common scale with variance ``scale_variance`` and independent relative errors ``r_std``, which
+    cause an error of tau.
     """
     ohm = ln_tau = 0.0
     for k in range(first, end):
@@ -86,10 +92,10 @@ def one_branch(e: Record, first: int, end: int, at: int, scale_variance: float, 
     ln_tau /= ohm
     by_r = by_tau = by_c = 0.0
     for k in range(first, end):
-        share, apart = e.ohm[1 + k] / ohm, LN_TAUS[k] - ln_tau
+        share, deviation = e.ohm[1 + k] / ohm, LN_TAUS[k] - ln_tau
         by_r += share**2
-        by_tau += (share * apart) ** 2
-        by_c += (share * (apart - 1.0)) ** 2
+        by_tau += (share * deviation) ** 2
+        by_c += (share * (deviation - 1.0)) ** 2
     own = r_std * r_std
     e.value[at], e.ln_variance[at] = ohm, scale_variance + own * by_r
     e.value[at + 1], e.ln_variance[at + 1] = math.exp(ln_tau), own * by_tau
@@ -98,28 +104,34 @@ def one_branch(e: Record, first: int, end: int, at: int, scale_variance: float, 
 
 @njit(cache=True)
 def branch_rise_within_sample(f: Record, e: Record) -> float:
-    """Return the rise of the branches within one sample after a step [ohm]. How much of it is R_s cannot be observed."""
+    """Return the rise of the RC pairs within one sample after a current step [ohm].
+
+    Measurements cannot divide this rise between R_s and the RC pairs.
+    """
     ohm = 0.0
     for k in range(BRANCHES):
-        ohm += e.ohm[1 + k] * (1.0 - math.exp(-min(f.decay_s, MAX_S) / TAUS[k]))
+        ohm += e.ohm[1 + k] * (1.0 - math.exp(-min(f.decay_s, MAX_STEP_S) / TAUS[k]))
     return ohm
 
 
 @njit(cache=True)
 def scale_is_identified(f: Record, p: Record, j: int) -> bool:
-    """Return True if data have determined the scale LN_R0 or LN_R, ``j``."""
-    return f.covariance[f.best, j, j] < KNOWN * resistance_std(f, p) ** 2
+    """Return True if data have determined the scale of the resistances, state ``j``, LN_R0 or LN_R."""
+    return f.covariance[f.best, j, j] < IDENTIFIED_FRACTION * resistance_std(f, p) ** 2
 
 
 @njit(cache=True)
 def r_s_identified_by_steps(f: Record, p: Record) -> bool:
-    """Return True if steps of the current have determined R_s."""
-    return f.step.variance < KNOWN * resistance_std(f, p) ** 2
+    """Return True if current steps have determined R_s."""
+    return f.step.variance < IDENTIFIED_FRACTION * resistance_std(f, p) ** 2
 
 
 @njit(cache=True)
 def open_circuit(f: Record, p: Record, e: Record, current_a: float, voltage_v: float) -> float:
-    """Voltage less overpotential, hysteresis and what temperature does to the OCV: E_o of the cell file's curve, at 25 C [V], (2.4)."""
+    """Return E_o on the cell file's curve at 25 C by the measured voltage, (2.4) [V].
+
+    Overpotential, hysteresis, learned correction and temperature dependence of the OCV are subtracted.
+    """
     x = f.mean[f.best]
     e_o = voltage_v + e.ohm[0] * (current_a - x[OFFSET])
     for k in range(BRANCHES):

@@ -1,4 +1,6 @@
-"""A voltage or a current that stays the same to the last digit though it cannot: a wire is off, a converter hangs.
+"""Detection of a frozen voltage or current: a constant value that charge or load contradict.
+
+A loose wire or a hanging converter causes such values.
 
 ``c`` is a record of CHECKS, ``f`` of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -10,35 +12,35 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 FAST_S = 10.0
-"""Changes of voltage and current within this time belong together [s]."""
+"""Maximum time over which changes of voltage and current are compared [s]."""
 VISIBLE_V = 0.003
-"""A change of the overpotential of one cell that shows fully [V]."""
-DOUBT_S = 5.0
-"""Duration of an impossibly constant voltage after which it is no longer used [s]."""
+"""Change of the overpotential of one cell that a working sensor certainly shows [V]."""
+SUSPECT_S = 5.0
+"""Duration of an implausibly constant voltage after which the voltage is no longer used [s]."""
 FROZEN_S = 60.0
-"""Duration of an impossibly constant input after which it is reported as frozen [s]."""
-SWING_V, RESOLVED = 0.02, 3.0
-"""Change of the voltage of one cell that proves a constant current frozen [V], and minimum ratio of a change to the
-voltage's resolution."""
-HELD_V, LOAD_C = 0.01, 0.1
-"""Change of the OCV of one cell that proves a constant voltage frozen [V]. Below this discharge current [C] only
-sudden changes count, because chargers hold a voltage."""
-UNCOUNTED = 0.1
-"""Relative charge error while the voltage is ignored."""
+"""Duration of an implausibly constant input after which the input is reported as frozen [s]."""
+SWING_V, MIN_RESOLUTION_STEPS = 0.02, 3.0
+"""Change of the voltage of one cell that proves a constant current frozen [V], and minimum change of the voltage in
+multiples of its resolution."""
+OCV_CHANGE_V, LOAD_C = 0.01, 0.1
+"""Change of the OCV of one cell that proves a constant voltage frozen [V], and minimum discharge current for that proof
+[C]. Below, only sudden changes count, because chargers regulate the voltage."""
+UNOBSERVED_CHARGE_ERROR = 0.1
+"""Relative error of the charge counted while the voltage is not used."""
 OUTLIERS_S = 3600.0
-"""Memory of single samples that were not believed [s]."""
+"""Time constant with which rejected single samples are discounted [s]."""
 
 
 @njit(cache=True)
 def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> bool:
-    """Return True if the voltage may be used.
+    """Update the durations of implausibly constant voltage and current; return True if the voltage is usable.
 
-    Update how long voltage and current have been impossibly constant; call before ``track_current_sign``.
+    The function must run before ``track_current_sign``, which updates the slow means.
     """
     counted_s = min(dt_s, FAST_S)
     fast = dt_s <= FAST_S and c.slow_v != 0.0
     moved = stuck = False
-    resolved_v = RESOLVED * max(c.step_v, math.sqrt(3.0 * p.sensor_v2))
+    resolved_v = MIN_RESOLUTION_STEPS * max(c.step_v, math.sqrt(3.0 * p.sensor_v2))
     change_v = abs(voltage_v - c.last_v)
     if c.last_v == 0.0 or change_v > 0.0:
         if c.last_v != 0.0:
@@ -60,36 +62,36 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
         c.same_soc, c.same_soc_std = f.soc, f.soc_std
     elif moved or (fast and abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > max(SWING_V * p.series, resolved_v)):
         c.frozen_a_s += counted_s
-    elif c.frozen_a_s < FROZEN_S:  # single glitches at rest
+    elif c.frozen_a_s < FROZEN_S:  # single glitches at rest are forgotten
         c.frozen_a_s -= c.frozen_a_s * min(1.0, counted_s / OUTLIERS_S)
     c.last_v, c.last_a = voltage_v, current_a
-    return not stuck or c.frozen_v_s <= DOUBT_S or c.frozen_v_s > FROZEN_S
+    return not stuck or c.frozen_v_s <= SUSPECT_S or c.frozen_v_s > FROZEN_S
 
 
 @njit(cache=True)
 def reference_series_resistance(p: Record) -> float:
-    """R_0 in the middle of the SOC, at 25 C [ohm]."""
+    """Return R_0 of the cell file at SOC 0.5 and 25 C [ohm]."""
     middle = p.weak_ohm.shape[0] // 2
     return p.weak_ohm[middle, 0] + p.strong_ohm[middle, 0]
 
 
 @njit(cache=True)
 def ocv_has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: float) -> bool:
-    """Return True if the charge since the last change of the voltage has moved the OCV more than the current's drop explains."""
+    """Return True if the charge since the last voltage change moved the OCV by more than the overpotential's change."""
     if f.count > 1:
         return False
     now_soc = c.held_soc - c.held_as / p.capacity_as
     moved_v = ocv(c.held_soc, p.ocv_v, p.ocv_slope_v) - ocv(now_soc, p.ocv_v, p.ocv_slope_v)
     dropped_v = p.middle_ohm * (current_a - c.held_a)
-    least_v = max(HELD_V * p.series, resolved_v, abs(dropped_v))
+    least_v = max(OCV_CHANGE_V * p.series, resolved_v, abs(dropped_v))
     return min(abs(moved_v), abs(moved_v + dropped_v)) > least_v
 
 
 @njit(cache=True)
 def rewind_to_freeze(c: Record, f: Record, p: Record) -> None:
-    """Return to the SOC before a sensor froze; count the charge from there if only the voltage froze."""
+    """Restore the SOC before a sensor froze, plus the charge counted since then if only the voltage froze."""
     if c.frozen_a_s > FROZEN_S:
         f.soc, f.soc_std = c.same_soc, c.same_soc_std + p.load_mean_c * c.same_s / 3600.0
     else:
         moved = c.held_as / p.capacity_as
-        f.soc, f.soc_std = min(max(c.held_soc - moved, 0.0), 1.0), c.held_soc_std + UNCOUNTED * abs(moved)
+        f.soc, f.soc_std = min(max(c.held_soc - moved, 0.0), 1.0), c.held_soc_std + UNOBSERVED_CHARGE_ERROR * abs(moved)

@@ -1,4 +1,4 @@
-"""Unmeasured charge: in a gap of the samples, between two runs of the service, or because a source reports little.
+"""Charge that was not measured, and its std: in gaps, between runs of the service, and between slow or rounded samples.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -12,11 +12,12 @@ from bms_estimator.numba_cache import njit
 LOAD_S = 600.0
 """Averaging time of the present load, and expected duration of that load in a gap [s]."""
 USUAL_S = 6.0 * 3600.0
-"""Averaging time of the usual load, which follows the present one in a long gap [s]."""
-BETWEEN = 0.2
-"""Variance of the mean current about that line, over the square of the change: 1/12 where the load stays for much longer than
-from one sample to the next, 0.10 and 0.18 with levels of 20 s each 10 s and each 60 s, 1/4 where it is another each time."""
-SAME_STEPS = 1.5
+"""Averaging time of the long-term mean load, which is expected after the present one in a long gap [s]."""
+INTERPOLATION_VARIANCE = 0.2
+"""Variance of the mean current between two samples about the straight line, over the squared change of the current. It is
+1/12 for loads that last much longer than a sample period, 0.10 and 0.18 for loads of 20 s sampled each 10 s and each 60 s,
+and 1/4 for independent samples."""
+MAX_EQUAL_STEPS = 1.5
 """Maximum difference between two reported currents that count as equal, in steps of the resolution."""
 IDLE_C = 0.1
 """Minimum std of an unmeasured current [C]."""
@@ -24,21 +25,21 @@ IDLE_C = 0.1
 
 @njit(cache=True)
 def initialize_load_statistics(s: Record, p: Record, current_a: float) -> None:
-    """Initialize the load statistics before a load is seen, as ``initial_branch_currents`` assumes.
+    """Initialize the load statistics at the first sample with the prior of ``initial_branch_currents``.
 
-    A small first sample gives more information on the load than a large one, which may be a peak.
+    The mean of the present load is the first sample's current, limited because a large current may be a short peak.
     """
     one_c = p.capacity_as / 3600.0
     s.usual_a = p.load_mean_c * one_c
     s.usual_a2 = (p.load_mean_c**2 + p.load_level_c**2 + p.load_c**2) * one_c * one_c
-    most_a = math.sqrt(s.usual_a2)
-    s.mean_a = min(max(current_a, -most_a), most_a)
+    limit_a = math.sqrt(s.usual_a2)
+    s.mean_a = min(max(current_a, -limit_a), limit_a)
     s.rms_a2 = max(s.mean_a * s.mean_a, (p.load_mean_c * one_c) ** 2)
 
 
 @njit(cache=True)
 def update_load_statistics(s: Record, current_a: float, dt_s: float) -> None:
-    """Mean and mean square of a current of ``current_a`` over ``dt_s`` into the present and the usual load."""
+    """Update mean and mean square of the present and the long-term load by ``current_a`` over ``dt_s``."""
     share = min(1.0, dt_s / LOAD_S)
     s.mean_a += share * (current_a - s.mean_a)
     s.rms_a2 += share * (current_a * current_a - s.rms_a2)
@@ -49,15 +50,18 @@ def update_load_statistics(s: Record, current_a: float, dt_s: float) -> None:
 
 @njit(cache=True)
 def expected_excess_charge(s: Record, held_a: float, dt_s: float) -> float:
-    """Charge that the present load moves in a gap of ``dt_s`` beyond ``held_a``, which both ends agree on, until it changes [A s]."""
+    """Return the expected charge in a gap of ``dt_s`` beyond ``held_a`` x ``dt_s`` [A s].
+
+    The present load is expected to end at random with the mean duration ``LOAD_S``.
+    """
     return (s.mean_a - held_a) * LOAD_S * (1.0 - math.exp(-dt_s / LOAD_S))
 
 
 @njit(cache=True)
 def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
-    """Std of the charge that moved in ``dt_s`` beside ``held_a`` x ``dt_s`` [A s].
+    """Return the std of the charge in ``dt_s`` about ``held_a`` x ``dt_s`` [A s].
 
-    The current was one of the present load, and after a time of the usual one, at random and the same all the time.
+    The unknown current is a random but constant value of the present load, or of the long-term load in a longer gap.
     """
     same = math.exp(-dt_s / LOAD_S)
     present_a2 = s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a
@@ -68,25 +72,25 @@ def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
 
 @njit(cache=True)
 def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
-    """Variance of the charge that moved in ``dt_s`` beside the straight line between two samples [A^2 s^2].
+    """Return the variance of the charge in ``dt_s`` about the straight line between two samples [A^2 s^2].
 
     Args:
-        change_a: Change of the current between the two [A].
+        change_a: Change of the current between the samples [A].
         dt_s: Time between the samples [s].
     """
-    return BETWEEN * (change_a * dt_s) ** 2 if dt_s > SLOW_S else 0.0
+    return INTERPOLATION_VARIANCE * (change_a * dt_s) ** 2 if dt_s > SLOW_S else 0.0
 
 
 @njit(cache=True)
 def rounding_charge_variance(s: Record, p: Record, dt_s: float, current_a: float) -> float:
-    """Return the additional variance of the charge within ``dt_s`` by the steps of the current [A^2 s^2].
+    """Return the additional variance of the charge within ``dt_s`` by the resolution of the current [A^2 s^2].
 
-    While the reported current stays the same, the error stays the same: its charge has the variance (error x time)^2.
+    A constant reported current has a constant error, whose charge has the variance (error x time)^2.
     """
-    error_a2 = p.current_step_a * p.current_step_a / 12.0  # of rounding
+    error_a2 = p.current_step_a * p.current_step_a / 12.0  # variance of rounding
     if current_a == 0.0 and s.current_a == 0.0:
-        error_a2 = max(error_a2, p.dead_band_a * p.dead_band_a / 3.0)  # anything within
-    same = abs(current_a - s.current_a) <= SAME_STEPS * p.current_step_a
+        error_a2 = max(error_a2, p.dead_band_a * p.dead_band_a / 3.0)  # uniform within the dead band
+    same = abs(current_a - s.current_a) <= MAX_EQUAL_STEPS * p.current_step_a
     before_s = s.same_s if same else 0.0
     s.same_s = before_s + dt_s
     return error_a2 * (s.same_s * s.same_s - before_s * before_s)

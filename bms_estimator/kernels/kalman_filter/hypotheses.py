@@ -1,11 +1,11 @@
 """Filter bank: several filters that start at different SOCs and are merged when they agree.
 
-At switch-on neither the SOC nor the polarization is known, and far from the true SOC the OCV has another slope. Therefore filters
-start at ``HYPOTHESES`` SOCs around the initial one. Each is weighted by its likelihood to a power below 1 (tempering), because
-successive errors of the model are not independent. Filters that agree are merged, and unlikely ones are removed. The output is
-mean and standard deviation of the mixture.
+At switch-on, SOC and polarization are unknown, and far from the true SOC the OCV has another slope. Therefore filters
+start at ``HYPOTHESES`` SOCs around the initial one. Each is weighted by its likelihood to a power below 1 (tempering),
+because successive errors of the model are not independent. Filters that agree are merged, and unlikely ones are removed.
+The output is the mean and standard deviation of the mixture.
 
-``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. At more than 1 Hz the filters see the mean of a second's samples.
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Above 1 Hz, each update uses the mean of about a second's samples.
 """
 
 import math
@@ -16,7 +16,14 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     on_grid,
 )
 from bms_estimator.kernels.kalman_filter.current_offset import update_offset_at_rest
-from bms_estimator.kernels.kalman_filter.ekf import HIGHEST, LOWEST, OWN_R_STD, adapt_bias_inflation, predict, update
+from bms_estimator.kernels.kalman_filter.ekf import (
+    INDEPENDENT_R_STD,
+    MAX_SOC,
+    MIN_SOC,
+    adapt_bias_inflation,
+    predict,
+    update,
+)
 from bms_estimator.kernels.kalman_filter.gap_charge import (
     initialize_load_statistics,
     update_load_statistics,
@@ -59,40 +66,41 @@ from bms_estimator.kernels.kalman_filter.window import prepare_transition, reset
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-ONE_STD = 0.06
-"""An SOC known better than this needs one filter only."""
-REACH_STDS = 2.25
-"""Hypotheses reach so far to both sides."""
+MAX_SINGLE_STD = 0.06
+"""Maximum std of an initial SOC for which one filter suffices."""
+SPREAD_STDS = 2.25
+"""Distance of the outermost hypotheses from the initial SOC, in std of that SOC."""
 OVERLAP = 0.62
-"""Std of a hypothesis over the distance to the next."""
+"""Std of a hypothesis, as a fraction of the distance between neighbours."""
 BEYOND_STD = 0.03
-"""Std of an SOC set outside 0..1."""
+"""Std of the prior weight of hypotheses whose SOC was limited to ``MIN_SOC`` or ``MAX_SOC``."""
 MIN_STD = 0.005
-"""Minimum std of the SOC: full and empty of a cell are not defined better."""
+"""Minimum std of the published SOC, because full and empty of a cell are not defined better."""
 UNKNOWN_FULL = 0.03
-"""Std of the SOC, over that of ln R, of a cell that was not measured: another make is full elsewhere on the curve."""
+"""Minimum std of the published SOC over that of ln R. A cell that was not measured is full at another point of the curve."""
 HYST_STD = 0.7
-"""Std of the first hysteresis."""
-KNOWN_S = 1800.0
-"""Time constant in which the unknown history before switch-on fades [s]."""
-REOPEN_STDS = 4.0
-"""Bias in std beyond which the SOC is initialized again: such a model error is less likely than a wrong SOC."""
-STRAINED_STDS = 2.0
-"""Bias in std beyond which a hypothesis loses weight. Its biases absorb its errors, so that its innovations alone
-would look small."""
-REOPEN_STD = 0.2
-"""Std of the SOC after such an initialization, as at switch-on."""
+"""Initial std of the hysteresis state h."""
+HISTORY_S = 1800.0
+"""Time constant with which effects of the unknown load before switch-on decay [s]."""
+REINITIALIZE_STDS = 4.0
+"""Bias in std above which the SOC is re-initialized, because a wrong SOC is more likely than such a model error."""
+INCONSISTENT_STDS = 2.0
+"""Bias in std above which a hypothesis loses weight. Its biases absorb its errors, so that its innovations alone are
+small."""
+REINITIALIZED_STD = 0.2
+"""Std of the SOC after a re-initialization, equal to the default at switch-on."""
 USER_SOC_STD = 0.03
-"""Std of an SOC set by the user, if it is right."""
+"""Std of a correct SOC set by the user."""
 WRONG_USER_SOC_STD = 0.12
-"""Std of an SOC set by the user, if it is wrong."""
-LN_RIGHT = 3.0
-"""Log-odds that an SOC set by the user is right; all wrong hypotheses together have one chance in ten."""
+"""Std of a wrong SOC set by the user."""
+LN_ODDS_CORRECT = 3.0
+"""Additional log-weight of the hypothesis that the user's SOC is correct. All other hypotheses together have a probability
+of about 0.1."""
 
 
 @njit(cache=True)
 def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temperature_c: float) -> None:
-    """Initialize at the first sample around the given ``soc`` with a std of ``p.soc_std``."""
+    """Initialize all states at the first sample, with hypotheses around ``soc`` with a std of ``p.soc_std``."""
     s.started, s.best = 1, 0
     s.current_a = current_a
     s.smallest_a = 0.0
@@ -105,7 +113,7 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
     x[:] = 0.0
     cov[:, :] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
-    cov[LN_R0, LN_R] = cov[LN_R, LN_R0] = max(resistance_std(s, p) ** 2 - OWN_R_STD**2, 0.0)
+    cov[LN_R0, LN_R] = cov[LN_R, LN_R0] = max(resistance_std(s, p) ** 2 - INDEPENDENT_R_STD**2, 0.0)
     s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
@@ -116,30 +124,30 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
 
 @njit(cache=True)
 def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
-    """Restart at ``soc`` with the likeliest hypothesis's estimates of sensor and cell.
+    """Initialize hypotheses around ``soc`` with the likeliest hypothesis's estimates of sensor and cell.
 
-    SOC, polarisation, hysteresis and errors of the model are unknown.
+    SOC, polarization, hysteresis and errors of the model are unknown.
     """
-    known = s.mean[s.best], s.covariance[s.best]
+    start = s.mean[s.best], s.covariance[s.best]
     for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
-        decorrelate_state(known[0], known[1], j)
+        decorrelate_state(start[0], start[1], j)
     for k in range(BRANCHES):
-        decorrelate_state(known[0], known[1], X + k)
+        decorrelate_state(start[0], start[1], X + k)
     s.x_a[:] = 0.0
-    initial_branch_currents(p, s.current_a, known[0], known[1])
-    known[1][HYST, HYST], known[1][CURVE, CURVE] = HYST_STD**2, 1.0
-    s.count = HYPOTHESES if soc_std > ONE_STD else 1
-    apart = 2.0 * REACH_STDS * soc_std / (HYPOTHESES - 1)
+    initial_branch_currents(p, s.current_a, start[0], start[1])
+    start[1][HYST, HYST], start[1][CURVE, CURVE] = HYST_STD**2, 1.0
+    s.count = HYPOTHESES if soc_std > MAX_SINGLE_STD else 1
+    spacing = 2.0 * SPREAD_STDS * soc_std / (HYPOTHESES - 1)
     if s.best != 0:
         copy_hypothesis(s, s.best, 0)
     for q in range(s.count - 1, -1, -1):
         if q > 0:
             copy_hypothesis(s, 0, q)
-        away = (q - (s.count - 1) // 2) * apart
-        std = OVERLAP * apart if s.count > 1 else soc_std
-        s.mean[q, SOC] = min(max(soc + away, LOWEST), HIGHEST)
+        distance = (q - (s.count - 1) // 2) * spacing
+        std = OVERLAP * spacing if s.count > 1 else soc_std
+        s.mean[q, SOC] = min(max(soc + distance, MIN_SOC), MAX_SOC)
         s.covariance[q, SOC, SOC] = std * std
-        s.ln_weight[q] = -0.5 * (away / soc_std) ** 2 - 0.5 * ((soc + away - s.mean[q, SOC]) / BEYOND_STD) ** 2
+        s.ln_weight[q] = -0.5 * (distance / soc_std) ** 2 - 0.5 * ((soc + distance - s.mean[q, SOC]) / BEYOND_STD) ** 2
         half_v2 = 0.5 * bias_variance(s, p, q)
         s.covariance[q, B_SLOW, B_SLOW] = s.covariance[q, B_FAST, B_FAST] = half_v2
         s.minute_u[q] = s.ten_minutes_u[q] = 0.0
@@ -153,16 +161,16 @@ def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
 
 @njit(cache=True)
 def set_soc(s: Record, p: Record, soc: float) -> None:
-    """Initialize again at an SOC set by the user: mostly it is right, and the voltage shows where it is not."""
+    """Re-initialize at an SOC set by the user, with hypotheses for a wrong value that later voltages may select."""
     spawn_hypotheses(s, p, soc, WRONG_USER_SOC_STD)
     s.covariance[s.best, SOC, SOC] = USER_SOC_STD**2
-    s.ln_weight[s.best] += LN_RIGHT
+    s.ln_weight[s.best] += LN_ODDS_CORRECT
     mixture_moments(s)
 
 
 @njit(cache=True)
 def update_hypotheses(s: Record, p: Record) -> None:
-    """Take the window in, with every hypothesis."""
+    """Update every hypothesis by the samples of the window, then prune and merge."""
     w = s.window
     dt_s = w.time_s
     if dt_s > 0.0:
@@ -172,19 +180,21 @@ def update_hypotheses(s: Record, p: Record) -> None:
     update_arrhenius_factors(s)
     s.seeded_s += dt_s
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
-    share, best = innovation_scale(s, p), 0
+    scale, best = innovation_scale(s, p), 0
     for q in range(s.count):
         if dt_s > 0.0:
             predict(s, p, q)
-        innovation_v, total_v2, straight_v2 = update(s, p, q, variance_v2)
+        innovation_v, total_v2, linear_v2 = update(s, p, q, variance_v2)
         u = innovation_v / math.sqrt(total_v2)
-        # the bend's part of S is constant at rest: counted each second, it would reject the knee at full rest
+        # S without the linearization error, which is constant at rest: repeated each second, it would reject a SOC at a knee
         s.ln_weight[q] -= p.half_likelihood_exponent * (
-            innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2)
+            innovation_v * innovation_v / (scale * linear_v2) + math.log(linear_v2)
         )
         if s.count > 1:
-            s.ln_weight[q] -= p.inconsistency_penalty * max(normalized_bias_squared(s, p, q) - STRAINED_STDS**2, 0.0)
-        if dt_s > 0.0 and not w.gap:  # one innovation is no error that stays, however long the gap
+            s.ln_weight[q] -= p.inconsistency_penalty * max(
+                normalized_bias_squared(s, p, q) - INCONSISTENT_STDS**2, 0.0
+            )
+        if dt_s > 0.0 and not w.gap:  # a single innovation after a long gap does not show a persistent error
             adapt_bias_inflation(s, q, dt_s, u)
         if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
             best = q
@@ -200,42 +210,42 @@ def update_hypotheses(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def innovation_scale(s: Record, p: Record) -> float:
-    """Return the ratio of the true innovation variance to S.
+    """Return the expected ratio of the innovation variance to S.
 
-    R and the biases allow for loads and cells that the file fits worst. Mostly the fit improves once the load before
-    switch-on is forgotten. Innovations far within S would leave the decision to ln S, and the hypothesis with the
-    smallest S would win.
-    Outside the temperatures of the cell file less of the kind is known, ``OUTSIDE_K`` away nothing.
+    R and the biases cover the loads and cells that the file fits worst. The fit usually improves after the effects of the
+    load before switch-on have decayed. With innovations much smaller than S, the term ln S would decide between the
+    hypotheses and favour the smallest S. Outside the temperature range of the cell file the ratio increases and reaches 1
+    at a distance of ``OUTSIDE_K``.
     """
     return min(
-        max(math.exp(-s.seeded_s / KNOWN_S), p.min_innovation_scale * extrapolation_factor(p, s.temperature_c) ** 2),
+        max(math.exp(-s.seeded_s / HISTORY_S), p.min_innovation_scale * extrapolation_factor(p, s.temperature_c) ** 2),
         1.0,
     )
 
 
 @njit(cache=True)
 def reinitialize_if_biased(s: Record, p: Record) -> None:
-    """Begin again where the model would have to be wrong by far more than it is: then the SOC is, by any amount."""
-    if s.count == 1 and normalized_bias_squared(s, p, 0) > REOPEN_STDS**2:
+    """Re-initialize the SOC if the bias of a single remaining hypothesis is larger than plausible model errors."""
+    if s.count == 1 and normalized_bias_squared(s, p, 0) > REINITIALIZE_STDS**2:
         reset_ocv_correction(s.mean[0], s.covariance[0])
-        spawn_hypotheses(s, p, s.mean[0, SOC], REOPEN_STD)
+        spawn_hypotheses(s, p, s.mean[0, SOC], REINITIALIZED_STD)
         s.reopened += 1
 
 
 @njit(cache=True)
 def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
-    """Return the squared number of std by which a hypothesis considers the model wrong.
+    """Return the squared bias of a hypothesis over its prior variance.
 
-    The biases also absorb errors of OCV and hysteresis, which dominate on a plateau.
+    The variance includes errors of OCV and hysteresis, which the biases also absorb and which dominate on a plateau.
     """
     bias_v, soc = s.mean[q, B_SLOW] + s.mean[q, B_FAST], s.mean[q, SOC]
     hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)
-    wrong_v2 = bias_variance(s, p, q) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
-    return bias_v * bias_v / wrong_v2
+    prior_v2 = bias_variance(s, p, q) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
+    return bias_v * bias_v / prior_v2
 
 
 @njit(cache=True)
 def weakest_cell_soc_std(s: Record, p: Record) -> float:
-    """Return the std of the SOC of the weakest cell in series; how far it lies below the mean cannot be observed."""
+    """Return the std of the SOC of the weakest cell in series, whose deviation from the mean cannot be observed."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
     return math.hypot(max(s.soc_std, MIN_STD, UNKNOWN_FULL * p.r_std), spread)

@@ -1,4 +1,4 @@
-"""Protection of the filter: an innovation gate, a watch on its input, the last good state.
+"""Protection of the filter: innovation gate, detection of input faults, and restoration of the last good state.
 
 ``c`` is a record of CHECKS, ``n`` of COUNTERS, ``f`` of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -13,7 +13,7 @@ from bms_estimator.kernels.kalman_filter.frozen_sensor import (
     FAST_S,
     FROZEN_S,
     OUTLIERS_S,
-    UNCOUNTED,
+    UNOBSERVED_CHARGE_ERROR,
     VISIBLE_V,
     reference_series_resistance,
     rewind_to_freeze,
@@ -28,85 +28,87 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.numba_cache import njit
 
 GATE_STDS = 6.0
-"""Limit of the innovation gate in std: a sample beyond it is a glitch."""
+"""Limit of the innovation gate in std. A single sample beyond the gate is a glitch."""
 GATE_SAMPLES, GATE_S = 5, 5.0
-"""Number of successive samples beyond the gate, and their minimum duration [s], after which they are accepted because
-the cell has changed."""
+"""Minimum number and minimum duration [s] of successive samples beyond the gate that are accepted, because they show a
+change of the cell."""
 SNAPSHOT_S = 60.0
 """Interval at which the last good state is stored [s]."""
-LOST_STD = 0.05
-"""Std of the SOC after a return to the last good state."""
-LOST_AT_MOST = 0.4
-"""No SOC is less certain than this, std."""
+RESTORED_STD = 0.05
+"""Additional std of the SOC after the last good state was restored."""
+MAX_SOC_STD = 0.4
+"""Maximum std of the SOC."""
 SIGN_S = 300.0
-"""Memory of the relation between voltage and current changes, counted while the current changes [s]."""
+"""Averaging time of the relation between voltage and current changes, counted while the current changes [s]."""
 MIN_EVIDENCE = 0.1
-"""Share of that memory which must be filled."""
-CLIP = 5.0
-"""Limit of a voltage change, in multiples of what the resistances explain, so that a glitch to zero does not
-dominate."""
+"""Minimum filled fraction of that average for a fault of the sign."""
+MAX_CHANGE_RATIO = 5.0
+"""Limit of a voltage change, in multiples of the change that the resistances explain, so that a glitch to zero does not
+dominate the average."""
 MANY_OUTLIERS, FEW_OUTLIERS = 5.0, 1.0
+"""Numbers of recent rejected samples at which the fault OUTLIERS begins and ends."""
 OFFSET_STDS, CAPACITY_STDS = 4.0, 2.0
-"""Limits of offset and capacity, in multiples of their initial std, beyond which they are suspicious."""
+"""Limits of offset and capacity, in multiples of their initial std, for the faults OFFSET and CAPACITY."""
 PRESENT_STDS = 3.0
-"""Minimum deviation of a suspicious offset or capacity in multiples of its present std."""
-TAKEN_BACK = 0.7
-"""A suspicion ends when its measure falls below this fraction of its limit."""
+"""Minimum offset or LN_Q of these faults, in multiples of its present std."""
+CLEAR_FRACTION = 0.7
+"""Fraction of its limit below which a fault ends (hysteresis)."""
 WRONG_V, WRONG_S = 0.12, 1800.0
-"""Bias of one cell [V] and duration [s] that no OCV of the cell's own chemistry explains."""
+"""Mean bias of one cell [V] and averaging time [s] beyond errors of an OCV of the cell's chemistry."""
 SEARCHES_S = 5.0 * 3600.0
-"""Memory of searches for the SOC: time after time only a wrong OCV explains them [s]."""
+"""Time constant with which re-initializations of the SOC are discounted [s]."""
 MANY_SEARCHES = 4.0
+"""Number of recent re-initializations of the SOC at which the OCV counts as wrong."""
 UNKNOWN_K = 5.0
-"""Distance from the temperatures of the cell file beyond which the model has no data [K]."""
+"""Distance from the temperature range of the cell file for the fault TEMPERATURE [K]."""
 
 SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT = (int(bit) for bit in InputFault)
 UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT
-"""No voltage is believed meanwhile."""
+"""Faults during which the voltage is not used."""
 
 CHECKS = np.dtype(
     [
         ("mean_a", "f8"),  # current at the last update of the filter [A]
-        ("gated_in_row", "i8"),
-        ("gated_s", "f8"),  # how long samples have been gated [s]
-        ("outliers", "f8"),  # single samples not believed of late
-        ("slow_v", "f8"),  # voltage and ...
-        ("slow_a", "f8"),  # ... current without their fast changes
-        ("slower_v", "f8"),  # the same of these two
-        ("slower_a", "f8"),
-        ("sign_evidence", "f8"),  # 0..1: how much was seen of
-        ("change_v_a", "f8"),  # running mean of the fast change of voltage times that of current [V A]
-        ("change_a2", "f8"),  # the same of the current's squared [A^2]
-        ("last_v", "f8"),  # of the sample before; 0: none
-        ("last_a", "f8"),
-        ("step_v", "f8"),  # the smallest change of voltage seen [V]; 0: none yet
-        ("frozen_v_s", "f8"),  # time for which the voltage has been impossibly constant [s]
-        ("frozen_a_s", "f8"),  # time for which the current has been impossibly constant
-        ("held_as", "f8"),  # charge since the voltage last changed [A s]; values at that time:
-        ("held_a", "f8"),  # current [A],
-        ("held_soc", "f8"),
-        ("held_soc_std", "f8"),
-        ("same_s", "f8"),  # time for which the current has been constant [s]; SOC and its std at its beginning
-        ("same_soc", "f8"),
-        ("same_soc_std", "f8"),
-        ("wrong_v", "f8"),  # running mean of the error that stays [V]
-        ("searches", "f8"),  # times the filter began again of late
-        ("seen_reopened", "i8"),
+        ("gated_in_row", "i8"),  # number of successive samples beyond the innovation gate
+        ("gated_s", "f8"),  # duration of these samples [s]
+        ("outliers", "f8"),  # number of rejected single samples, discounted with OUTLIERS_S
+        ("slow_v", "f8"),  # running mean of the voltage [V]; 0: no sample yet
+        ("slow_a", "f8"),  # running mean of the current [A]
+        ("slower_v", "f8"),  # running mean of slow_v [V]
+        ("slower_a", "f8"),  # running mean of slow_a [A]
+        ("sign_evidence", "f8"),  # filled fraction of the two averages below, 0..1
+        ("change_v_a", "f8"),  # running mean of fast voltage change times fast current change [V A]
+        ("change_a2", "f8"),  # running mean of the squared fast current change [A^2]
+        ("last_v", "f8"),  # voltage of the previous sample [V]; 0: none
+        ("last_a", "f8"),  # current of the previous sample [A]
+        ("step_v", "f8"),  # smallest observed change of the voltage [V]; 0: none yet
+        ("frozen_v_s", "f8"),  # time for which the voltage has been implausibly constant [s]
+        ("frozen_a_s", "f8"),  # time for which the current has been implausibly constant [s]
+        ("held_as", "f8"),  # charge since the last change of the voltage [A s]
+        ("held_a", "f8"),  # current at the last change of the voltage [A]
+        ("held_soc", "f8"),  # SOC at the last change of the voltage
+        ("held_soc_std", "f8"),  # std of the SOC at the last change of the voltage
+        ("same_s", "f8"),  # time since the last change of the current [s]
+        ("same_soc", "f8"),  # SOC at the last change of the current
+        ("same_soc_std", "f8"),  # std of the SOC at the last change of the current
+        ("wrong_v", "f8"),  # running mean of the slow bias [V]
+        ("searches", "f8"),  # number of SOC re-initializations, discounted with SEARCHES_S
+        ("seen_reopened", "i8"),  # value of EKF_STATE.reopened at the last check
         ("suspects", "i8"),  # bits of model.input_faults.InputFault
-        ("good_mean", "f8", STATES),  # state of the likeliest filter when it was last saved
-        ("good_covariance", "f8", (STATES, STATES)),
-        ("good_soc", "f8"),
-        ("good_soc_std", "f8"),
-        ("good_age_s", "f8"),
+        ("good_mean", "f8", STATES),  # mean of the likeliest hypothesis in the last good state
+        ("good_covariance", "f8", (STATES, STATES)),  # its covariance
+        ("good_soc", "f8"),  # SOC of the last good state
+        ("good_soc_std", "f8"),  # std of the SOC of the last good state
+        ("good_age_s", "f8"),  # time since the last good state was stored [s]
     ],
     align=True,
 )
 
 COUNTERS = np.dtype(
     [
-        ("gated", "i8"),  # samples not believed
-        ("reopened", "i8"),  # number of successive ones
-        ("reset", "i8"),  # not finite: back to the last good state
+        ("gated", "i8"),  # samples rejected by the innovation gate
+        ("reopened", "i8"),  # runs of samples beyond the gate that were accepted
+        ("reset", "i8"),  # restorations of the last good state because a value was not finite
     ],
     align=True,
 )
@@ -124,7 +126,7 @@ def passes_innovation_gate(
     current_a: float,
     voltage_v: float,
 ) -> bool:
-    """Return True if the filter may use a sample: its voltage is near the prediction, or stays beyond the gate.
+    """Return True if the filter may use a sample: its voltage is within the gate, or many successive ones are beyond.
 
     Args:
         c: Record of CHECKS.
@@ -132,8 +134,8 @@ def passes_innovation_gate(
         f: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
         e: Record of EQUIVALENT.
-        dt_s: Time since the sample before [s].
-        change_a: Change of the current since then [A].
+        dt_s: Time since the previous sample [s].
+        change_a: Change of the current since the previous sample [A].
         current_a: Current [A].
         voltage_v: Voltage [V].
     """
@@ -159,13 +161,13 @@ def passes_innovation_gate(
 
 @njit(cache=True)
 def gate_persists(c: Record) -> bool:
-    """Return True if enough successive samples lie beyond the gate, which then are not glitches."""
+    """Return True if enough successive samples lie beyond the gate, so that they are not glitches."""
     return c.gated_in_row >= GATE_SAMPLES and c.gated_s >= GATE_S
 
 
 @njit(cache=True)
 def store_last_good_state(c: Record, f: Record) -> None:
-    """Save the likeliest filter as the last good state."""
+    """Store the likeliest hypothesis as the last good state."""
     c.good_mean[:] = f.mean[f.best]
     c.good_covariance[:, :] = f.covariance[f.best]
     c.good_soc, c.good_soc_std, c.good_age_s = f.soc, f.soc_std, 0.0
@@ -173,7 +175,7 @@ def store_last_good_state(c: Record, f: Record) -> None:
 
 @njit(cache=True)
 def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
-    """Back to the last good state when anything of the filter is not finite; otherwise save it at intervals."""
+    """Restore the last good state if a value of the filter is not finite; otherwise store the state at intervals."""
     total = (
         f.temperature_c
         + f.soc
@@ -198,27 +200,27 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
     f.mean[0, :] = c.good_mean
     f.covariance[0, :, :] = c.good_covariance
     if not math.isfinite(f.temperature_c):
-        f.temperature_c, f.sensed = REFERENCE_C, 0  # the next input is accepted at once
+        f.temperature_c, f.sensed = REFERENCE_C, 0  # the next temperature is used without smoothing
         f.weak = f.strong = f.hysteresis = 1.0
     initialize_load_statistics(f, p, f.current_a)
-    spawn_hypotheses(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + LOST_STD**2))
+    spawn_hypotheses(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + RESTORED_STD**2))
     reset_window(f)
     n.reset += 1
 
 
 @njit(cache=True)
 def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
-    """Track how fast changes of the voltage follow those of the current: by -R_s if the sign is right.
+    """Average fast changes of the voltage over fast changes of the current; their ratio is -R_s if the sign is right.
 
-    A ramp is no change: where the curve ends, the voltage has one by itself.
+    A ramp does not count as a change, because the voltage has ramps of its own at the ends of the OCV curve.
     """
-    if dt_s > FAST_S or c.slow_v == 0.0:  # too long to judge, or the first sample
+    if dt_s > FAST_S or c.slow_v == 0.0:  # too long a step for a fast change, or the first sample
         c.slow_v = c.slower_v = voltage_v
         c.slow_a = c.slower_a = current_a
         return
     ohm = p.middle_ohm
     change_a = current_a - 2.0 * c.slow_a + c.slower_a
-    limit_v = CLIP * ohm * abs(change_a)
+    limit_v = MAX_CHANGE_RATIO * ohm * abs(change_a)
     change_v = min(max(voltage_v - 2.0 * c.slow_v + c.slower_v, -limit_v), limit_v)
     share = min(1.0, dt_s / FAST_S)
     c.slower_v += share * (c.slow_v - c.slower_v)
@@ -242,25 +244,25 @@ def unusable_input_bits(c: Record, p: Record) -> int:
 
 @njit(cache=True)
 def sign_is_wrong(c: Record, p: Record) -> bool:
-    """Return True if the voltage rises with a reported discharge; a present suspicion stays until it falls."""
+    """Return True if the voltage rises with a reported discharge; a present fault ends only when the voltage falls."""
     steep = 0.25 * reference_series_resistance(p) * c.change_a2
     return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > MIN_EVIDENCE
 
 
 @njit(cache=True)
 def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
-    """Process a sample without using its voltage, while voltage and current do not belong together.
+    """Process a sample without its voltage, during a fault of ``UNUSABLE``.
 
-    With the wrong sign of the current the SOC errs by twice the charge, always the same way; a current that is not measured may be
-    anything common. Estimates learned with the wrong sign are useless, so the filter is re-initialized afterwards.
+    A wrong sign of the current causes an SOC error of twice the charge, always in one direction. A frozen current may be
+    any typical load. Estimates learned with a wrong sign are useless, so that the filter is re-initialized afterwards.
     """
     moved = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
-    wrong = UNCOUNTED * moved
+    error = UNOBSERVED_CHARGE_ERROR * moved
     if c.suspects & CURRENT:
-        wrong = p.load_mean_c * min(dt_s, p.unmeasured_s) / 3600.0
+        error = p.load_mean_c * min(dt_s, p.unmeasured_s) / 3600.0
     elif c.suspects & SIGN_OF_CURRENT:
-        wrong = 2.0 * moved
-    f.soc_std = min(math.hypot(f.soc_std + wrong, f.window.unknown_as / p.capacity_as), LOST_AT_MOST)
+        error = 2.0 * moved
+    f.soc_std = min(math.hypot(f.soc_std + error, f.window.unknown_as / p.capacity_as), MAX_SOC_STD)
     f.window.unknown_as = 0.0
     f.step.phase = UNHELD
     bits = unusable_input_bits(c, p)
@@ -272,14 +274,14 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
         initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
         spawn_hypotheses(f, p, f.soc, soc_std)
     else:
-        spawn_hypotheses(f, p, f.soc, max(f.soc_std, LOST_STD))
+        spawn_hypotheses(f, p, f.soc, max(f.soc_std, RESTORED_STD))
     reset_window(f)
     c.suspects = 0
 
 
 @njit(cache=True)
 def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
-    """Set and take back the bits of ``c.suspects`` after an update of the filter over ``dt_s``."""
+    """Set and clear the bits of ``c.suspects`` after an update of the filter over ``dt_s``."""
     before = c.suspects
     c.outliers -= c.outliers * min(1.0, dt_s / OUTLIERS_S)
     bits = unusable_input_bits(c, p)
@@ -299,11 +301,11 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
     c.wrong_v += min(1.0, dt_s / WRONG_S) * (x[B_SLOW] - c.wrong_v)
     c.searches += f.reopened - c.seen_reopened - min(1.0, dt_s / SEARCHES_S) * c.searches
     c.seen_reopened = f.reopened
-    part = TAKEN_BACK if before & OCV else 1.0
-    if abs(c.wrong_v) > part * WRONG_V * p.series or c.searches > part * MANY_SEARCHES:
-        bits = OCV | bits & OUTLIERS  # offset and capacity try to explain it
+    fraction = CLEAR_FRACTION if before & OCV else 1.0
+    if abs(c.wrong_v) > fraction * WRONG_V * p.series or c.searches > fraction * MANY_SEARCHES:
+        bits = OCV | bits & OUTLIERS  # a wrong OCV also causes wrong estimates of offset and capacity
     outside_k = max(p.low_c - f.temperature_c, f.temperature_c - p.high_c)
-    if f.sensed and outside_k > UNKNOWN_K * (TAKEN_BACK if before & TEMPERATURE else 1.0):
+    if f.sensed and outside_k > UNKNOWN_K * (CLEAR_FRACTION if before & TEMPERATURE else 1.0):
         bits |= TEMPERATURE
     c.suspects = bits
 
@@ -311,5 +313,5 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
 @njit(cache=True)
 def is_significant_bias(value: float, variance: float, expected: float, before: int) -> bool:
     """Return True if a bias exceeds its expected size significantly."""
-    part = TAKEN_BACK if before else 1.0
-    return expected > 0.0 and abs(value) > part * max(expected, PRESENT_STDS * math.sqrt(variance))
+    fraction = CLEAR_FRACTION if before else 1.0
+    return expected > 0.0 and abs(value) > fraction * max(expected, PRESENT_STDS * math.sqrt(variance))

@@ -1,4 +1,4 @@
-"""The mixture of hypotheses: one row of EKF_STATE each, of which likely ones stay and those that agree become one.
+"""Mixture of hypotheses, one row of EKF_STATE each: removal of unlikely hypotheses, and merging of similar ones.
 
 ``s`` is a record of EKF_STATE.
 """
@@ -9,15 +9,15 @@ from bms_estimator.kernels.kalman_filter.records import SOC, STATES
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-UNLIKELY = -9.0
-"""ln of a relative weight below which a hypothesis is removed."""
-ALIKE_STDS = 0.7
-"""Two hypotheses closer than this many std of SOC are one."""
+MIN_LN_WEIGHT = -9.0
+"""ln of the weight relative to the likeliest hypothesis below which a hypothesis is removed."""
+MERGE_STDS = 0.7
+"""Distance below which two neighbouring hypotheses are merged, in std of the more certain one's SOC."""
 
 
 @njit(cache=True)
 def decorrelate_state(mean: Record, covariance: Record, j: int) -> None:
-    """State ``j`` is 0 and belongs to none."""
+    """Set state ``j`` to 0, with zero variance and covariances."""
     mean[j] = 0.0
     covariance[j, :] = 0.0
     covariance[:, j] = 0.0
@@ -25,7 +25,7 @@ def decorrelate_state(mean: Record, covariance: Record, j: int) -> None:
 
 @njit(cache=True)
 def copy_hypothesis(s: Record, source: int, to: int) -> None:
-    """Hypothesis ``to`` becomes as ``source``."""
+    """Copy hypothesis ``source`` to ``to``."""
     s.mean[to, :] = s.mean[source]
     s.covariance[to, :, :] = s.covariance[source]
     s.ln_weight[to] = s.ln_weight[source]
@@ -35,7 +35,7 @@ def copy_hypothesis(s: Record, source: int, to: int) -> None:
 
 @njit(cache=True)
 def clear_hypothesis(s: Record, q: int) -> None:
-    """Clear row ``q``: all 0, because zeros need no space in a compressed checkpoint."""
+    """Set row ``q`` to 0, because zeros need no space in a compressed checkpoint."""
     s.mean[q, :] = 0.0
     s.covariance[q, :, :] = 0.0
     s.ln_weight[q] = s.minute_u[q] = s.ten_minutes_u[q] = s.fast_inflation[q] = s.slow_inflation[q] = 0.0
@@ -43,18 +43,18 @@ def clear_hypothesis(s: Record, q: int) -> None:
 
 @njit(cache=True)
 def prune_and_merge(s: Record) -> None:
-    """Remove unlikely hypotheses, and merge neighbors that agree."""
+    """Remove unlikely hypotheses, and merge similar neighbours."""
     top, q = s.ln_weight[s.best], 0
     while q < s.count:
         s.ln_weight[q] -= top
-        if s.ln_weight[q] < UNLIKELY:
+        if s.ln_weight[q] < MIN_LN_WEIGHT:
             remove_hypothesis(s, q)
         else:
             q += 1
     q = 1
     while q < s.count:
-        apart = abs(s.mean[q, SOC] - s.mean[q - 1, SOC])
-        if apart * apart < ALIKE_STDS**2 * min(s.covariance[q, SOC, SOC], s.covariance[q - 1, SOC, SOC]):
+        distance = abs(s.mean[q, SOC] - s.mean[q - 1, SOC])
+        if distance * distance < MERGE_STDS**2 * min(s.covariance[q, SOC, SOC], s.covariance[q - 1, SOC, SOC]):
             merge_pair(s, q - 1, q)
             remove_hypothesis(s, q)
         else:
@@ -63,26 +63,26 @@ def prune_and_merge(s: Record) -> None:
 
 @njit(cache=True)
 def merge_pair(s: Record, a: int, b: int) -> None:
-    """Hypothesis ``a`` becomes the normal distribution with mean and covariance of both."""
-    most = max(s.ln_weight[a], s.ln_weight[b])
-    weight_a, weight_b = math.exp(s.ln_weight[a] - most), math.exp(s.ln_weight[b] - most)
+    """Replace hypothesis ``a`` by the normal distribution with mean and covariance of the mixture of ``a`` and ``b``."""
+    max_ln_weight = max(s.ln_weight[a], s.ln_weight[b])
+    weight_a, weight_b = math.exp(s.ln_weight[a] - max_ln_weight), math.exp(s.ln_weight[b] - max_ln_weight)
     share = weight_b / (weight_a + weight_b)
-    apart = s.ph
+    difference = s.ph
     for j in range(STATES):
-        apart[j] = s.mean[b, j] - s.mean[a, j]
-        s.mean[a, j] += share * apart[j]
+        difference[j] = s.mean[b, j] - s.mean[a, j]
+        s.mean[a, j] += share * difference[j]
     for j in range(STATES):
         for k in range(j, STATES):
             both = s.covariance[a, j, k] + share * (s.covariance[b, j, k] - s.covariance[a, j, k])
-            s.covariance[a, j, k] = s.covariance[a, k, j] = both + share * (1.0 - share) * apart[j] * apart[k]
-    s.ln_weight[a] = most + math.log(weight_a + weight_b)
+            s.covariance[a, j, k] = s.covariance[a, k, j] = both + share * (1.0 - share) * difference[j] * difference[k]
+    s.ln_weight[a] = max_ln_weight + math.log(weight_a + weight_b)
     if s.best == b:
         s.best = a
 
 
 @njit(cache=True)
 def remove_hypothesis(s: Record, q: int) -> None:
-    """Close the row."""
+    """Remove row ``q`` and move the later rows up."""
     for j in range(q, s.count - 1):
         copy_hypothesis(s, j + 1, j)
     s.count -= 1
@@ -93,7 +93,7 @@ def remove_hypothesis(s: Record, q: int) -> None:
 
 @njit(cache=True)
 def mixture_moments(s: Record) -> None:
-    """Mean and std of SOC of the mixture."""
+    """Write mean and std of the mixture's SOC to ``s.soc`` and ``s.soc_std``."""
     total = mean = variance = 0.0
     for q in range(s.count):
         weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])

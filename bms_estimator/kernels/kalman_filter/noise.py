@@ -1,4 +1,4 @@
-"""Noise of the filter: each term of R, Q and P(0).
+"""Noise covariances of the filter: the terms of R, Q and P(0).
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -33,44 +33,45 @@ from bms_estimator.kernels.kalman_filter.records import (
 from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
-FLOOR_C = 0.1
-"""The load counts as at least so large [C]: an idle cell is not a perfect model [1/h]."""
+MIN_LOAD_C = 0.1
+"""Minimum load in the variance of the biases [C], because the model has errors in an idle cell, too."""
 INDEPENDENT_S = 30.0
-"""Maximum weight of a pause before a sample [s]."""
+"""Time after which the errors of successive windows count as independent [s]. R decreases with the window's duration up to
+this time."""
 UNSENSED_R_STD = 0.25
-"""Std of ln of the resistances without a temperature sensor: 10 K in both directions."""
+"""Std of ln of the resistances without a temperature sensor, as of a deviation of 10 K."""
 WARMED_R_STD = 0.015
-"""Increase of that std for each kelvin of modeled self-heating [1/K]: half of the heating may be wrong."""
+"""Increase of that std for each kelvin of modelled self-heating [1/K], as of an error of half of the heating."""
 AGED_SOC = 400.0
-"""Charge over which aging changes the curve of a cell: 200 full cycles [SOC]."""
-HYST_LEFT = 0.17
-"""Std of the hysteresis h if the direction of the charge is known."""
-LOWER_HALF = 0.5
-"""SOC below which a cell may be empty early."""
-STEEP_V = 1.0
-"""Slope of the OCV of a cell that is its last fall [V]; if it is smaller, ``curve_error_v`` is the error of the
-curve."""
+"""Charge throughput over which aging changes the OCV curve of a cell [SOC]: 200 full cycles."""
+HYST_STEADY_STD = 0.17
+"""Std of the hysteresis state h after a long charge or discharge."""
+EARLY_EMPTY_SOC = 0.5
+"""SOC below which the model includes that a cold cell is empty early."""
+KNEE_SLOPE_V = 1.0
+"""Minimum slope of the OCV of one cell at its knee near empty [V]. On flatter parts ``curve_error_v`` covers the error of
+the curve."""
 USUAL_LN_R = 0.25
-"""Up to this ln of the resistances over those of the file, the error of the model does not grow with them."""
+"""LN_R above which the variance of the biases grows with the resistances."""
 OUTSIDE_K = 30.0
-"""Distance from the temperatures of the cell file at which the model's errors double [K]."""
+"""Distance from the temperature range of the cell file at which the model's errors double [K]."""
 
 
 @njit(cache=True)
 def extrapolation_factor(p: Record, temperature_c: float) -> float:
-    """Factor on errors of the model beyond the temperatures that the cell file was made for."""
+    """Return the factor on errors of the model outside the temperature range of the cell file."""
     return 1.0 + max(p.low_c - temperature_c, temperature_c - p.high_c, 0.0) / OUTSIDE_K
 
 
 @njit(cache=True)
 def max_known_temperature(p: Record) -> float:
-    """Above it resistances are smaller, but errors are not [C]."""
+    """Return the temperature above which errors of the model do not decrease with the resistances [C]."""
     return max(p.high_c, REFERENCE_C)
 
 
 @njit(cache=True)
 def resistance_std(s: Record, p: Record) -> float:
-    """Std of ln of the true over the file's resistances: without a temperature they may be anything near."""
+    """Return the std of ln of the true over the file's resistances, larger without a temperature sensor."""
     if s.sensed:
         return p.r_std
     return max(p.r_std, math.hypot(UNSENSED_R_STD, WARMED_R_STD * (s.temperature_c - REFERENCE_C)))
@@ -84,8 +85,8 @@ def offset_variance(p: Record) -> float:
 
 @njit(cache=True)
 def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> float:
-    """R [V^2] of the mean voltage of a window: what the ladder leaves, far more than the sensor's noise."""
-    measured_c = s.temperature_c if s.sensed else REFERENCE_C  # estimated values do not reduce errors
+    """Return R of the mean voltage of a window [V^2], mainly the error of the ladder and only little sensor noise."""
+    measured_c = s.temperature_c if s.sensed else REFERENCE_C  # a modelled temperature does not reduce errors
     model_v = (
         p.model_v
         * arrhenius(p.model_j, min(measured_c, max_known_temperature(p)))
@@ -96,34 +97,34 @@ def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> flo
 
 @njit(cache=True)
 def bias_variance(s: Record, p: Record, q: int) -> float:
-    """Variance of B_SLOW + B_FAST [V^2] of hypothesis ``q`` at a steady state: resistances are wrong in proportion, and along SOC.
+    """Return the steady-state variance of B_SLOW + B_FAST of hypothesis ``q`` [V^2].
 
-    Resistances that were found to be larger than those of the file leave a larger error.
+    The file's resistances have a relative error and a shift along SOC. The error grows with LN_R above ``USUAL_LN_R``.
 
-    A cold cell is empty early, and no file predicts by how much: in its lower half the shift along SOC grows in the
-    cold as the weak part does, and also moves the knee of the OCV near empty.
+    A cold cell is empty early by an amount that no file predicts. Below ``EARLY_EMPTY_SOC`` the shift along SOC therefore
+    grows in the cold with the Arrhenius factor of the weak part, and it also shifts the knee of the OCV near empty.
     """
     soc, scale = s.mean[q, SOC], math.exp(max(s.mean[q, LN_R] - USUAL_LN_R, 0.0))
     ohm = total_resistance(s, p, soc)
     shift, early_v = p.bias_soc, 0.0
-    if soc < LOWER_HALF:
+    if soc < EARLY_EMPTY_SOC:
         shift *= s.weak
         early_v = 0.5 * (ocv(soc + shift, p.ocv_v, p.ocv_slope_v) - ocv(soc - shift, p.ocv_v, p.ocv_slope_v))
-        early_v = max(early_v - STEEP_V * p.series * shift, 0.0)
-    steep = total_resistance(s, p, soc - shift) - total_resistance(s, p, soc + shift)
-    grown = max(ohm - p.middle_ohm, 0.0)
-    floor_a = FLOOR_C * p.capacity_as / 3600.0
-    wrong_ohm2 = (p.bias_relative * ohm) ** 2 + (p.bias_grown * grown) ** 2 + (0.5 * steep) ** 2
-    wrong_v2 = scale * scale * wrong_ohm2 * max(s.rms_a2, floor_a * floor_a) + early_v * early_v
-    return extrapolation_factor(p, s.temperature_c) ** 2 * wrong_v2
+        early_v = max(early_v - KNEE_SLOPE_V * p.series * shift, 0.0)
+    shift_ohm = total_resistance(s, p, soc - shift) - total_resistance(s, p, soc + shift)
+    grown_ohm = max(ohm - p.middle_ohm, 0.0)
+    min_load_a = MIN_LOAD_C * p.capacity_as / 3600.0
+    error_ohm2 = (p.bias_relative * ohm) ** 2 + (p.bias_grown * grown_ohm) ** 2 + (0.5 * shift_ohm) ** 2
+    error_v2 = scale * scale * error_ohm2 * max(s.rms_a2, min_load_a * min_load_a) + early_v * early_v
+    return extrapolation_factor(p, s.temperature_c) ** 2 * error_v2
 
 
 @njit(cache=True)
 def total_resistance(s: Record, p: Record, soc: float) -> float:
-    """Sum of the resistances at ``soc``, at least that within the file's temperatures [ohm]."""
-    weak, strong, most_c = s.weak, s.strong, max_known_temperature(p)
-    if s.temperature_c > most_c:
-        weak, strong = arrhenius(WEAK_J, most_c), arrhenius(STRONG_J, most_c)
+    """Return the sum of the resistances at ``soc`` [ohm], above ``max_known_temperature`` that at this temperature."""
+    weak, strong, limit_c = s.weak, s.strong, max_known_temperature(p)
+    if s.temperature_c > limit_c:
+        weak, strong = arrhenius(WEAK_J, limit_c), arrhenius(STRONG_J, limit_c)
     resistances(soc, p.weak_ohm, p.strong_ohm, weak, strong, s.ohm)
     total = 0.0
     for k in range(RESISTANCES):
@@ -133,13 +134,13 @@ def total_resistance(s: Record, p: Record, soc: float) -> float:
 
 @njit(cache=True)
 def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float) -> None:
-    """Q of one step into the covariance of hypothesis ``q``; the diagonal of F is in ``s.f``.
+    """Add Q of one step to the covariance of hypothesis ``q``; the diagonal of F is in ``s.f``.
 
     Args:
         s: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
         q: Hypothesis.
-        moved: Magnitude of the charge moved, per unit of SOC.
+        moved: Charge throughput [SOC].
         bias_v2: ``bias_variance`` [V^2].
     """
     cov, f, w = s.covariance[q], s.f, s.window
@@ -160,7 +161,7 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     cov[LN_Q, LN_Q] += p.capacity_std**2 * (1.0 - f[LN_Q] ** 2)
     for j in (LN_R0, LN_R):
         cov[j, j] += resistance_std(s, p) ** 2 * (1.0 - f[j] * f[j])
-    cov[HYST, HYST] += HYST_LEFT**2 * (1.0 - f[HYST] ** 2)
+    cov[HYST, HYST] += HYST_STEADY_STD**2 * (1.0 - f[HYST] ** 2)
     cov[CURVE, CURVE] += 1.0 - f[CURVE] ** 2
     for j in range(NODE, NODE + NODES):
         cov[j, j] += max(1.0 - cov[j, j], 0.0) * moved / AGED_SOC
@@ -168,15 +169,16 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
 
 @njit(cache=True)
 def add_gap_noise(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
-    """Add the noise of an unmeasured current that stays constant, so that it moves SOC and branches together.
+    """Add the noise of an unmeasured current with a constant and a varying part.
 
-    Its change has the same size: the RC pairs, which respond to the last seconds or minutes, belong to another mean
-    than the SOC. Otherwise the voltage after the gap would determine the SOC.
+    The constant part moves SOC and RC pairs with full correlation. The varying part has an equal std and moves only the RC
+    pairs, which respond to the last seconds or minutes. Without that part, the voltage after the gap would determine the
+    SOC.
 
     Args:
         p: Record of EKF_SETTINGS.
         cov: Shape (STATES, STATES), updated.
-        f: Diagonal of F over that time.
+        f: Diagonal of F over the gap.
         std_a: Standard deviation of the current [A].
         soc_per_a: SOC drawn per ampere [1/A].
     """
@@ -185,15 +187,21 @@ def add_gap_noise(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: fl
         for k in range(SOC, j + 1):
             added = by_j * (-soc_per_a if k == SOC else 1.0 - f[k])
             if k >= X:
-                since = math.sqrt((1.0 - f[j] * f[j]) * (1.0 - f[k] * f[k]))
-                added += since * branch_covariance(p.load_s, TAUS[j - X], TAUS[k - X])
+                renewed = math.sqrt((1.0 - f[j] * f[j]) * (1.0 - f[k] * f[k]))
+                added += renewed * branch_covariance(p.load_s, TAUS[j - X], TAUS[k - X])
             cov[j, k] += std_a * std_a * added
             cov[k, j] = cov[j, k]
 
 
 @njit(cache=True)
 def branch_covariance(t: float, tau_k: float, tau_m: float) -> float:
-    """Stationary covariance of branches of ``tau_k`` and ``tau_m`` [s] under a Gauss-Markov load of ``t`` [s], over its variance."""
+    """Return the stationary covariance of two RC pairs' filtered currents, relative to the variance of the load.
+
+    Args:
+        t: Correlation time of the Gauss-Markov load [s].
+        tau_k: Time constant of the first RC pair [s].
+        tau_m: Time constant of the second RC pair [s].
+    """
     return (t / (t + tau_m) / tau_k + t / (t + tau_k) / tau_m) / (1.0 / tau_k + 1.0 / tau_m)
 
 
@@ -201,14 +209,15 @@ def branch_covariance(t: float, tau_k: float, tau_m: float) -> float:
 def initial_branch_currents(p: Record, current_a: float, mean: Floats, covariance: Floats) -> None:
     """Set mean and covariance of x_k for an unknown load before switch-on, given the current at switch-on.
 
-    The load was a level, normal with mean ``load_mean_c`` and std ``load_level_c``, and on it a Gauss-Markov process of
-    time constant t = ``load_s`` and std ``load_c``. Of that, the stationary covariance of branch k and the current is t/(t+tau_k).
+    The prior of the load is the sum of a constant level, normal with mean ``load_mean_c`` and std ``load_level_c``, and a
+    Gauss-Markov process with time constant t = ``load_s`` and std ``load_c``. The stationary covariance of RC pair k and
+    the current, relative to the variance of the process, is t / (t + tau_k).
 
     Args:
         p: Record of EKF_SETTINGS.
-        current_a: At the first sample [A].
-        mean: Shape (STATES,), its x_k are written.
-        covariance: Shape (STATES, STATES), its x_k are written.
+        current_a: Current at the first sample [A].
+        mean: Shape (STATES,); x_k are written.
+        covariance: Shape (STATES, STATES); rows and columns of x_k are written.
     """
     one_c = p.capacity_as / 3600.0
     level_a2, load_a2, t = (p.load_level_c * one_c) ** 2, (p.load_c * one_c) ** 2, p.load_s

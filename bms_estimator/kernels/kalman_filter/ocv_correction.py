@@ -1,13 +1,13 @@
-"""The OCV learned while the filter runs: the error of the curve of the cell file as states of the filter, along SOC.
+"""Correction of the cell file's OCV curve, learned by the filter as states at SOC nodes.
 
-The fraction ``learned`` of the variance of that error belongs to the curve itself and returns at the same SOC. It is
-blended between ``NODES`` states so that its variance stays, each in units of the curve's std there, correlated with its
-neighbours over ``ALIKE_SOC``. The rest, CURVE, is of temperature, load and history, and is another each time.
+The fraction ``learned`` of the variance of the curve's error is constant and recurs at each pass of an SOC. It is
+interpolated between ``NODES`` states, scaled so that the variance between nodes equals that at nodes. The states are in
+units of the curve's std and are correlated along SOC over ``CORRELATION_SOC``. The remaining error, CURVE, depends on
+temperature, load and history and varies.
 
-A voltage depends on SOC and curve together, so its information on the curve is no more certain than the SOC was
-without it. The
-joint covariance holds exactly that, so no rule is needed which voltages may be learned from (the same with a map and a
-place in it: Smith, Self and Cheeseman 1990).
+A voltage depends on SOC and curve together, so that its information on the curve is limited by the uncertainty of the SOC.
+The joint covariance contains this limit, so that no rule has to select voltages for learning (as in simultaneous
+localization and mapping: Smith, Self and Cheeseman 1990).
 
 ``x`` is a mean of EKF_STATE, ``p`` a record of EKF_SETTINGS.
 """
@@ -19,10 +19,11 @@ from bms_estimator.kernels.kalman_filter.records import NODE, NODES
 from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
-ALIKE_SOC = 0.6
-"""Correlation length of the OCV's error [SOC]: cells of one chemistry differ in the used range of the electrodes."""
-NEIGHBOURS = math.exp(-1.0 / (NODES - 1) / ALIKE_SOC)
-"""Correlation of two nodes beside each other, before anything is learned."""
+CORRELATION_SOC = 0.6
+"""Correlation length of the OCV's error [SOC]. It is long, because cells of one chemistry differ in the used range of the
+electrodes."""
+NODE_CORRELATION = math.exp(-1.0 / (NODES - 1) / CORRELATION_SOC)
+"""Prior correlation of two neighbouring nodes."""
 
 
 @njit(cache=True)
@@ -35,9 +36,9 @@ def node_position(soc: float) -> tuple[int, float]:
 
 @njit(cache=True)
 def node_error_scale(p: Record, soc: float, t: float) -> float:
-    """Error of the curve at ``soc`` by nodes of 1 on both sides [V]: of the same variance between nodes as at them."""
-    kept = 1.0 - 2.0 * t * (1.0 - t) * (1.0 - NEIGHBOURS)
-    return on_grid(soc, p.curve_error_v) * math.sqrt(p.learned / kept)
+    """Return the scale of the interpolated node states at ``soc`` [V], normalized to a constant variance between nodes."""
+    interpolated_variance = 1.0 - 2.0 * t * (1.0 - t) * (1.0 - NODE_CORRELATION)
+    return on_grid(soc, p.curve_error_v) * math.sqrt(p.learned / interpolated_variance)
 
 
 @njit(cache=True)
@@ -49,10 +50,10 @@ def ocv_correction(p: Record, x: Floats, soc: float) -> float:
 
 @njit(cache=True)
 def reset_ocv_correction(x: Floats, covariance: Floats) -> None:
-    """Nothing is learned yet."""
+    """Reset the nodes to their prior."""
     x[NODE : NODE + NODES] = 0.0
     covariance[NODE : NODE + NODES, :] = 0.0
     covariance[:, NODE : NODE + NODES] = 0.0
     for j in range(NODES):
         for k in range(NODES):
-            covariance[NODE + j, NODE + k] = NEIGHBOURS ** abs(j - k)
+            covariance[NODE + j, NODE + k] = NODE_CORRELATION ** abs(j - k)

@@ -1,22 +1,22 @@
-"""The extended Kalman filter: state vector, settings with their origin, and records.
+"""State vector, noise settings and records of the extended Kalman filter.
 
-The state vector, in this order (also of the rows and columns of the covariance):
+Order of the state vector and of the covariance:
 
 ====  =========  ==============================================================================================
   0   SOC        state of charge z
-1-6   X          x_k in the branches of the ladder beyond what the current since switch-on explains [A]
+1-6   X          filtered currents x_k of the RC pairs, less those due to the current since switch-on [A]
   7   LN_R0      ln of the true over the file's series resistance
-  8   LN_R       the same of all branches
-  9   B_SLOW     error of the model that stays for hours [V]
- 10   B_FAST     error of the model that stays for a minute [V]
+  8   LN_R       ln of the true over the file's resistances of the RC pairs, one scale for all
+  9   B_SLOW     error of the model that persists for hours [V]
+ 10   B_FAST     error of the model that persists for a minute [V]
  11   OFFSET     measured less true current [A]
- 12   LN_Q       ln(true / declared capacity); a wrong gain of the current sensor looks the same
+ 12   LN_Q       ln(true / declared capacity), not distinguishable from a gain error of the current sensor
  13   HYST       hysteresis h, -1 after discharge, 1 after charge
- 14   CURVE      error of the OCV at this SOC, here and now, in units of its standard deviation
-15-   NODE       error of the OCV curve at ``NODES`` SOCs from 0 to 1, in the same units: learned (``ocv_correction``)
+ 14   CURVE      varying error of the OCV at the present SOC, in units of its standard deviation
+15-   NODE       constant error of the OCV curve at ``NODES`` SOCs from 0 to 1, in units of its std (``ocv_correction``)
 ====  =========  ==============================================================================================
 
-Several such filters run side by side from different SOCs until they agree (``hypotheses``).
+Several filters run in parallel from different SOCs until they agree (``hypotheses``).
 """
 
 from dataclasses import dataclass, fields
@@ -35,61 +35,63 @@ HYPOTHESES = 7
 
 @dataclass(frozen=True)
 class Noise:
-    """Uncertainties of one cell in series. 1 C is the current that empties the cell in an hour."""
+    """Uncertainties of one cell. 1 C is the current that empties the cell in an hour."""
 
     model_v: float = 0.05
-    """R: error of the ladder in the mean of one second, std at 25 C [V]."""
+    """R: std of the ladder's error in the mean voltage of one second at 25 C [V]."""
     model_j: float = 27e3
-    """Activation energy with which it grows in the cold [J/mol]."""
+    """R: activation energy of the growth of ``model_v`` in the cold [J/mol]."""
     bias_relative: float = 0.03
-    """B: error of the model that stays, relative to the sum of the resistances times the RMS current of 10 min."""
+    """Bias: std relative to the sum of the resistances times the RMS current of 10 min."""
     bias_grown: float = 0.11
-    """B: the same by which resistances have grown, in the cold and near empty, beyond those at 25 C and SOC 0.5."""
+    """Bias: std relative to the growth of the resistances in the cold and near empty over those at 25 C and SOC 0.5."""
     bias_soc: float = 0.035
-    """B: the same from a shift of resistances and of the OCV's last fall along SOC, at 25 C; it grows with ``WEAK_J``."""
+    """Bias: shift of the resistances and of the OCV's knee near empty along SOC at 25 C; it grows with ``WEAK_J``."""
     slow_s: float = 3600.0
+    """Bias: time constant of B_SLOW, which has half of the variance [s]."""
     fast_s: float = 45.0
-    """B: time constant of the fast bias, in which half of its variance changes [s]."""
+    """Bias: time constant of B_FAST, which has half of the variance [s]."""
     x_relative: float = 0.05
-    """Q: current in the branches, relative to the current."""
+    """Q: std of the filtered currents of the RC pairs, relative to the current."""
     charge_error: float = 0.002
-    """Q: std of SOC gained over the whole range: linearity of the current sensor."""
+    """Q: std of the SOC after a throughput of 1, due to the nonlinearity of the current sensor."""
     r_std: float = 0.1
-    """Resistances: std of their logarithm, if the cell file has none."""
+    """P(0): std of ln of the resistances if the cell file declares none."""
     unsensed_s: float = 3600.0
-    """Time constant with which resistances follow an unknown temperature without a sensor [s]."""
+    """Q: time constant of the resistances' changes with an unmeasured temperature [s]."""
     offset_c: float = 0.007
-    """Offset of the current sensor, std [C] ..."""
+    """P(0): std of the current sensor's offset [C]."""
     offset_s: float = 10.0 * 86400.0
-    """Time in which the offset drifts by its initial std [s]."""
+    """Q: time in which the offset drifts by its initial std [s]."""
     zero_std_c: float = 0.001
-    """Offset of a sensor that has shown no current at rest, std [C]."""
+    """Std of the offset of a sensor that reports no current at rest [C]."""
     capacity_std: float = 0.08
-    """Capacity, relative std, ..."""
+    """P(0): relative std of the capacity."""
     aged_soc: float = 1000.0
-    """Charge throughput in which the capacity changes by its initial std with age: 500 full cycles [SOC]."""
+    """Q: charge throughput over which aging changes the capacity by its initial std [SOC]: 500 full cycles."""
     cell_spread: float = 0.1
-    """Cells in series: by how much of the charge drawn the emptiest lies below their mean, std of SOC. One that is smaller by a
-    fifth is within two of it."""
+    """Cell imbalance: std of the weakest cell's SOC below the mean, per unit of SOC discharged. A cell with 20 % less
+    capacity lies at 2 std."""
     soc_std: float = 0.2
-    """SOC at switch-on, std."""
+    """P(0): std of the SOC at switch-on."""
     load_c: float = 1.2
-    """Load before switch-on, unknown: its std [C] ..."""
+    """P(0): std of the varying part of the unknown load before switch-on [C]."""
     load_mean_c: float = 0.3
-    """Mean of the unknown load before switch-on [C]."""
+    """P(0): mean of the unknown load before switch-on [C]."""
     load_level_c: float = 0.35
-    """Std of the part of that load that stays constant for hours [C]."""
+    """P(0): std of the part of the unknown load that is constant for hours [C]."""
     load_s: float = 20.0
-    """Correlation time of the varying part of that load [s]."""
+    """P(0): correlation time of the varying part of the unknown load [s]."""
     half_likelihood_exponent: float = 0.17
-    """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
+    """Half of the likelihood's exponent in the weights of hypotheses. It is below 0.5, because successive errors are not
+    independent."""
     min_innovation_scale: float = 0.25
-    """Minimum fraction to which S shrinks for weights, because R and B allow for the worst case."""
+    """Minimum factor on S in the weights of hypotheses, because R and the biases cover the worst case."""
     inconsistency_penalty: float = 0.1
-    """A hypothesis that holds the model for wrong by more than two std loses this part of their square from its ln weight, with each
-    update."""
+    """Log-weight penalty. At each update a hypothesis whose bias exceeds 2 std loses this factor times the excess of the
+    squared bias in variances."""
     hysteresis_soc: float = 0.04
-    """Charge that leads from one branch of the hysteresis to the other [SOC]."""
+    """Charge constant of the exponential approach of h to -1 or 1 [SOC]."""
 
 
 EKF_SETTINGS = np.dtype(
@@ -99,20 +101,20 @@ EKF_SETTINGS = np.dtype(
         ("ocv_v", "f8", OCV_POINTS),  # E_o over SOC 0..1 at 25 C [V]
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
         ("curve_error_v", "f8", GRID),  # std of E_o [V]
-        ("learned", "f8"),  # part of its variance that is of the curve, the same each time: ``ocv_correction``
-        ("curve_soc", "f8", GRID),  # charge over which that error changes [SOC]
+        ("learned", "f8"),  # constant fraction of the variance of E_o, which is learned: ``ocv_correction``
+        ("curve_soc", "f8", GRID),  # charge throughput over which the varying error of E_o changes [SOC]
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
-        ("hysteresis_v", "f8", GRID),  # half of what E_o is higher after charge than after discharge, at 25 C [V]
-        ("weak_ohm", "f8", (GRID, RESISTANCES)),  # at 25 C, activation energy WEAK_J [ohm]
-        ("strong_ohm", "f8", (GRID, RESISTANCES)),  # the same with STRONG_J
-        ("middle_ohm", "f8"),  # sum of all at SOC 0.5 and 25 C [ohm]
-        ("low_c", "f8"),  # temperatures that the resistances are known for [C]
-        ("high_c", "f8"),
+        ("hysteresis_v", "f8", GRID),  # half of E_o after charge less E_o after discharge, at 25 C [V]
+        ("weak_ohm", "f8", (GRID, RESISTANCES)),  # resistances with activation energy WEAK_J, at 25 C [ohm]
+        ("strong_ohm", "f8", (GRID, RESISTANCES)),  # resistances with activation energy STRONG_J, at 25 C [ohm]
+        ("middle_ohm", "f8"),  # sum of all resistances at SOC 0.5 and 25 C [ohm]
+        ("low_c", "f8"),  # temperature range of the resistances, lower end [C]
+        ("high_c", "f8"),  # upper end [C]
         ("sensor_v2", "f8"),  # variance of one voltage sample: noise and rounding [V^2]
         ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
-        ("current_step_a", "f8"),  # of the current that is shown [A]; 0: none
-        ("dead_band_a", "f8"),  # a smaller one is shown as 0 [A]
-        *[(field.name, "f8") for field in fields(Noise)],  # volts as of the pack
+        ("current_step_a", "f8"),  # resolution of the reported current [A]; 0: not rounded
+        ("dead_band_a", "f8"),  # current below which the sensor reports 0 [A]
+        *[(field.name, "f8") for field in fields(Noise)],  # volts are those of the pack
     ],
     align=True,
 )
@@ -120,16 +122,16 @@ EKF_SETTINGS = np.dtype(
 WINDOW = np.dtype(
     [
         ("samples", "i8"),
-        ("time_s", "f8"),  # since the update before [s]
-        ("charge_as", "f8"),  # moved since then [A s]
-        ("throughput_as", "f8"),  # its magnitude
+        ("time_s", "f8"),  # time since the previous update [s]
+        ("charge_as", "f8"),  # charge since the previous update, positive on discharge [A s]
+        ("throughput_as", "f8"),  # sum of charge and discharge since the previous update [A s]
         ("unknown_as", "f8"),  # std of the charge in unmeasured gaps [A s]
-        ("between_as2", "f8"),  # variance of the charge that samples far apart do not show [A^2 s^2]
-        ("rounded_as2", "f8"),  # the same of what the steps of the current leave out [A^2 s^2]
+        ("between_as2", "f8"),  # variance of the charge between samples far apart [A^2 s^2]
+        ("rounded_as2", "f8"),  # variance of the charge by rounding of the current [A^2 s^2]
         ("gap", "i8"),  # 1: samples are missing
         ("sum_v", "f8"),
         ("sum_a", "f8"),
-        ("sum_as", "f8"),  # of the charge moved until each sample
+        ("sum_as", "f8"),  # sum over the samples of the charge up to each sample
         ("sum_x_a", "f8", BRANCHES),
     ],
     align=True,
@@ -138,59 +140,59 @@ WINDOW = np.dtype(
 
 STEP = np.dtype(
     [
-        ("phase", "i8"),  # of step_resistance
-        ("current_a", "f8"),  # when it was last held,
-        ("voltage_v", "f8"),
-        ("x_a", "f8", BRANCHES),  # and in the branches
+        ("phase", "i8"),  # UNHELD, HELD or STEPPED of step_resistance
+        ("current_a", "f8"),  # last constant current [A]
+        ("voltage_v", "f8"),  # voltage at that current [V]
+        ("x_a", "f8", BRANCHES),  # filtered currents of the RC pairs at that time [A]
         ("ln_ratio", "f8"),  # ln(R_s / R_0 of the file)
-        ("variance", "f8"),  # of that
+        ("variance", "f8"),  # variance of ln_ratio
     ],
     align=True,
 )
-"""Last step of the current, and R_s as learned from such steps."""
+"""Last current step, and R_s learned from such steps."""
 
 EKF_STATE = np.dtype(
     [
         ("mean", "f8", (HYPOTHESES, STATES)),
         ("covariance", "f8", (HYPOTHESES, STATES, STATES)),
-        ("ln_weight", "f8", HYPOTHESES),  # of the best 0
-        ("minute_u", "f8", HYPOTHESES),  # running means of the normalised innovation, over a minute ...
-        ("ten_minutes_u", "f8", HYPOTHESES),  # ... and ten
-        ("fast_inflation", "f8", HYPOTHESES),  # of the variance of B_FAST
-        ("slow_inflation", "f8", HYPOTHESES),  # of the variance of B_SLOW
-        ("count", "i8"),  # hypotheses in use
-        ("best", "i8"),  # the likeliest
-        ("started", "i8"),
-        ("seeded_s", "f8"),  # age of the hypotheses [s]
-        ("reopened", "i8"),  # times the SOC became unknown: the model would have to be wrong by too much
+        ("ln_weight", "f8", HYPOTHESES),  # log-weights; that of the best is 0 after merging
+        ("minute_u", "f8", HYPOTHESES),  # running mean of the normalized innovation over a minute
+        ("ten_minutes_u", "f8", HYPOTHESES),  # running mean of the normalized innovation over ten minutes
+        ("fast_inflation", "f8", HYPOTHESES),  # factor on the variance of B_FAST
+        ("slow_inflation", "f8", HYPOTHESES),  # factor on the variance of B_SLOW
+        ("count", "i8"),  # number of hypotheses
+        ("best", "i8"),  # index of the likeliest hypothesis
+        ("started", "i8"),  # 1: initialized
+        ("seeded_s", "f8"),  # time since the hypotheses were initialized [s]
+        ("reopened", "i8"),  # number of re-initializations of the SOC because of an implausible bias
         ("window", WINDOW),
-        ("current_a", "f8"),  # of the last sample
-        ("same_s", "f8"),  # time for which the reported current has been constant to a step [s]
-        ("rest_s", "f8"),  # time for which no load has been reported [s]
-        ("rest_as", "f8"),  # ... and the charge that was shown all the same [A s]
-        ("smallest_a", "f8"),  # the smallest that was shown and is not 0 [A]; 0: none yet
+        ("current_a", "f8"),  # current of the last sample [A]
+        ("same_s", "f8"),  # time for which the reported current has been constant within its resolution [s]
+        ("rest_s", "f8"),  # duration of the present rest [s]
+        ("rest_as", "f8"),  # charge counted in the present rest [A s]
+        ("smallest_a", "f8"),  # smallest nonzero reported current [A]; 0: none yet
         ("step", STEP),
-        ("x_a", "f8", BRANCHES),  # current filtered by the branches since switch-on [A]
-        ("decay", "f8", BRANCHES),  # of the branches over ``decay_s``
+        ("x_a", "f8", BRANCHES),  # current since switch-on, filtered by the RC pairs [A]
+        ("decay", "f8", BRANCHES),  # decay of the RC pairs over ``decay_s``
         ("decay_s", "f8"),
-        ("mean_a", "f8"),  # of the current, and ...
-        ("rms_a2", "f8"),  # ... of its square, over 10 min [A^2]
-        ("usual_a", "f8"),  # the same over hours
-        ("usual_a2", "f8"),
-        ("temperature_c", "f8"),
-        ("weak", "f8"),  # Arrhenius factors at it
-        ("strong", "f8"),
-        ("hysteresis", "f8"),  # the same of the hysteresis
+        ("mean_a", "f8"),  # mean current over 10 min [A]
+        ("rms_a2", "f8"),  # mean squared current over 10 min [A^2]
+        ("usual_a", "f8"),  # mean current over hours [A]
+        ("usual_a2", "f8"),  # mean squared current over hours [A^2]
+        ("temperature_c", "f8"),  # temperature of the cell, measured or modelled [C]
+        ("weak", "f8"),  # Arrhenius factor of WEAK_J at that temperature
+        ("strong", "f8"),  # Arrhenius factor of STRONG_J
+        ("hysteresis", "f8"),  # Arrhenius factor of HYSTERESIS_J
         ("sensed", "i8"),  # 1: a temperature was reported
-        ("soc", "f8"),  # mean of the hypotheses
-        ("soc_std", "f8"),
-        ("voltage_v", "f8"),  # predicted by the likeliest [V]
-        ("innovation_v", "f8"),  # measured less that [V]
+        ("soc", "f8"),  # mean SOC of the mixture
+        ("soc_std", "f8"),  # std of the SOC of the mixture
+        ("voltage_v", "f8"),  # voltage predicted by the likeliest hypothesis [V]
+        ("innovation_v", "f8"),  # measured less predicted voltage [V]
         ("innovation_variance", "f8"),  # S [V^2]
-        ("ohm", "f8", RESISTANCES),  # scratch: resistances,
-        ("h", "f8", STATES),  # H,
-        ("ph", "f8", STATES),  # P H',
-        ("f", "f8", STATES),  # diagonal of F over the window
+        ("ohm", "f8", RESISTANCES),  # scratch space: resistances [ohm]
+        ("h", "f8", STATES),  # scratch space: H
+        ("ph", "f8", STATES),  # scratch space: P H'
+        ("f", "f8", STATES),  # scratch space: diagonal of F over the window
     ],
     align=True,
 )

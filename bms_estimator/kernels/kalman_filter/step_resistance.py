@@ -1,8 +1,8 @@
-"""The series resistance R_s from steps of the current: what the voltage jumps by, as everybody measures it.
+"""Series resistance R_s from voltage jumps at current steps.
 
-A window of a second has the error of the whole model in it; between two samples around a step nothing of that changes but
-the fastest branches, which are taken off. A step counts when the current is held before and behind it: in between,
-voltage and current of one row may be of two moments.
+The mean voltage of a window contains the error of the whole model. Between two samples around a current step, only the
+fastest RC pairs change, and their change is subtracted. The current must be constant before and after a step, because
+voltage and current of a sample during the step may be measured at different times.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -11,38 +11,47 @@ import math
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, resistances
 from bms_estimator.kernels.kalman_filter.ekf import HUBER
-from bms_estimator.kernels.kalman_filter.equivalent_circuit import MAX_S
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import MAX_STEP_S
 from bms_estimator.kernels.kalman_filter.records import LN_R, SOC
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 UNHELD, HELD, STEPPED = range(3)
+"""Phases: current not constant; current constant; current stepped after a constant current."""
 MIN_C = 0.2
-"""Minimum change of the current between two samples that counts as a step [C]."""
+"""Minimum change of the current between two samples of a current step [C]."""
 HELD_SHARE = 0.1
-"""A current is held that changes by no more than this part of the (least) step."""
+"""Maximum change of a constant current, as a fraction of the step."""
 STEP_STD = 0.05
-"""Std of ln of the resistance that one step shows, by kinetics and by timing errors of samples."""
+"""Std of ln R_s by one step, due to kinetics and to timing errors of samples."""
 FAST_STD = 0.5
-"""Relative std of what the branches change by within the step."""
+"""Relative std of the RC pairs' change within the step."""
 SHAPE_STD = 0.3
 """Std of a random walk of ln(R_s / R_0 of the file) over the whole range of SOC."""
 
 
 @njit(cache=True)
 def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: float) -> None:
-    """Take one sample, after ``integrate_current``: the current changed by ``change_a`` [A] within ``dt_s`` [s]."""
-    step, least_a = s.step, MIN_C * p.capacity_as / 3600.0
+    """Update the phase by one sample, after ``integrate_current``, and R_s at the end of a step.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        dt_s: Time since the previous sample [s].
+        change_a: Change of the current since the previous sample [A].
+        voltage_v: Voltage of the sample [V].
+    """
+    step, min_step_a = s.step, MIN_C * p.capacity_as / 3600.0
     before, step.phase = step.phase, UNHELD
     step.variance += SHAPE_STD**2 * abs(s.current_a) * dt_s / p.capacity_as
-    if dt_s > MAX_S:
+    if dt_s > MAX_STEP_S:
         return
     stepped_a = abs(s.current_a - step.current_a)
-    if before == STEPPED and stepped_a >= least_a and abs(change_a) <= HELD_SHARE * stepped_a:
+    if before == STEPPED and stepped_a >= min_step_a and abs(change_a) <= HELD_SHARE * stepped_a:
         update_r_s_from_step(s, p, voltage_v)
-    elif before == HELD and abs(change_a) >= least_a:
+    elif before == HELD and abs(change_a) >= min_step_a:
         step.phase = STEPPED
-    if abs(change_a) <= HELD_SHARE * least_a:
+    if abs(change_a) <= HELD_SHARE * min_step_a:
         step.phase = HELD
         step.current_a, step.voltage_v = s.current_a, voltage_v
         for k in range(BRANCHES):
@@ -51,7 +60,7 @@ def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, volt
 
 @njit(cache=True)
 def update_r_s_from_step(s: Record, p: Record, voltage_v: float) -> None:
-    """Learn of the step that ends with this voltage [V]."""
+    """Update R_s by the step that ends with ``voltage_v`` [V]."""
     x, step = s.mean[s.best], s.step
     resistances(x[SOC], p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
     change_a, fast_v = s.current_a - step.current_a, 0.0

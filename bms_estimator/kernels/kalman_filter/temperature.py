@@ -25,45 +25,41 @@ from bms_estimator.numba_cache import njit
 TEMPERATURE_S = 10.0
 """Averaging time of a temperature sensor's noise [s]."""
 
-FASTEST_K_S = 0.1
-"""No cell warms or cools faster [K/s], ..."""
+MAX_RATE_K_S = 0.1
+"""Maximum rate of a cell's temperature [K/s]."""
 
-SETTLED_S = 60.0
-"""Delay until the rate limit of the temperature applies [s]: some sensors begin with 85 C."""
+RATE_LIMIT_DELAY_S = 60.0
+"""Delay until the rate limit of the temperature applies [s], because some sensors report 85 C at first."""
 
-COLDEST_C, HOTTEST_C = -60.0, 120.0
+MIN_PLAUSIBLE_C, MAX_PLAUSIBLE_C = -60.0, 120.0
 """Range of a cell's plausible temperatures [C]."""
 
 HEAT_J = 22.0
-"""Heat that warms 1 Ah of a cell by a kelvin [J/(K Ah)] ..."""
-COOLS_S = 600.0
-"""Time constant of a cell's cooling in still air [s]: for an LG M50 at C/2 and 1C the fits of heat capacity and time
-constant give 22 and 24 J/K per Ah, 650 and 570 s."""
-WARMEST_C = 80.0
-"""No cell that is used gets warmer [C]: a current that is no truth would leave it hot for an hour."""
+"""Heat capacity per Ah of a cell [J/(K Ah)]. Fits to an LG M50 at C/2 and 1C give 22 and 24 J/(K Ah)."""
+COOLING_S = 600.0
+"""Time constant of a cell's cooling in still air [s]. Fits to an LG M50 at C/2 and 1C give 650 and 570 s."""
+MAX_MODELLED_C = 80.0
+"""Maximum modelled temperature [C], so that a wrong current does not cause an implausible temperature for an hour."""
 
 
 @njit(cache=True)
 def propagate_self_heating(s: Record, p: Record) -> None:
-    """Compute the temperature at the end of the window from losses i^2 R_0 + sum x_k^2 R_k, at ``REFERENCE_C`` ambient."""
+    """Model the temperature at the end of the window by losses i^2 R_0 + sum x_k^2 R_k, in air of ``REFERENCE_C``."""
     w, x = s.window, s.mean[s.best]
     resistances(s.soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
     current_a = w.charge_as / w.time_s
     loss_w = math.exp(x[LN_R0]) * s.ohm[0] * current_a * current_a
     for k in range(BRANCHES):
         loss_w += math.exp(x[LN_R]) * s.ohm[1 + k] * (s.x_a[k] + x[X + k]) ** 2
-    in_the_end_c = REFERENCE_C + loss_w / p.series * COOLS_S / (HEAT_J * p.capacity_as / 3600.0)
-    s.temperature_c = in_the_end_c + (s.temperature_c - in_the_end_c) * math.exp(-w.time_s / COOLS_S)
-    s.temperature_c = min(s.temperature_c, WARMEST_C)
+    steady_c = REFERENCE_C + loss_w / p.series * COOLING_S / (HEAT_J * p.capacity_as / 3600.0)
+    s.temperature_c = steady_c + (s.temperature_c - steady_c) * math.exp(-w.time_s / COOLING_S)
+    s.temperature_c = min(s.temperature_c, MAX_MODELLED_C)
 
 
 @njit(cache=True)
 def is_temperature(temperature_c: float) -> bool:
-    """Return True for a temperature that a cell can have; sensors report -127 or -300 C for an open wire.
-
-    NaN gives False.
-    """
-    return COLDEST_C <= temperature_c <= HOTTEST_C
+    """Return True for a plausible temperature, False for NaN. Sensors with an open wire report -127 or -300 C."""
+    return MIN_PLAUSIBLE_C <= temperature_c <= MAX_PLAUSIBLE_C
 
 
 @njit(cache=True)

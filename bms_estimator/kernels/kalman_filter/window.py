@@ -1,4 +1,4 @@
-"""The window of samples that make one update of the filter.
+"""Window of about a second of samples, whose mean is one measurement of the filter.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -24,8 +24,8 @@ from bms_estimator.kernels.kalman_filter.gap_charge import (
     rounding_charge_variance,
 )
 from bms_estimator.kernels.kalman_filter.temperature import (
-    FASTEST_K_S,
-    SETTLED_S,
+    MAX_RATE_K_S,
+    RATE_LIMIT_DELAY_S,
     TEMPERATURE_S,
     is_temperature,
     propagate_self_heating,
@@ -34,9 +34,9 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 WINDOW_S = 0.99
-"""Samples of about a second make one update [s]."""
-SAME_STEP = 0.005
-"""A step as long as that before within this, relative, has its decays."""
+"""Minimum duration of a window [s]. Each sample of a 1 Hz source is a window."""
+DECAY_TOLERANCE = 0.005
+"""Relative change of the sample period below which the decays of the RC pairs are not computed again."""
 
 
 @njit(cache=True)
@@ -51,33 +51,42 @@ def reset_window(s: Record) -> None:
 
 @njit(cache=True)
 def integrate_current(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, temperature_c: float) -> None:
-    """Charge and branches from the sample before to this one; ``gap``: samples are missing between them."""
+    """Integrate the current from the previous sample to this one: charge, RC pairs, and their variances.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        dt_s: Time since the previous sample [s].
+        gap: True if samples are missing since the previous sample.
+        current_a: Current of this sample [A].
+        temperature_c: Temperature of the cell [C]; NaN without a sensor.
+    """
     if is_temperature(temperature_c):
         share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
-        most_k = FASTEST_K_S * dt_s if s.sensed and s.seeded_s > SETTLED_S else math.inf
-        s.temperature_c += min(max(share * (temperature_c - s.temperature_c), -most_k), most_k)
+        max_change_k = MAX_RATE_K_S * dt_s if s.sensed and s.seeded_s > RATE_LIMIT_DELAY_S else math.inf
+        s.temperature_c += min(max(share * (temperature_c - s.temperature_c), -max_change_k), max_change_k)
         s.sensed = 1
     w = s.window
     held_a, change_a = interpolated_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
-    unseen = gap or dt_s > p.unmeasured_s
+    unmeasured = gap or dt_s > p.unmeasured_s
     charge_as = held_a * min(dt_s, MAX_FLOW_S)
     if gap and dt_s > p.unmeasured_s:
         charge_as += expected_excess_charge(s, held_a, dt_s)
         held_a = charge_as / dt_s
-    if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
+    if abs(dt_s - s.decay_s) > DECAY_TOLERANCE * dt_s:
         s.decay_s = dt_s
         for k in range(BRANCHES):
             s.decay[k] = math.exp(-dt_s / TAUS[k])
     for k in range(BRANCHES):
         s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
-        if dt_s > SLOW_S and not unseen:
+        if dt_s > SLOW_S and not unmeasured:
             s.x_a[k] += ramp_correction(change_a, dt_s / TAUS[k], s.decay[k])
     w.time_s += dt_s
     w.charge_as += charge_as
     w.throughput_as += abs(charge_as)
     if gap:
         w.gap = 1
-    if unseen:
+    if unmeasured:
         w.unknown_as += gap_charge_std(s, p, held_a, dt_s)
     else:
         w.between_as2 += interpolation_charge_variance(change_a, dt_s)

@@ -1,7 +1,7 @@
-"""The learning law: sensitivity times e with a memory, for any model of ``learning_model``.
+"""Learning law: least squares with discounting over sensitivities, for any model of ``learning_model``.
 
-``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS; ``m`` and ``q`` are the law's own parts of them, ``o`` is
-the observer's.
+``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS. ``m`` and ``q`` are their fields ``learning``, ``o`` is
+the field ``observer`` of ``s``.
 """
 
 import math
@@ -13,11 +13,11 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 LEARN_EVERY_S = 0.999
-"""Minimum interval between two steps of theta [s]; more samples only add to the memory."""
-FASTEST_HZ = 0.1
-"""Greatest gamma k, since k only grows: theta that follows noise faster than in some 10 s is led astray by it [1/s]."""
+"""Minimum interval between two steps of theta [s]. Samples between them only add information."""
+MAX_RATE_HZ = 0.1
+"""Maximum of gamma k [1/s], because k only grows and a theta faster than some 10 s follows noise."""
 RESTING_C = 0.02
-"""A first sample of no more is of a cell at rest [C]."""
+"""Maximum current of a first sample of a cell at rest [C]."""
 
 
 @njit(cache=True)
@@ -35,7 +35,7 @@ def initialize_learning(s: Record, p: Record, voltage_v: float) -> None:
 
 @njit(cache=True)
 def reset_information(m: Record, q: Record) -> None:
-    """Nothing is remembered."""
+    """Set the accumulated information to zero."""
     m.waited_s = 0.0
     for j in range(q.count):
         m.pull[j] = 0.0
@@ -45,11 +45,10 @@ def reset_information(m: Record, q: Record) -> None:
 
 @njit(cache=True)
 def initialize_states_at_rest(s: Record, p: Record, voltage_v: float) -> None:
-    """Initialize the states of a cell at rest.
+    """Initialize the states as those of a cell at rest.
 
-    The remaining voltage goes to the offset and does not move the parameters.
-
-    Nothing is learned until the states would have forgotten that they were otherwise.
+    The voltage error becomes the injected offset and does not change the parameters. Learning is disabled for
+    ``settle_s``, until effects of another initial state have decayed.
     """
     m, q, o = s.learning, p.learning, s.observer
     load_constants(q.model, m.given, p, o.soc, m.temperature_c)
@@ -65,7 +64,15 @@ def initialize_states_at_rest(s: Record, p: Record, voltage_v: float) -> None:
 
 @njit(cache=True)
 def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v: float) -> None:
-    """Advance by one sample at the SOC that the observer has; the current was ``before_a`` [A] at the sample before."""
+    """Advance the learning law by one sample at the observer's present SOC.
+
+    Args:
+        s: Record of ESTIMATOR_STATE.
+        p: Record of ESTIMATOR_SETTINGS.
+        dt_s: Time since the previous sample [s].
+        before_a: Current at the previous sample [A].
+        voltage_v: Measured voltage [V].
+    """
     m, q, o = s.learning, p.learning, s.observer
     load_constants(q.model, m.given, p, o.soc, m.temperature_c)
     unmeasured_s = p.observer.unmeasured_s
@@ -74,7 +81,7 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
     e = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) - m.offset_v
     o.innovation_v = e
     inject_output_error(m, q, dt_s, e)
-    o.adapting = 0 if o.soc <= q.soc_floor else 1  # without a SOC always
+    o.adapting = 0 if o.soc <= q.soc_floor else 1  # a fuel cell has no SOC and always adapts
     m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= unmeasured_s else q.settle_s
     if o.adapting and m.settle_s == 0.0:
         accumulate_information(m, q, dt_s, e)
@@ -86,7 +93,7 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
             else:
                 reset_information(m, q)
         excess = max(abs(e) - p.observer.dead_zone_v, 0.0) / q.cells
-        o.k = min(o.k + excess * excess * dt_s, FASTEST_HZ / q.rate)  # (3.13) with the dead zone of E2
+        o.k = min(o.k + excess * excess * dt_s, MAX_RATE_HZ / q.rate)  # (3.13) with the dead zone of erratum 2
     estimate = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) + m.offset_v
     write_observer_state(s, p, estimate)
     broken = not math.isfinite(estimate)
@@ -97,7 +104,7 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
 
 @njit(cache=True)
 def inject_output_error(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """Move the offset by e and update its sensitivities: ``m.psi`` becomes that of y^ with the offset."""
+    """Add a fraction of e to the offset, and update the offset's sensitivities; ``m.psi`` becomes that of y^ with offset."""
     share = -math.expm1(-dt_s / q.offset_s)
     m.offset_v += share * e
     for j in range(q.count):
@@ -109,15 +116,15 @@ def inject_output_error(m: Record, q: Record, dt_s: float, e: float) -> None:
 def accumulate_information(m: Record, q: Record, dt_s: float, e: float) -> None:
     """Update Kreisselmeier's filters: psi psi' and psi (e + psi' theta).
 
-    Old information is discounted while the load excites new.
+    Old information is discounted only while the load provides new information.
     """
-    told, known = 0.0, e
+    psi_squared, target = 0.0, e
     for j in range(q.count):
-        told += m.psi[j] * m.psi[j]
-        known += m.psi[j] * m.theta[j]
-    discount_information(m, q, dt_s / q.memory_s * told / (told + q.told_v * q.told_v))
+        psi_squared += m.psi[j] * m.psi[j]
+        target += m.psi[j] * m.theta[j]
+    discount_information(m, q, dt_s / q.memory_s * psi_squared / (psi_squared + q.told_v * q.told_v))
     for j in range(q.count):
-        m.pull[j] += dt_s * m.psi[j] * known
+        m.pull[j] += dt_s * m.psi[j] * target
         for i in range(j + 1):
             m.information[j, i] += dt_s * m.psi[j] * m.psi[i]
 
@@ -125,16 +132,16 @@ def accumulate_information(m: Record, q: Record, dt_s: float, e: float) -> None:
 @njit(cache=True)
 def discount_information(m: Record, q: Record, times: float) -> None:
     """Discount the accumulated information by e^-times."""
-    keep = math.exp(-times)
+    factor = math.exp(-times)
     for j in range(q.count):
-        m.pull[j] *= keep
+        m.pull[j] *= factor
         for i in range(j + 1):
-            m.information[j, i] *= keep
+            m.information[j, i] *= factor
 
 
 @njit(cache=True)
 def solve_parameter_step(m: Record, q: Record) -> bool:
-    """Write the step from theta to the balance of information and leakage to ``m.step``; return False if singular."""
+    """Write the step from theta to the solution of information and leakage to ``m.step``; return False if singular."""
     n = q.count
     for j in range(n):
         m.step[j] = m.pull[j] + q.leak_v2s[j] * (q.middle[j] - m.theta[j])
@@ -155,42 +162,46 @@ def solve_parameter_step(m: Record, q: Record) -> bool:
 
 @njit(cache=True)
 def cholesky_factor(m: Record, q: Record) -> bool:
-    """Cholesky's factor of information and leakage; False where that is no positive matrix, by rounding or a damaged state."""
+    """Write the Cholesky factor of information plus leakage to ``m.factor``.
+
+    Returns:
+        False if the matrix is not positive definite, by rounding or a damaged state.
+    """
     for j in range(q.count):
-        rest = m.information[j, j] + q.leak_v2s[j]
+        pivot = m.information[j, j] + q.leak_v2s[j]
         for i in range(j):
-            inner = m.information[j, i]
+            element = m.information[j, i]
             for h in range(i):
-                inner -= m.factor[j, h] * m.factor[i, h]
-            m.factor[j, i] = inner / m.factor[i, i]
-            rest -= m.factor[j, i] ** 2
-        if not rest > 0.0:
+                element -= m.factor[j, h] * m.factor[i, h]
+            m.factor[j, i] = element / m.factor[i, i]
+            pivot -= m.factor[j, i] ** 2
+        if not pivot > 0.0:
             return False
-        m.factor[j, j] = math.sqrt(rest)
+        m.factor[j, j] = math.sqrt(pivot)
     return True
 
 
 @njit(cache=True)
 def apply_parameter_step(m: Record, q: Record, share: float) -> None:
-    """Move theta within its bounds, and the states with it: as though it had been so all along.
+    """Move theta by ``share`` of the step within its bounds, and the states to those of the new theta.
 
-    Sensitivities belong to another theta: the memory fades with the square of the step.
+    The accumulated sensitivities are those of earlier theta, so that information is discounted with the squared step.
     """
-    way = 0.0
+    squared_step = 0.0
     for j in range(q.count):
-        way += m.step[j] * m.step[j]
+        squared_step += m.step[j] * m.step[j]
         moved = min(max(m.theta[j] + share * m.step[j], q.lower[j]), q.upper[j])
         m.step[j] = moved - m.theta[j]
         m.theta[j] = moved
         m.offset_v += m.d_offset[j] * m.step[j]
         for branch in range(2):
             m.x[branch] += m.dx[branch, j] * m.step[j]
-    discount_information(m, q, share * way / (q.reach * q.reach))
+    discount_information(m, q, share * squared_step / (q.reach * q.reach))
 
 
 @njit(cache=True)
 def write_observer_state(s: Record, p: Record, estimate_v: float) -> None:
-    """Write the adaptive law's states, parameters, gain and estimated voltage to the observer's record."""
+    """Write states, parameters, gain and estimated voltage of the learning law to the observer's record."""
     m, q, o = s.learning, p.learning, s.observer
     o.v_ts, o.v_tl = m.x[0], m.x[1]
     o.voltage_estimate_v = estimate_v

@@ -1,6 +1,7 @@
-"""Models of the learning law, selected by an integer because numba's disk cache cannot store first-class functions.
+"""Dispatch of the learning law's functions to a model, selected by an integer.
 
-A model is a file of the shape of ``chen_mora``; the law calls it through the functions here.
+An integer is used because numba's disk cache cannot store first-class functions. The modules ``chen_mora_sensitivity`` and
+``fuel_cell`` define the functions of each model.
 """
 
 import math
@@ -36,7 +37,7 @@ def load_constants(model: int, given: Floats, p: Record, soc: float, temperature
 
 @njit(cache=True)
 def steady_state(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
-    """Set states and derivatives at a first sample with unknown history; in place."""
+    """Set states and derivatives in place to the steady state, for a sample with unknown history."""
     if model == _CHEN_MORA:
         chen_mora_sensitivity.steady_state(x, dx, theta, given, current_a)
     elif model == _FUEL_CELL:
@@ -45,7 +46,7 @@ def steady_state(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats
 
 @njit(cache=True)
 def advance(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, dt_s: float) -> None:
-    """States ``x`` (2,) [V] and their derivatives ``dx`` (2, 8) after ``dt_s`` under a held current, in place."""
+    """Advance states ``x`` (2,) [V] and derivatives ``dx`` (2, 8) in place by ``dt_s`` under a constant current."""
     if model == _CHEN_MORA:
         chen_mora_sensitivity.advance(x, dx, theta, given, current_a, dt_s)
     elif model == _FUEL_CELL:
@@ -54,7 +55,7 @@ def advance(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, cur
 
 @njit(cache=True)
 def output(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, psi: Floats) -> float:
-    """Terminal voltage y^ [V]; psi = dy^/dtheta (8,) in place."""
+    """Return the terminal voltage y^ [V]; write dy^/dtheta to ``psi`` (8,)."""
     if model == _CHEN_MORA:
         return chen_mora_sensitivity.output(x, dx, theta, given, current_a, psi)
     if model == _FUEL_CELL:

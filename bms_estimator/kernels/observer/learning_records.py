@@ -1,4 +1,4 @@
-"""The records of the learning law, parts of the whole estimator's."""
+"""Records of the learning law, fields of the estimator's records."""
 
 import numpy as np
 
@@ -11,20 +11,20 @@ LEARNING_SETTINGS = np.dtype(
     [
         ("enabled", "i8"),  # 0: a printed law
         ("model", "i8"),  # kernels.observer.learning_model.Model
-        ("count", "i8"),  # parameters that are learned
+        ("count", "i8"),  # number of identified parameters
         ("file", "f8", CONSTANTS),  # values at theta = 0
         ("lower", "f8", LEARNABLE),  # bounds of theta
         ("upper", "f8", LEARNABLE),
-        ("middle", "f8", LEARNABLE),  # where the leakage leads
-        ("leak_v2s", "f8", LEARNABLE),  # information that the middle counts as [V^2 s]
-        ("memory_s", "f8"),  # time constant of forgetting, under load [s]
-        ("offset_s", "f8"),  # time constant of the injection; infinite: nothing is injected [s]
-        ("settle_s", "f8"),  # time after which the states have forgotten unknown initial values [s]
+        ("middle", "f8", LEARNABLE),  # theta to which the leakage leads
+        ("leak_v2s", "f8", LEARNABLE),  # weight of the leakage, as information [V^2 s]
+        ("memory_s", "f8"),  # time constant of discounting, under load [s]
+        ("offset_s", "f8"),  # time constant of the injection [s]; infinite: no injection
+        ("settle_s", "f8"),  # time after which effects of unknown initial states have decayed [s]
         ("rate", "f8"),  # gamma: rate at which theta follows the data, at k = 1 [1/s]
         ("cells", "f8"),  # cells in series: k is that of one cell
         ("told_v", "f8"),  # a sensitivity of this size gives information on the parameters [V]
-        ("reach", "f8"),  # trust region of theta: sensitivities hold for shorter steps
-        ("soc_floor", "f8"),  # below it nothing is learned (E14)
+        ("reach", "f8"),  # trust region of theta: maximum step for which the sensitivities are valid
+        ("soc_floor", "f8"),  # SOC below which learning is disabled (erratum 14)
     ],
     align=True,
 )
@@ -34,17 +34,17 @@ LEARNING_STATE = np.dtype(
         ("theta", "f8", LEARNABLE),  # ln of each parameter over the file's
         ("x", "f8", 2),  # states of the model [V]
         ("dx", "f8", (2, LEARNABLE)),  # their derivatives by theta [V]
-        ("offset_v", "f8"),  # what the injection has added to the output [V]
-        ("d_offset", "f8", LEARNABLE),  # its derivative by theta [V]
+        ("offset_v", "f8"),  # injected offset of the output [V]
+        ("d_offset", "f8", LEARNABLE),  # derivative of offset_v by theta [V]
         ("psi", "f8", LEARNABLE),  # dy^/dtheta [V]
         ("temperature_c", "f8"),  # last reported value; NaN without one [C]
-        ("given", "f8", LEARNABLE),  # values that are not learned, at the last sample
-        ("information", "f8", (LEARNABLE, LEARNABLE)),  # of psi psi', remembered [V^2 s]
-        ("pull", "f8", LEARNABLE),  # of psi (e + psi' theta), remembered [V^2 s]
-        ("settle_s", "f8"),  # time without learning: the states hold unmeasured history [s]
-        ("waited_s", "f8"),  # since theta moved [s]
-        ("step", "f8", LEARNABLE),  # the last change of theta
-        ("factor", "f8", (LEARNABLE, LEARNABLE)),  # Cholesky's, of information and leakage
+        ("given", "f8", LEARNABLE),  # constants of the model at the last sample
+        ("information", "f8", (LEARNABLE, LEARNABLE)),  # discounted integral of psi psi' [V^2 s]
+        ("pull", "f8", LEARNABLE),  # discounted integral of psi (e + psi' theta) [V^2 s]
+        ("settle_s", "f8"),  # remaining time without learning, while the states depend on an unmeasured load [s]
+        ("waited_s", "f8"),  # time since the last step of theta [s]
+        ("step", "f8", LEARNABLE),  # last change of theta
+        ("factor", "f8", (LEARNABLE, LEARNABLE)),  # Cholesky factor of information plus leakage
     ],
     align=True,
 )

@@ -1,4 +1,4 @@
-"""The Mittag-Leffler function E_a(-lambda k^a), 2 < a <= 3, as the Nussbaum gain needs it.
+"""Mittag-Leffler function E_a(-lambda k^a), 2 < a <= 3, of the Nussbaum gain.
 
 (3.10) is printed with a plus sign, which makes every term of (3.11) positive; with the minus sign it is a
 Nussbaum function (Li & Chen, Automatica 2009). With r = lambda^(1/a) k its exact value is
@@ -11,8 +11,8 @@ approaches the real axis as a approaches 3,
 
     G_a(r) = 1/(pi a) int e^(-r s(theta)) d theta,    s(0) .. s = inf,
 
-which is tabulated over 1/(1 + r) once per a. Near r = 0, where G is not smooth (it holds a term r^a), the
-power series (3.11) serves.
+which is tabulated over 1/(1 + r) once per a. Near r = 0, where G is not smooth because of a term r^a, the power series
+(3.11) is used.
 """
 
 import math
@@ -25,28 +25,29 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 SERIES_TERMS = 24
+"""Number of terms of the series (3.11)."""
 SERIES_LIMIT = 2.0
-"""Up to this r the series (3.11) is summed: its terms stay below 2, so no digits are lost."""
+"""Maximum r for the series (3.11). Its terms stay below 2 there, so that no digits are lost."""
 TABLE_POINTS = 1025
-"""Nodes of G over w = 1/(1 + r) in [0, 1/(1 + SERIES_LIMIT)]: cubic Hermite error below 1e-12."""
+"""Number of nodes of G over w = 1/(1 + r) in [0, 1/(1 + SERIES_LIMIT)], for a cubic Hermite error below 1e-12."""
 
 _W_END = 1.0 / (1.0 + SERIES_LIMIT)
 
 
 def series_coefficients(alpha: float) -> Floats:
-    """Coefficients (-1)^k / Gamma(alpha k + 1) of the series (3.11) in r^alpha. Shape (SERIES_TERMS,)."""
+    """Return the coefficients (-1)^k / Gamma(alpha k + 1) of the series (3.11) in r^alpha. Shape (SERIES_TERMS,)."""
     k = np.arange(SERIES_TERMS)
     return np.array([(-1.0) ** j * math.exp(-math.lgamma(alpha * j + 1.0)) for j in k])
 
 
 @lru_cache(maxsize=8)  # 5 million exponentials; an alpha seldom changes
 def decay_table(alpha: float) -> tuple[Floats, Floats]:
-    """G_alpha and its derivative by w at ``TABLE_POINTS`` nodes of w = 1/(1 + r) in [0, 1/3].
+    """Return G_alpha and its derivative by w at ``TABLE_POINTS`` nodes of w = 1/(1 + r) in [0, 1/3].
 
-    The arrays are shared by all callers and read only.
+    All callers share the arrays, which are read-only.
 
     Raises:
-        ValueError: When ``alpha`` is not in (2, 3]: E_a(-lambda k^a) is a Nussbaum function only there.
+        ValueError: ``alpha`` is not in (2, 3], so that E_a(-lambda k^a) is no Nussbaum function.
     """
     if not 2.0 < alpha <= 3.0:
         raise ValueError(f"alpha = {alpha}: must be in (2, 3], where E_a(-lambda k^a) is a Nussbaum function")
@@ -64,7 +65,7 @@ def decay_table(alpha: float) -> tuple[Floats, Floats]:
 
 
 def _mean_of_exponentials(alpha: float) -> tuple[Floats, Floats]:
-    """Nodes s and weights of G = sum(weight * exp(-r s)): Gauss-Legendre in theta, graded to both ends."""
+    """Return nodes s and weights of G = sum(weight * exp(-r s)), by Gauss-Legendre panels in theta graded to both ends."""
     c, sine = math.cos(math.pi * alpha), abs(math.sin(math.pi * alpha))
     # theta runs from atan2(c, sine) (s = 0) to pi/2 (s = inf); z = s^alpha on a logarithmic scale has
     # d theta = sine dz / ((z + c)^2 + sine^2), smooth but for the peak at z = -c, which theta removes.
@@ -91,7 +92,7 @@ def _mean_of_exponentials(alpha: float) -> tuple[Floats, Floats]:
 
 @njit(cache=True)
 def mittag_leffler(r: float, alpha: float, series: Floats, decay_value: Floats, decay_slope: Floats) -> float:
-    """E_alpha(-r^alpha) for r >= 0, to 1e-10 of its envelope.
+    """Return E_alpha(-r^alpha) for r >= 0, with an error below 1e-10 of its envelope.
 
     Args:
         r: lambda^(1/alpha) k, not negative.
@@ -113,7 +114,7 @@ def mittag_leffler(r: float, alpha: float, series: Floats, decay_value: Floats, 
 
 @njit(cache=True)
 def _decay(r: float, value: Floats, slope: Floats) -> float:
-    """G_alpha(r) from its table over w = 1/(1 + r), cubic Hermite."""
+    """Return G_alpha(r) by cubic Hermite interpolation of its table over w = 1/(1 + r)."""
     step = _W_END / (TABLE_POINTS - 1)
     position = 1.0 / (1.0 + r) / step
     i = min(int(position), TABLE_POINTS - 2)

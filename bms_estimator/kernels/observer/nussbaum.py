@@ -9,9 +9,9 @@ from bms_estimator.numba_cache import njit
 
 
 class Nussbaum(IntEnum):
-    """Choice of N(k), which drives the observer."""
+    """Nussbaum function N(k), the gain of the observer."""
 
-    MITTAG_LEFFLER = 0  # E_a(-lambda k^a), (3.10) with the sign of E1 of docs/theory/thesis.md
+    MITTAG_LEFFLER = 0  # E_a(-lambda k^a), (3.10) with the sign of erratum 1 in docs/theory/thesis.md
     K2_COS = 1  # N1 = k^2 cos k
     K_COS_SQRT = 2  # N2 = k cos sqrt|k|
     LN_COS_SQRT_LN = 3  # N3 = ln k cos sqrt(ln k), k > 1
@@ -24,7 +24,7 @@ _LN_COS_SQRT_LN = int(Nussbaum.LN_COS_SQRT_LN)
 
 @njit(cache=True)
 def nussbaum_gain(k: float, p: Record) -> float:
-    """N(k), clamped to +-``gain_limit``.
+    """Return N(k), clamped to +-``gain_limit``.
 
     Args:
         k: Adaptive gain state (3.13) [V^2 s].

@@ -1,8 +1,9 @@
-"""The high-gain adaptive observer, Algorithm 1: one sample in, one record updated.
+"""High-gain adaptive observer, Algorithm 1.
 
-Over a sample y, i, N and a_i are held. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix, e
-decays with one of its eigenvalues, and (3.18) is a first-order lag driven by the mean of e^2 over the sample. Each is
-solved exactly, so the step is stable for every N >= 0 and every step length. ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+y, i, N and a_i are constant over a sample period. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix, e
+decays with one of its eigenvalues, and (3.18) is a first-order lag driven by the mean of e^2 over the period. Each
+equation is solved exactly, so that the step is stable for every N >= 0 and every period. ``s`` is a record of
+OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
 """
 
 import math
@@ -13,9 +14,10 @@ from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-SMALLEST_LOOP = 0.1
-"""Least 1 + N R_s the algebraic loop of (3.14) is closed with; below it N has turned the loop's sign."""
+MIN_LOOP_GAIN = 0.1
+"""Lower limit of 1 + N R_s in the algebraic loop of (3.14). Near 0, a negative N reverses the sign of the loop."""
 LOST, REGAINED = -1, 1
+"""Results of ``lock_transition``."""
 
 
 @njit(cache=True)
@@ -46,7 +48,7 @@ def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v:
 
 @njit(cache=True)
 def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
-    """SOC by coulomb counting (3.1); none of a fuel cell."""
+    """Update SOC by coulomb counting (3.1). A fuel cell has no SOC."""
     if p.capacity_as > 0.0:
         charge_as = interpolated_current(dt_s, s.current_a, current_a, p.unmeasured_s) * min(dt_s, MAX_FLOW_S)
         s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
@@ -55,13 +57,13 @@ def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
 
 @njit(cache=True)
 def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
-    """Advance the observer by one sample at the SOC it finds: Algorithm 1, lines 2 to 7."""
+    """Advance the observer by one sample at the present SOC: Algorithm 1, lines 2 to 7."""
     e_o = ocv(s.soc, p.ocv_v, p.ocv_slope_v)
 
     s.adapting = 1 if s.soc > stability_floor(s, p) else 0
     soc = max(s.soc, stability_floor(s, p))
     ohm_s = p.output_r_s * r_s(soc, s.a) if p.output_r_s > 0.0 else 0.0
-    loop = max(1.0 + s.gain * ohm_s, SMALLEST_LOOP)
+    loop = max(1.0 + s.gain * ohm_s, MIN_LOOP_GAIN)
     e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop  # (3.15) with (3.14) or (4.1)
     s.innovation_v = e
 
@@ -75,7 +77,7 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
 
     excess = max(abs(e) - p.dead_zone_v, 0.0)
     if excess > 0.0:
-        s.k += excess * excess * mean_square * dt_s  # (3.13) with the dead zone of E2
+        s.k += excess * excess * mean_square * dt_s  # (3.13) with the dead zone of erratum 2
         s.gain = nussbaum_gain(s.k, p)
     s.voltage_estimate_v = e_o - s.v_ts - s.v_tl  # (4.1)
     if p.output_r_s > 0.0:
@@ -85,7 +87,7 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
 
 @njit(cache=True)
 def adapt_parameters(s: Record, p: Record, dt_s: float, e_squared: float) -> None:
-    """Adaptation laws (3.16)-(3.18), a' = drive e^2 + rate (target - a), exact for an e^2 held at its mean over the sample."""
+    """Apply the adaptive law (3.16), (3.17) or (3.18), a' = drive e^2 + rate (target - a), exactly for a constant e^2."""
     if dt_s != s.decay_dt_s:
         s.decay_dt_s = dt_s
         for i in range(1, 16):
@@ -97,23 +99,25 @@ def adapt_parameters(s: Record, p: Record, dt_s: float, e_squared: float) -> Non
 
 @njit(cache=True)
 def update_margins(s: Record) -> None:
-    """delta1 (2.11) and delta2 (2.12) of the present parameters."""
+    """Update delta1 (2.11) and delta2 (2.12) by the present parameters."""
     s.delta_1 = delta(s.a[8], s.a[9], s.a[7])
     s.delta_2 = delta(s.a[11], s.a[12], s.a[10])
 
 
 @njit(cache=True)
 def stability_floor(s: Record, p: Record) -> float:
-    """SOC down to which the elements are evaluated: below it a capacitance may be negative (E14)."""
+    """Return the minimum SOC of the elements. Below, a capacitance may be negative (erratum 14)."""
     return max(s.delta_1, s.delta_2) + p.margin_guard
 
 
 @njit(cache=True)
 def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: float, dt_s: float) -> float:
-    """x2, x3 after ``dt_s``: (3.2)-(3.3) with u = -gain (drop_v + x2 + x3), gain and inputs held, exactly.
+    """Advance x2 and x3 by ``dt_s``, exactly: (3.2)-(3.3) with u = -gain (drop_v + x2 + x3) and constant gain and inputs.
 
-    The matrix is [[-1/tau_ts - gain, -gain], [-gain, -1/tau_tl - gain]]. Returns the eigenvalue that the
-    output error e follows [1/s].
+    The matrix is [[-1/tau_ts - gain, -gain], [-gain, -1/tau_tl - gain]].
+
+    Returns:
+        Eigenvalue with which the output error e decays [1/s].
     """
     mean = -gain - 0.5 * (1.0 / tau_ts + 1.0 / tau_tl)
     half = 0.5 * (1.0 / tau_tl - 1.0 / tau_ts)
@@ -134,7 +138,7 @@ def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: fl
 
 @njit(cache=True)
 def integral_of_exponential(rate: float, dt_s: float) -> float:
-    """Integral of e^(rate t) over 0..dt_s [s]."""
+    """Return the integral of e^(rate t) over 0..dt_s [s]."""
     x = rate * dt_s
     if abs(x) < 1e-8:
         return dt_s * (1.0 + 0.5 * x)
@@ -143,17 +147,17 @@ def integral_of_exponential(rate: float, dt_s: float) -> float:
 
 @njit(cache=True)
 def track_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) -> None:
-    """Loss of lock (E2), detected and recovered from.
+    """Detect a loss of lock (erratum 2) and recover from it.
 
-    Lock is lost if the error stays beyond ``lock_error_v`` for ``lock_time_s``, or exceeds it under a gain with the
-    wrong sign, or if the gain overflows. It is back when the error has been within for ``lock_time_s``.
-    In lock, a gain that falls below ``rearm_gain`` starts again from k0 before its sign turns, where it is above
-    ``rearm_gain`` at k0: N1 to N3 begin at or near 0.
+    The lock is lost if the error exceeds ``lock_error_v`` for ``lock_time_s``, exceeds it with a gain of the wrong sign,
+    or if the gain overflows. It is regained after the error has been within ``lock_error_v`` for ``lock_time_s``.
+    In lock, k restarts from k0 if the gain falls below ``rearm_gain``, before its sign changes. This requires a gain above
+    ``rearm_gain`` at k0, which N1 to N3 may not have, because they start at or near 0.
     """
     beyond = not abs(s.innovation_v) <= p.lock_error_v
-    turned = beyond and s.gain <= 0.0
+    wrong_sign = beyond and s.gain <= 0.0
     overflow = not (math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and abs(s.gain) < p.gain_limit)
-    change = lock_transition(s, p, dt_s, turned or overflow)
+    change = lock_transition(s, p, dt_s, wrong_sign or overflow)
     if change == LOST:
         reinitialize_from_measurement(s, p, voltage_v, e_o)
     elif change == 0 and s.gain < p.rearm_gain and not beyond and nussbaum_gain(p.k0, p) > p.rearm_gain:
@@ -164,10 +168,21 @@ def track_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) 
 
 @njit(cache=True)
 def lock_transition(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
-    """``LOST`` when the error has been beyond for long enough, or ``at_once``; ``REGAINED`` when it has been within; else 0."""
+    """Update the lock by the present error.
+
+    Args:
+        s: Record of OBSERVER_STATE.
+        p: Record of OBSERVER_SETTINGS.
+        dt_s: Time since the previous sample [s].
+        at_once: True for a loss of lock without delay.
+
+    Returns:
+        ``LOST`` after the error exceeded ``lock_error_v`` for ``lock_time_s``, or at once; ``REGAINED`` after the error
+        was within that limit for ``lock_time_s``; otherwise 0.
+    """
     beyond = not abs(s.innovation_v) <= p.lock_error_v
     if beyond == (s.lock == 1):
-        # a single sample after a long gap must not decide: at most a fifth of the time counts per sample
+        # at most a fifth of the time counts per sample, so that a single sample after a long gap does not decide
         s.unlocked_s += min(dt_s, 0.2 * p.lock_time_s)
     else:
         s.unlocked_s = 0.0
@@ -185,7 +200,7 @@ def lock_transition(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
 
 @njit(cache=True)
 def reinitialize_from_measurement(s: Record, p: Record, voltage_v: float, e_o: float) -> None:
-    """Start again from the measurement: e = 0, k = k0, parameters at their limit."""
+    """Reinitialize the observer with e = 0, k = k0 and the parameters at their limits."""
     s.k = p.k0
     s.gain = nussbaum_gain(s.k, p)
     s.v_ts = 0.5 * (e_o - voltage_v)

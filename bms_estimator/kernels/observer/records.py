@@ -1,6 +1,6 @@
-"""The records that kernels work on: settings that stay, state that ``step`` updates, one row of trace per sample.
+"""Settings and state records of the observer.
 
-State is data: what a step changes, what a checkpoint stores, what a test compares bit by bit.
+The state record contains all values that a step changes. A checkpoint stores it, and tests compare it bit by bit.
 """
 
 import numpy as np
@@ -27,16 +27,16 @@ OBSERVER_SETTINGS = np.dtype(
         ("k0", "f8"),  # k(t0) [V^2 s]
         ("gain_limit", "f8"),  # clamp of |N|
         ("rearm_gain", "f8"),  # below this N, in lock, k starts again from k0; -inf, or above N(k0): never
-        ("dead_zone_v", "f8"),  # e_dead of E2 [V]; 0 gives the printed (3.13)
+        ("dead_zone_v", "f8"),  # e_dead of erratum 2 [V]; 0 gives the printed (3.13)
         ("epsilon_v", "f8"),  # eps2 of Algorithm 1 [V]
         ("lock_error_v", "f8"),  # |e| beyond which the observer does not track [V]
-        ("lock_time_s", "f8"),  # for how long, until lock is lost or back [s]
+        ("lock_time_s", "f8"),  # time with |e| beyond or within lock_error_v until the lock is lost or regained [s]
         ("margin_guard", "f8"),  # adaptation stops this far above max(delta1, delta2)
         ("soc_initial", "f8"),  # 0..1; NaN: from the first sample's voltage through the OCV
-        ("voltage_min_v", "f8"),  # what a sample may hold
-        ("voltage_max_v", "f8"),
-        ("current_max_a", "f8"),  # magnitude
-        ("gap_s", "f8"),  # a longer step counts as a gap, unless the one before was about as long [s]
+        ("voltage_min_v", "f8"),  # minimum voltage of an accepted sample [V]
+        ("voltage_max_v", "f8"),  # maximum voltage of an accepted sample [V]
+        ("current_max_a", "f8"),  # maximum magnitude of the current of an accepted sample [A]
+        ("gap_s", "f8"),  # minimum duration of a gap, unless the previous step was about as long [s]
         ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
     ],
     align=True,
@@ -44,9 +44,9 @@ OBSERVER_SETTINGS = np.dtype(
 
 OBSERVER_STATE = np.dtype(
     [
-        ("time_s", "f8"),  # of the last accepted sample
-        ("current_a", "f8"),  # of the last accepted sample
-        ("step_s", "f8"),  # to it from the one before [s]
+        ("time_s", "f8"),  # time stamp of the last accepted sample [s]
+        ("current_a", "f8"),  # current of the last accepted sample [A]
+        ("step_s", "f8"),  # time between the last two accepted samples [s]
         ("soc", "f8"),  # x1, 0..1: by the identifier, or by coulomb counting
         ("soc_coulomb", "f8"),  # by coulomb counting alone (3.1), 0..1
         ("v_ts", "f8"),  # x2 [V]
@@ -54,7 +54,7 @@ OBSERVER_STATE = np.dtype(
         ("k", "f8"),  # adaptive gain state (3.13) [V^2 s]
         ("gain", "f8"),  # N(k); gamma k [1/s] of the learning law
         ("a", "f8", PARAMETERS),  # a1..a15 (3.16)-(3.18)
-        ("target", "f8", PARAMETERS),  # where (3.18) leads; the identifier moves it
+        ("target", "f8", PARAMETERS),  # limit of (3.18); the identifier changes it
         ("decay", "f8", PARAMETERS),  # e^(-rate dt) for ``decay_dt_s``
         ("settle", "f8", PARAMETERS),  # (1 - decay) / rate for ``decay_dt_s`` [s]
         ("decay_dt_s", "f8"),
@@ -62,17 +62,17 @@ OBSERVER_STATE = np.dtype(
         ("voltage_estimate_v", "f8"),  # y^ after it (4.1)
         ("delta_1", "f8"),  # (2.11)
         ("delta_2", "f8"),  # (2.12)
-        ("unlocked_s", "f8"),  # how long |e| has been beyond (lock) or within (no lock) the lock error
-        ("started", "i8"),  # a first sample was taken
+        ("unlocked_s", "f8"),  # time with |e| beyond (in lock) or within (out of lock) lock_error_v [s]
+        ("started", "i8"),  # 1: initialized by a first sample
         ("lock", "i8"),  # 1 while the observer tracks
         ("adapting", "i8"),  # 0 below the margins
-        ("samples", "i8"),  # accepted
+        ("samples", "i8"),  # number of accepted samples
         ("dropped_not_finite", "i8"),
         ("dropped_range", "i8"),
-        ("dropped_repeated", "i8"),  # time stamp of the sample before
+        ("dropped_repeated", "i8"),  # samples with the time stamp of the previous one
         ("dropped_saturated", "i8"),  # voltage or current at the end of the converter's range
-        ("time_steps_back", "i8"),  # the clock went back; the sample is taken, its step is not
-        ("gaps", "i8"),  # steps longer than ``gap_s`` and than those before
+        ("time_steps_back", "i8"),  # times that the clock was set back; the sample is accepted, but not the step to it
+        ("gaps", "i8"),  # number of gaps (``kernels.step.is_gap``)
         ("lock_losses", "i8"),
         ("gain_rearms", "i8"),
     ],

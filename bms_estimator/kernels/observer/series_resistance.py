@@ -1,7 +1,7 @@
-"""Step 3 of the thesis, sample by sample: R_s by (4.2), least squares over each 1 % of SOC.
+"""Step 3 of the thesis, sample by sample: R_s by (4.2), least squares in each bin of 1 % SOC.
 
 x2 and x3 of (4.2) are those of the model with the present a1..a12 under the measured current. The observer's own x2 and x3
-absorb every error of the voltage and leave nothing for R_s.
+absorb every error of the voltage, including i R_s.
 """
 
 import math
@@ -15,17 +15,17 @@ from bms_estimator.numba_cache import njit
 
 BINS = 100
 """Number of SOC bins, one value of R_s each."""
-SMALLEST_CURRENT_C = 0.02
-"""Smallest current that (4.2) is evaluated at: below it, the sensor's noise dominates [1/h]."""
+MIN_CURRENT_C = 0.02
+"""Minimum current for (4.2) as C-rate [1/h]. Below, the sensor's noise dominates."""
 MAX_SAMPLES = 20_000
-"""Samples of a bin at which its sums are halved, so that R_s follows the cell's ageing."""
+"""Number of samples of a bin at which its sums are halved, so that R_s follows the aging of the cell."""
 
 SERIES_RESISTANCE = np.dtype(
     [
         ("v_ts", "f8"),  # x2 of the model [V]
         ("v_tl", "f8"),  # x3 of the model [V]
         ("settle_s", "f8"),  # remaining time without sums, while x2 and x3 depend on an unmeasured load [s]
-        ("samples", "f8", BINS),  # samples of the sums
+        ("samples", "f8", BINS),  # number of samples in the sums
         ("square_a2", "f8", BINS),  # sum of i^2 [A^2]
         ("product_va", "f8", BINS),  # sum of i (E_o - x2 - x3 - y) [V A]
     ],
@@ -34,23 +34,24 @@ SERIES_RESISTANCE = np.dtype(
 
 
 @njit(cache=True)
-def begin_series_resistance(s: Record, p: Record) -> None:
-    """Reset sums and RC voltages; records of ESTIMATOR_STATE and ESTIMATOR_SETTINGS. The observer has started.
+def initialize_series_resistance(s: Record, p: Record) -> None:
+    """Reset sums and RC voltages after the observer's first sample.
 
-    At rest the RC voltages are 0. Under load they are unknown, and nothing is summed until they have settled.
+    At rest the RC voltages are 0. Under load they are unknown, so that the sums start after ``settle_s``. ``s`` is a
+    record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
     """
     r = s.series_resistance
     r.v_ts = r.v_tl = 0.0
-    r.settle_s = p.learning.settle_s if flows(s.observer.current_a, p) else 0.0
+    r.settle_s = p.learning.settle_s if current_suffices(s.observer.current_a, p) else 0.0
     r.samples[:] = 0.0
     r.square_a2[:] = 0.0
     r.product_va[:] = 0.0
 
 
 @njit(cache=True)
-def flows(current_a: float, p: Record) -> bool:
+def current_suffices(current_a: float, p: Record) -> bool:
     """Return True if (4.2) can be evaluated at a current; ``p`` is a record of ESTIMATOR_SETTINGS."""
-    return abs(current_a) > SMALLEST_CURRENT_C * p.observer.capacity_as / 3600.0
+    return abs(current_a) > MIN_CURRENT_C * p.observer.capacity_as / 3600.0
 
 
 @njit(cache=True)
@@ -60,10 +61,10 @@ def series_resistance_step(s: Record, p: Record, dt_s: float, before_a: float, s
     Args:
         s: Record of ESTIMATOR_STATE, after the observer's step.
         p: Record of ESTIMATOR_SETTINGS.
-        dt_s: Time since the sample before [s].
-        before_a: Current at the sample before, held since then [A].
-        soc: SOC at the sample before.
-        voltage_v: Measured [V].
+        dt_s: Time since the previous sample [s].
+        before_a: Current at the previous sample, constant until this sample [A].
+        soc: SOC at the previous sample.
+        voltage_v: Measured voltage [V].
     """
     r, o = s.series_resistance, s.observer
     middle = max(0.5 * (soc + o.soc), stability_floor(o, p.observer))
@@ -71,7 +72,7 @@ def series_resistance_step(s: Record, p: Record, dt_s: float, before_a: float, s
     r.v_ts = rc_step(r.v_ts, before_a, ohm_ts, ohm_ts * c_ts(middle, o.a), dt_s)  # (2.2)
     r.v_tl = rc_step(r.v_tl, before_a, ohm_tl, ohm_tl * c_tl(middle, o.a), dt_s)  # (2.3)
     r.settle_s = max(r.settle_s - dt_s, 0.0) if dt_s <= p.observer.unmeasured_s else p.learning.settle_s
-    if r.settle_s > 0.0 or not o.adapting or not flows(o.current_a, p):
+    if r.settle_s > 0.0 or not o.adapting or not current_suffices(o.current_a, p):
         return
     b = bin_of(o.soc)
     if r.samples[b] >= MAX_SAMPLES:
@@ -87,7 +88,7 @@ def series_resistance_step(s: Record, p: Record, dt_s: float, before_a: float, s
 
 @njit(cache=True)
 def series_resistance(s: Record) -> float:
-    """R_s by (4.2), with the sign of (2.4), over the bin of the present SOC [ohm]; NaN where no current has flowed.
+    """Return R_s by (4.2), with the sign of (2.4), in the bin of the present SOC [ohm]; NaN for a bin without data.
 
     ``s`` is a record of ESTIMATOR_STATE.
     """
@@ -97,5 +98,5 @@ def series_resistance(s: Record) -> float:
 
 @njit(cache=True)
 def bin_of(soc: float) -> int:
-    """Index of the bin that holds ``soc``, 0..1."""
+    """Return the index of the bin that contains ``soc``, 0..1."""
     return min(max(int(soc * BINS), 0), BINS - 1)

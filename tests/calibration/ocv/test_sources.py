@@ -7,7 +7,7 @@ from bms_estimator.calibration.ocv.slow_curve import GRID
 from bms_estimator.calibration.ocv.sources import (
     PLATEAU_SHARE,
     REST_SHARE_STD,
-    USUAL_STD,
+    TYPICAL_HYSTERESIS_STD,
     ExternalCurve,
     Recording,
     center_on_typical_hysteresis,
@@ -76,7 +76,7 @@ def test_a_lone_branch_is_brought_to_the_middle_of_what_is_usual(direction, lift
     assert points.ocv_v - plain.ocv_v == pytest.approx(lifted * hysteresis_v(plain.soc), abs=1e-4)
     assert (points.common_v > plain.common_v).all()
     assert moved.hysteresis_v == pytest.approx(usual_v)
-    assert moved.hysteresis_std_v == pytest.approx(USUAL_STD * usual_v)
+    assert moved.hysteresis_std_v == pytest.approx(TYPICAL_HYSTERESIS_STD * usual_v)
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

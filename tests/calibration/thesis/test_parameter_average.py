@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
-from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, settled
+from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, averaging_window
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
@@ -22,8 +22,8 @@ def run(samples, **given):
 
 
 def find(error_v=None, voltage_v=None, margin=None, a=None, **given):
-    """Run ``settled`` on a thousand seconds with the given events only."""
-    return settled(
+    """Run ``averaging_window`` on a thousand seconds with the given events only."""
+    return averaging_window(
         TIME_S,
         np.zeros(TIME_S.size) if error_v is None else error_v,
         np.linspace(4.2, 3.6, TIME_S.size) if voltage_v is None else voltage_v,

@@ -26,7 +26,7 @@ KINETIC = 2
 """The process of 3 s: charge transfer."""
 KINETIC_V = 0.051
 """2 R T / F: where its resistance begins to fall [V]."""
-COOLS_S = 900.0
+COOLING_S = 900.0
 """Time constant in which a cell gets warm [s]."""
 GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 TAPER_C = 0.05
@@ -105,7 +105,7 @@ def simulate(
             stopped = 1.0
         current_a[n] = i
         voltage_v[n], true_soc[n] = v, soc
-        rise_k += (warms_k * i * (open_v - v) - rise_k) * dt_s / COOLS_S
+        rise_k += (warms_k * i * (open_v - v) - rise_k) * dt_s / COOLING_S
         moved = i * dt_s / 3600.0 / capacity_ah
         soc -= moved
         for k in range(1, len(TAU_S)):
