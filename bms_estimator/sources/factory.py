@@ -1,4 +1,7 @@
-"""Factory of sources. A kind is one file here and a row in ``KINDS``; it is imported when it is needed."""
+"""Factory of sources.
+
+Each source kind is one module, listed in ``KINDS``. The module is imported only if the settings use it.
+"""
 
 import importlib
 from collections.abc import Mapping
@@ -14,11 +17,11 @@ KINDS: Mapping[str, str] = {
     "can": "fieldbus.can",
     "ble": "bluetooth.source",
 }
-"""Modules by ``source.kind``, with a ``producer(settings)`` that creates the line producer."""
+"""Module of each ``source.kind``. Its function ``producer(settings)`` creates the line producer."""
 
 
 def make_line_producer(settings: Settings) -> LineProducer | None:
-    """Make the line producer of ``[source]``; None if the source is a serial port.
+    """Make the line producer that ``[source]`` selects; None without ``[source]``, for a serial port.
 
     Raises:
         UserError: A setting cannot be used.
@@ -27,12 +30,12 @@ def make_line_producer(settings: Settings) -> LineProducer | None:
     if settings.source is None:
         return None
     module = importlib.import_module(f"{__package__}.{KINDS[settings.source.kind]}")
-    made: LineProducer = module.producer(settings)
-    return made
+    line_producer: LineProducer = module.producer(settings)
+    return line_producer
 
 
 def open_line_source(settings: Settings, *, tap: ReadTap | None = None) -> LineSource | None:
-    """Open the source of ``[source]``; None if it is a serial port.
+    """Make the source that ``[source]`` selects; None without ``[source]``, for a serial port.
 
     Raises:
         UserError, ModuleNotFoundError: As ``make_line_producer``.

@@ -1,34 +1,37 @@
-"""Faults of a line are logged at a limited rate, because junk may arrive for days."""
+"""Rate-limited log of a line's faults, because noise may arrive for days."""
 
 import math
 from collections.abc import Mapping
 
 import structlog
 
-JUNK_LOG_S = 30.0
-"""Faults are logged no more often than this [s]."""
-_NO_FAULTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects", "retained")
-"""Bytes and samples before the hello are usual where opening the port does not reset the board; so is a retained
-message."""
+MIN_LOG_INTERVAL_S = 30.0
+"""Minimum interval between two log lines on faults [s]."""
+_NORMAL_EVENTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects", "retained")
+"""Counters of normal events, which are not logged.
+
+Bytes and samples before the hello are normal if opening the port does not reset the board. Retained messages are
+normal on MQTT.
+"""
 
 log = structlog.get_logger(__name__)
 
 
 class FaultLog:
-    """Logs new faults."""
+    """Log of a line's faults at a limited rate."""
 
     def __init__(self) -> None:
         self._logged, self._logged_s = 0, -math.inf
 
     def check(self, counters: Mapping[str, int], now_s: float) -> None:
-        """Look at the counters since start.
+        """Log the fault counters if they have changed and the minimum interval has passed.
 
         Args:
-            counters: Counts by kind.
+            counters: Counts since start, by name.
             now_s: Monotonic clock [s].
         """
-        counted = {name: n for name, n in counters.items() if name not in _NO_FAULTS and n}
-        faults = sum(counted.values())
-        if faults != self._logged and now_s - self._logged_s >= JUNK_LOG_S:
+        nonzero = {name: n for name, n in counters.items() if name not in _NORMAL_EVENTS and n}
+        faults = sum(nonzero.values())
+        if faults != self._logged and now_s - self._logged_s >= MIN_LOG_INTERVAL_S:
             self._logged, self._logged_s = faults, now_s
-            log.warning("faults on the line", **counted)
+            log.warning("faults on the line", **nonzero)

@@ -1,4 +1,4 @@
-"""Sources other than serial lines: a ``LineProducer`` for each kind, and the common rest."""
+"""Sources other than serial ports: a ``LineProducer`` for each kind, and the ``LineSource`` that runs one."""
 
 import asyncio
 import contextlib
@@ -19,16 +19,16 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
 
-LOOK_S = 1.0
-"""Interval of the check for samples [s]."""
+CHECK_INTERVAL_S = 1.0
+"""Interval between two checks for silence and faults [s]."""
 SILENT_PERIODS = 3.0
-"""Number of expected sample periods without a sample that counts as a fault."""
+"""Number of sample periods without a sample after which a source counts as silent."""
 
 log = structlog.get_logger(__name__)
 
 
 class SourceUnavailableError(Exception):
-    """The source cannot be reached, or was lost; the message gives the reason. It may become available later."""
+    """The source cannot be reached, or its connection was lost. The message gives the reason; a retry may succeed."""
 
 
 class LineProducer(ABC):
@@ -37,48 +37,49 @@ class LineProducer(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """Name of the source, with which messages begin."""
+        """Name of the source, as a prefix of its messages."""
 
     @abstractmethod
     def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """Connect; then ``CONNECTED``, and lines of ``sample_json_line`` as they arrive.
+        """Connect, yield ``CONNECTED``, then yield lines of ``sample_json_line`` as they arrive.
 
-        Called again, after a pause, when it has ended or raised. It never blocks the event loop, and is closed at the end.
+        ``LineSource`` calls this method again, after a pause, when the iterator has ended or raised. The iterator must
+        not block the event loop.
 
         Raises:
-            SourceUnavailableError, OSError: It cannot be reached, or was lost.
+            SourceUnavailableError, OSError: The source cannot be reached, or its connection was lost.
         """
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Faults by kind since start: values that could not be read or used."""
+        """Number of faults since start, by kind."""
         return {}
 
     @property
     def fault(self) -> str | None:
-        """Reason why no line arrives although it is connected; None if unknown."""
+        """Reason why a connected source yields no line; None if unknown."""
         return None
 
     @property
     def board(self) -> Mapping[str, str]:
-        """Hello of the device."""
+        """Properties that the device reported, such as its serial number; empty without any."""
         return {}
 
 
 class LineSource:
-    """Async source of SAMPLE blocks from a producer, which is restarted whenever it ends.
+    """Source of sample blocks from a line producer, which is restarted whenever it ends.
 
-    All lines pass ``decoder.feed(arrival_s, line)``, so a capture of these calls replays bit-identically.
+    Every line passes through ``decoder.feed(arrival_s, line)``. A capture of these calls therefore replays bit-identically.
 
     Args:
-        producer: Produces the lines.
+        producer: Connects to the device and yields its lines.
         sensor: Sign of the current; ``protocol`` must be ``text``.
         period_s: Expected sample period [s].
-        tap: Receives each (arrival time, line) of the decoder.
+        tap: Receives a copy of each arrival time and line that the decoder is fed.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Delay before a missing or lost device is retried; doubles with each attempt [s].
-        look_s: Interval of the check for samples [s].
+        check_interval_s: Interval between two checks for silence and faults [s].
     """
 
     def __init__(
@@ -91,18 +92,18 @@ class LineSource:
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
         first_retry_s: float = FIRST_RETRY_S,
-        look_s: float = LOOK_S,
+        check_interval_s: float = CHECK_INTERVAL_S,
     ) -> None:
         self._producer, self._decoder, self._tap = producer, make_protocol(sensor), tap
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
-        self._look_s, self._silent_s = look_s, SILENT_PERIODS * max(period_s, look_s)
+        self._check_interval_s, self._silent_s = check_interval_s, SILENT_PERIODS * max(period_s, check_interval_s)
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
         self._lines: asyncio.Queue[Chunk | None] = asyncio.Queue()
         self._message: str | None = "not opened yet"
-        self._said = ""
-        self._openings, self._connected = 0, False
-        self._tended_s = self._heard_s = monotonic()
-        self._arrived_s = math.nan  # of the last block's line, on the clock of the arrivals
+        self._logged_message = ""
+        self._connections, self._connected = 0, False
+        self._last_check_s = self._last_sample_s = monotonic()
+        self._block_arrival_s = math.nan  # arrival time of the last block's line
         self._faults = FaultLog()
         self._task: asyncio.Task[None] | None = None
         self._watcher: asyncio.Task[None] | None = None
@@ -110,17 +111,17 @@ class LineSource:
     @property
     def counters(self) -> Mapping[str, int]:
         """Counters of decoder and producer, ``reconnects``, and ``missed_reads`` of the tap."""
-        counters = {**self._decoder.counters, **self._producer.counters, "reconnects": max(self._openings - 1, 0)}
+        counters = {**self._decoder.counters, **self._producer.counters, "reconnects": max(self._connections - 1, 0)}
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
 
     @property
     def message(self) -> str | None:
-        """Reason why no samples arrive; None when they do."""
+        """Reason why no samples arrive; None while they arrive."""
         return self._message
 
     @property
     def board(self) -> Mapping[str, str]:
-        """Hello of the device."""
+        """Properties that the device reported, such as its serial number; empty without any."""
         return self._producer.board
 
     @property
@@ -130,7 +131,7 @@ class LineSource:
 
     @property
     def clock_ppm(self) -> float | None:
-        """Rate error of the clock, which is unknown."""
+        """Rate error of the device's clock [1e-6]; None if unknown."""
         return self._decoder.clock_ppm
 
     current_zero: None = None
@@ -139,9 +140,11 @@ class LineSource:
     """Function that switches a relay; None: no relay."""
 
     def pulse(self) -> SourceHealth:
-        """Health of the task that produces lines."""
+        """Return the health of the task that runs the producer."""
         now_s = self._monotonic()
-        return SourceHealth(now_s - self._tended_s, self._epoch_s + now_s - self._arrived_s, self._lines.qsize())
+        return SourceHealth(
+            now_s - self._last_check_s, self._epoch_s + now_s - self._block_arrival_s, self._lines.qsize()
+        )
 
     async def __aenter__(self) -> Self:
         """Start producing lines; the device may still be missing."""
@@ -153,18 +156,18 @@ class LineSource:
     async def __aexit__(self, *_: object) -> None:
         """Stop producing lines."""
         tasks: set[asyncio.Task[None]] = {task for task in (self._watcher, self._task) if task is not None}
-        while tasks:  # wait_for of Python 3.11, in what a producer calls, may swallow that it is to end
+        while tasks:  # a producer may call wait_for, which may swallow a cancellation in Python 3.11
             for task in tasks:
                 task.cancel()
-            _done, tasks = await asyncio.wait(tasks, timeout=LOOK_S)
+            _done, tasks = await asyncio.wait(tasks, timeout=CHECK_INTERVAL_S)
 
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:
-        """Blocks as lines arrive. The tap receives the lines of yielded blocks."""
-        while (read := await self._lines.get()) is not None:
-            block = self._decode(*read)
+        """Yield blocks as lines arrive. A line goes to the tap when its block is requested."""
+        while (chunk := await self._lines.get()) is not None:
+            block = self._decode(*chunk)
             if block.size:
-                self._arrived_s = read[0]
-                self._message, self._said, self._retry_s = None, "", self._first_retry_s
+                self._block_arrival_s = chunk[0]
+                self._message, self._logged_message, self._retry_s = None, "", self._first_retry_s
                 yield block
         if self._task is not None and not self._task.cancelled():
             self._task.result()
@@ -174,49 +177,52 @@ class LineSource:
             self._tap.write(arrival_s, line)
         block = self._decoder.feed(arrival_s, line)
         if block.size:
-            self._heard_s = self._monotonic()
+            self._last_sample_s = self._monotonic()
         return block
 
     async def _produce(self) -> None:
-        """Produce lines and restart after an error. Only an internal error ends it and is raised to the reader."""
+        """Run the producer, and restart it whenever it ends or loses its device.
+
+        Any other exception ends this task, and ``__aiter__`` raises it.
+        """
         while True:
             await self._pause()
-            reason = "it ended"
+            reason = "the source ended"
             try:
                 async with contextlib.aclosing(self._producer.iter_lines()) as lines:
                     async for line in lines:
-                        self._take(line)
+                        self._on_line(line)
             except (SourceUnavailableError, OSError) as error:
                 reason = str(error)
             self._connected = False
             self._report(f"{self._producer.name}: {reason}; trying again")
 
     async def _pause(self) -> None:
-        """Each one is longer until a sample arrives."""
+        """Wait before the next attempt. Each wait is longer than the one before, until a sample arrives."""
         wait_s, self._retry_s = self._retry_s, min(max(2.0 * self._retry_s, self._first_retry_s), MAX_RETRY_S)
         await asyncio.sleep(wait_s)
 
-    def _take(self, line: bytes) -> None:
+    def _on_line(self, line: bytes) -> None:
         if line != CONNECTED:
             self._lines.put_nowait((self._epoch_s + self._monotonic(), line))
             return
-        self._openings += 1
-        self._connected, self._heard_s = True, self._monotonic()
-        self._message = f"{self._producer.name}: connected, nothing has come yet"
+        self._connections += 1
+        self._connected, self._last_sample_s = True, self._monotonic()
+        self._message = f"{self._producer.name}: connected, no sample yet"
         log.info("connected", source=self._producer.name)
 
     async def _watch(self) -> None:
-        """Report why nothing arrives, and log faults."""
+        """Report a silent source, and log faults, at each check interval."""
         while True:
-            self._tended_s = now_s = self._monotonic()
-            if self._connected and now_s - self._heard_s >= self._silent_s:
-                why = self._producer.fault or self._decoder.fault or "connected, but silent"
-                self._report(f"{self._producer.name}: {why}")
+            self._last_check_s = now_s = self._monotonic()
+            if self._connected and now_s - self._last_sample_s >= self._silent_s:
+                reason = self._producer.fault or self._decoder.fault or "connected, but silent"
+                self._report(f"{self._producer.name}: {reason}")
             self._faults.check(self.counters, now_s)
-            await asyncio.sleep(self._look_s)
+            await asyncio.sleep(self._check_interval_s)
 
     def _report(self, message: str) -> None:
-        """Report why no samples arrive; in the log once for each reason, until samples arrive."""
-        if message != self._said:
+        """Set the message. It is logged again only after it changed or samples arrived."""
+        if message != self._logged_message:
             log.warning("no samples", reason=message)
-        self._message = self._said = message
+        self._message = self._logged_message = message

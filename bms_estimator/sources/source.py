@@ -6,62 +6,62 @@ from typing import NamedTuple, Protocol, Self
 from bms_estimator.model.sample import CellBlock, SampleBlock
 
 Chunk = tuple[float, bytes]
-"""Arrival [s since 1970], bytes."""
+"""Arrival time [s since 1970] and bytes of one read."""
 
 
 class SourceHealth(NamedTuple):
     """Health of a source."""
 
     task_idle_s: float
-    """Since its task last looked after the line, or tried to open it [s]."""
+    """Time since its task last checked the connection or tried to open it [s]."""
     block_age_s: float
     """Time since the bytes of the latest block were read [s]."""
     queued_reads: int
-    """Chunks of the serial port that are waiting to be decoded."""
+    """Number of chunks that are waiting to be decoded."""
 
 
 class ReadTap(Protocol):
-    """Takes all that the decoder is fed, as ``Recording`` does. Does not wait, and raises nothing."""
+    """Receiver of a copy of each chunk that the decoder is fed, such as a recorder. It must neither block nor raise."""
 
     @property
     def missed_reads(self) -> int:
-        """Reads of the line that it could not take."""
+        """Number of chunks that it could not store."""
 
     def write(self, arrival_s: float, data: bytes) -> None:
-        """Take one read of the line."""
+        """Receive one chunk."""
 
 
 class Source(Protocol):
     """An async iterator of SAMPLE blocks with fault counters.
 
-    A serial board never ends by itself; a capture or a table ends with its last row.
+    The iterator of a device never ends by itself. That of a capture or a table ends with the last sample.
     """
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Since start: ``frames_received``, ``frames_lost``, ``crc_errors``, ``reconnects`` and faults by kind."""
+        """Counts since start: ``frames_received``, ``frames_lost``, ``crc_errors``, ``reconnects`` and faults by kind."""
 
     @property
     def message(self) -> str | None:
-        """Reason why no samples arrive, for people; None when they do."""
+        """Reason why no samples arrive, as text; None while they arrive."""
 
     @property
     def board(self) -> Mapping[str, str]:
-        """Hello of the board; empty without one."""
+        """Properties from the board's hello message; empty without one."""
 
     @property
     def clock_ppm(self) -> float | None:
-        """Rate of the board's clock over the host's [1e-6]; None if unknown."""
+        """Rate error of the board's clock relative to the host's [1e-6]; None if unknown."""
 
     @property
     def cells(self) -> CellBlock:
         """Cell voltages of the latest block; ``NO_CELLS`` where no cells are measured."""
 
     def __aiter__(self) -> AsyncIterator[SampleBlock]:
-        """Blocks of samples, none of them empty."""
+        """Yield blocks of samples; none of them is empty."""
 
     async def __aenter__(self) -> Self:
-        """Open."""
+        """Open the source."""
 
     async def __aexit__(self, *_: object) -> None:
-        """Close."""
+        """Close the source."""

@@ -30,8 +30,8 @@ COUNTED = {
 }
 """Where a fault shows."""
 FASTER = {
-    "protocols.base.polled_protocol.PACE_S": 0.1,
-    "protocols.base.polled_protocol.GAP_S": 0.01,
+    "protocols.base.polled_protocol.POLL_CYCLE_S": 0.1,
+    "protocols.base.polled_protocol.QUERY_INTERVAL_S": 0.01,
     "sources.serial.serial_source.TALK_S": 0.02,
 }
 """Than a BMS is asked, to spare time."""

@@ -101,7 +101,7 @@ async def test_it_says_that_nothing_comes_and_what_comes_instead():
         ([CONNECTED], "a device: connected, but silent"),
         (junk, 'a device: lines come that do not tell voltage and current; the first: \'{"voltage":"unavailable"}\''),
     ):
-        source = LineSource(Scripted(script), TEXT, period_s=0.001, look_s=0.001)
+        source = LineSource(Scripted(script), TEXT, period_s=0.001, check_interval_s=0.001)
         async with source:
             taking = asyncio.create_task(take(source, 1))
             await message(source, said)

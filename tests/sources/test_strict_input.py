@@ -105,7 +105,7 @@ def test_a_capture_whose_header_is_odd_is_refused_with_its_name(tmp_path: Path, 
         path = tmp_path / "odd.bms.gz"
         path.write_bytes(gzip.compress((tmp_path / "odd.bms").read_bytes()))
     for read in (read_header, lambda path: list(read_capture(path)), open_capture):
-        with pytest.raises(UserError, match=rf"^{path}: its header is none of this program's: "):
+        with pytest.raises(UserError, match=rf"^{path}: its header is not valid: "):
             read(path)
 
 

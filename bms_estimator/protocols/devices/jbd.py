@@ -78,7 +78,7 @@ class JbdProtocol(PolledProtocol):
         elif register == NAME:
             self._model = data.decode("ascii", "replace").strip("\0 ")
         elif register == CELLS:
-            self._beside.keep(arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])])
+            self._beside.store(arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])])
         elif len(data) < MIN_BASIC:
             self._count_fault("length_errors", "its basic information is too short")
         else:

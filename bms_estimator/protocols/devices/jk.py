@@ -164,7 +164,7 @@ class JkProtocol(PolledProtocol):
 
     def _newer(self, arrival_s: float, frame: bytes) -> Reading | None:
         address = frame[FRAME_BYTES] if len(frame) > FRAME_BYTES else None
-        if address is not None and question(address) != self._asked:
+        if address is not None and question(address) != self._query:
             self._overheard_s = arrival_s
         if (address is not None and self._is_other(address)) or frame[4] != REALTIME:
             return None

@@ -47,9 +47,9 @@ class JunctekProtocol(ReadingProtocol):
     @property
     def description(self) -> str | None:
         """The last values."""
-        if self._good is None:
+        if self._last_reading is None:
             return None
-        return f"Junctek battery monitor, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
+        return f"Junctek battery monitor, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
     def on_port_opened(self) -> None:
         """Poll at once. Decoded values stay, because a recording does not contain openings."""

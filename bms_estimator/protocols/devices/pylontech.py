@@ -56,11 +56,11 @@ class PylontechProtocol(ReadingProtocol):
     @property
     def description(self) -> str | None:
         """Number of batteries, and the last values."""
-        if self._good is None:
+        if self._last_reading is None:
             return None
         n = len(self._batteries)
         batteries = "1 battery" if n == 1 else f"{n} batteries"
-        return f"Pylontech, {batteries}, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
+        return f"Pylontech, {batteries}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
     def on_port_opened(self) -> None:
         """Poll at once. Decoded values stay, because a recording does not contain openings."""
@@ -128,7 +128,7 @@ class PylontechProtocol(ReadingProtocol):
         if not 1 <= battery <= BATTERIES or len(rows) > CELLS:
             raise ValueError(answer)
         cells_v = [1e-3 * _whole(row[1]) for row in rows]
-        self._cells.setdefault(battery, RecentCellVoltages(CELLS_S)).keep(arrival_s, cells_v)
+        self._cells.setdefault(battery, RecentCellVoltages(CELLS_S)).store(arrival_s, cells_v)
 
     def _stack(self, arrival_s: float, names: Sequence[str], rows: Sequence[Sequence[str]]) -> Reading | None:
         """All batteries as one.

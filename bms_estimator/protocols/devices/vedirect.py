@@ -38,9 +38,9 @@ class VeDirectProtocol(ReadingProtocol):
     @property
     def description(self) -> str | None:
         """Product and the last values."""
-        if self._good is None:
+        if self._last_reading is None:
             return None
-        return f"VE.Direct battery monitor {self._product}, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
+        return f"VE.Direct battery monitor {self._product}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - the block carries no time
         self._rest += data

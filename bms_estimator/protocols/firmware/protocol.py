@@ -140,7 +140,7 @@ class BoardProtocol(DeviceProtocol):
         hint = "; firmware before 0.2.0 has no relay pin"
         return self._tell(set_relay_command(relay), hint=hint, changes_hello=False)
 
-    def tell(self, frame: bytes) -> Command:
+    def send(self, frame: bytes) -> Command:
         """Have ``next_output`` send a command that may be given twice."""
         return self._tell(frame)
 

@@ -18,7 +18,10 @@ def reading_of(sample: Mapping[str, Any]) -> Reading | None:
 
 
 def _temperature(sample: Mapping[str, Any]) -> float:
-    """Mean of the sensors on cells; where none is called so, the temperature of the BMS, or the mean of all sensors [degC]."""
+    """Return the mean temperature of the sensors on cells [degC].
+
+    Without such sensors return the temperature of the BMS, or the mean of all sensors.
+    """
     sensors = sample.get("temp_values", ())
     on_cells = [sensor for sensor in sensors if getattr(getattr(sensor, "type", None), "name", "") == "CELL"]
     if not on_cells and "temperature" in sample:
@@ -33,7 +36,7 @@ def _mean(values: Iterable[float]) -> float:
 
 
 def _number(value: Any) -> float:
-    """Return the number, or NaN."""
+    """Convert a value to a finite float; NaN if it is not one."""
     try:
         number = float(value)
     except (TypeError, ValueError):

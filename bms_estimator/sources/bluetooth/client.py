@@ -1,4 +1,4 @@
-"""A BMS over Bluetooth, by aiobmsble and bleak: found, connected and polled."""
+"""Bluetooth client of a BMS, with aiobmsble and bleak: scan, connect and poll."""
 
 import asyncio
 import logging
@@ -18,11 +18,11 @@ from bms_estimator.sources.bluetooth.bms_sample import reading_of
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 SCAN_S = 15.0
-"""A BMS advertises every few seconds at least; one that a phone is connected to does not [s]."""
+"""Timeout of a scan [s]. A BMS advertises every few seconds, but not while a phone is connected to it."""
 
 
 class BleProducer(LineProducer):
-    """Polls a BMS. It stays connected: most take seconds to connect.
+    """Line producer that polls a BMS. It stays connected, because most of them take seconds to connect.
 
     Args:
         settings: Settings of the BMS.
@@ -32,14 +32,10 @@ class BleProducer(LineProducer):
     """
 
     def __init__(self, settings: BleSource) -> None:
-        known = sorted(module.name.removesuffix("_bms") for module in pkgutil.iter_modules(aiobmsble.bms.__path__))
-        if settings.bms is not None and settings.bms.removesuffix("_bms") not in known:
-            raise UserError(f"source.bms = {settings.bms!r}: aiobmsble knows {', '.join(known)}")
-        for library in (
-            "aiobmsble",
-            "bleak",
-            "bleak_retry_connector",
-        ):  # their log lines are replaced by one of this module
+        supported = sorted(module.name.removesuffix("_bms") for module in pkgutil.iter_modules(aiobmsble.bms.__path__))
+        if settings.bms is not None and settings.bms.removesuffix("_bms") not in supported:
+            raise UserError(f"source.bms = {settings.bms!r}: aiobmsble supports {', '.join(supported)}")
+        for library in ("aiobmsble", "bleak", "bleak_retry_connector"):  # LineSource logs the reason in one line
             logging.getLogger(library).setLevel(logging.CRITICAL)
         self._settings = settings
         self._not_measured = 0
@@ -52,7 +48,7 @@ class BleProducer(LineProducer):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Since start: samples without voltage or current."""
+        """Number of samples without voltage or current since start."""
         return {"not_measured": self._not_measured}
 
     @property
@@ -61,7 +57,7 @@ class BleProducer(LineProducer):
         return self._fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """One line for each poll."""
+        """Connect, and yield one line for each poll."""
         try:
             device, kind = await self._find()
             async with kind(device) as bms:
@@ -76,26 +72,21 @@ class BleProducer(LineProducer):
                     await asyncio.sleep(next_s - loop.time())
                     sample = await bms.async_update()
         except PermissionError:
-            raise SourceUnavailableError("it wants a password; take that away in its app") from None
+            raise SourceUnavailableError("the BMS asks for a password; remove the password in its app") from None
         except TimeoutError:
-            raise SourceUnavailableError("no answer") from None
+            raise SourceUnavailableError("no response") from None
         except FileNotFoundError:  # the socket of D-Bus
             raise SourceUnavailableError("no Bluetooth: are D-Bus and bluetoothd running?") from None
-        except (
-            BleakError,
-            EOFError,
-            OSError,
-            ValueError,
-            LookupError,
-            AssertionError,
-        ) as error:  # unexpected bytes
+        except (BleakError, EOFError, OSError) as error:
+            raise SourceUnavailableError(str(error) or type(error).__name__) from None
+        except (ValueError, LookupError, AssertionError) as error:  # the library could not parse the received bytes
             raise SourceUnavailableError(str(error) or type(error).__name__) from None
 
     def _line(self, sample: Mapping[str, object]) -> bytes | None:
         reading = reading_of(sample)
         if reading is None:
             self._not_measured += 1
-            self._fault = "it answers, but tells no voltage or no current"
+            self._fault = "the BMS responds, but reports no voltage or no current"
             return None
         self._fault = None
         return sample_json_line(
@@ -106,23 +97,29 @@ class BleProducer(LineProducer):
         """Find the BMS and the driver of its kind.
 
         Raises:
-            SourceUnavailableError: It does not advertise, or its kind is unknown.
+            SourceUnavailableError: The BMS does not advertise, or its kind is unknown.
         """
-        heard: list[AdvertisementData] = []
+        advertisements: list[AdvertisementData] = []
 
-        def is_it(device: BLEDevice, advertisement: AdvertisementData) -> bool:
-            heard[:] = [advertisement]
+        def is_wanted(device: BLEDevice, advertisement: AdvertisementData) -> bool:
+            advertisements[:] = [advertisement]
             if self._settings.address is not None:
                 return bool(device.address.lower() == self._settings.address.lower())
             return self._settings.name in (device.name, advertisement.local_name)
 
-        device = await BleakScanner.find_device_by_filter(is_it, timeout=SCAN_S)
+        device = await BleakScanner.find_device_by_filter(is_wanted, timeout=SCAN_S)
         if device is None:
-            raise SourceUnavailableError("it does not advertise: is it near and on, and no phone connected to it?")
-        told = self._settings.bms
-        kind = await (bms_cls(f"{told.removesuffix('_bms')}_bms") if told else bms_identify(heard[0], device.address))
+            raise SourceUnavailableError(
+                "the BMS does not advertise: is it in range and on, and is no phone connected to it?"
+            )
+        configured = self._settings.bms
+        kind = await (
+            bms_cls(f"{configured.removesuffix('_bms')}_bms")
+            if configured
+            else bms_identify(advertisements[0], device.address)
+        )
         if kind is None:
             raise SourceUnavailableError(
-                f"{device.name or device.address}: no kind that aiobmsble knows; set source.bms"
+                f"{device.name or device.address}: its kind is not recognized by aiobmsble; set source.bms"
             )
         return device, kind

@@ -1,4 +1,4 @@
-"""A BMS over Bluetooth: its samples, and a check of the Python version. Does no I/O."""
+"""``kind = "ble"``: a BMS over Bluetooth. It checks the Python version before it imports the client."""
 
 import sys
 
@@ -7,8 +7,8 @@ from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import LineProducer
 
-NEEDED_PYTHON = 0x030C0000
-"""3.12, as aiobmsble needs it."""
+MIN_PYTHON_HEX = 0x030C0000
+"""Minimum Python version of aiobmsble, 3.12, in the format of ``sys.hexversion``."""
 
 
 def producer(settings: Settings) -> LineProducer:
@@ -16,11 +16,11 @@ def producer(settings: Settings) -> LineProducer:
 
     Raises:
         UserError: This Python is too old, or aiobmsble does not support this BMS.
-        ModuleNotFoundError: It is not installed.
+        ModuleNotFoundError: aiobmsble is not installed.
     """
     assert isinstance(settings.source, BleSource)  # noqa: S101 - as KINDS has it
-    if sys.hexversion < NEEDED_PYTHON:
+    if sys.hexversion < MIN_PYTHON_HEX:
         raise UserError(f'source.kind = "ble" needs Python 3.12 or newer; this is {sys.version.split()[0]}')
-    from bms_estimator.sources.bluetooth.client import BleProducer  # noqa: PLC0415 - needs that Python, and an extra
+    from bms_estimator.sources.bluetooth.client import BleProducer  # noqa: PLC0415 - needs Python 3.12 and an extra
 
     return BleProducer(settings.source)

@@ -1,4 +1,4 @@
-"""Records of a raw capture (``sources.captures.raw_capture`` has the format) taken apart, a megabyte at a time."""
+"""Parser of the records of a raw capture (format: ``sources.captures.raw_capture``), for one chunk of the file."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,40 +16,40 @@ RECORD_OVERHEAD_BYTES = HEAD_BYTES + CRC_BYTES
 @njit(cache=True)
 def split_records(
     raw: Bytes,
-    longest: int,
+    max_length: int,
     arrival_bits: NDArray[np.int64],
     ends: NDArray[np.int64],
     payload: Bytes,
 ) -> tuple[int, int, int, int]:
-    """Take whole records from the start of ``raw``.
+    """Parse the complete records at the start of ``raw``.
 
     Args:
-        raw: Records, the last of them perhaps cut off.
-        longest: Bytes that a record may hold; a length above is damage.
-        arrival_bits: Output, shape (n,): arrival times, the bits of a float64.
-        ends: Output, shape (n,): where in ``payload`` each record's bytes end.
-        payload: Output: the bytes, one record behind the other.
+        raw: Records; the last one may be incomplete.
+        max_length: Maximum length of a record [bytes]; a longer one is damaged.
+        arrival_bits: Output, shape (n,): arrival times as the bits of a float64.
+        ends: Output, shape (n,): end of each record's bytes in ``payload``.
+        payload: Output: concatenated bytes of the records.
 
     Returns:
-        Bytes taken from ``raw``, records, bytes of payload, and 1 when what follows is damaged rather than cut off.
+        Number of bytes parsed, of records, and of payload bytes; and 1 if the next record is damaged, 0 if incomplete.
     """
-    position = records = filled = 0
+    position = records = payload_bytes = 0
     while records < ends.size:
         if raw.size - position < RECORD_OVERHEAD_BYTES:
-            return position, records, filled, 0
+            return position, records, payload_bytes, 0
         length = read_unsigned(raw, position + ARRIVAL_BYTES, LENGTH_BYTES)
-        if length > longest:
-            return position, records, filled, 1
-        body = position + HEAD_BYTES
-        end = body + length
-        if raw.size - end < CRC_BYTES:
-            return position, records, filled, 0
-        if crc16(raw, position, end) != read_unsigned(raw, end, CRC_BYTES):
-            return position, records, filled, 1
+        if length > max_length:
+            return position, records, payload_bytes, 1
+        body_begin = position + HEAD_BYTES
+        body_end = body_begin + length
+        if raw.size - body_end < CRC_BYTES:
+            return position, records, payload_bytes, 0
+        if crc16(raw, position, body_end) != read_unsigned(raw, body_end, CRC_BYTES):
+            return position, records, payload_bytes, 1
         arrival_bits[records] = read_unsigned(raw, position, ARRIVAL_BYTES)
-        payload[filled : filled + length] = raw[body:end]
-        filled += length
-        ends[records] = filled
+        payload[payload_bytes : payload_bytes + length] = raw[body_begin:body_end]
+        payload_bytes += length
+        ends[records] = payload_bytes
         records += 1
-        position = end + CRC_BYTES
-    return position, records, filled, 0
+        position = body_end + CRC_BYTES
+    return position, records, payload_bytes, 0

@@ -1,4 +1,4 @@
-"""Curves as CSV files: an open-circuit voltage, or a polarization curve of a fuel cell."""
+"""Readers of curves in CSV files: open-circuit voltage, and polarization curve of a fuel cell."""
 
 import csv
 import gzip
@@ -11,10 +11,8 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
 
-COLUMNS = ("soc", "ocv_v", "hysteresis_v")
-
-
-POLARISATION = ("current_a", "voltage_v", "temperature_c")
+OCV_COLUMNS = ("soc", "ocv_v", "hysteresis_v")
+POLARISATION_COLUMNS = ("current_a", "voltage_v", "temperature_c")
 
 
 class CurveColumns(NamedTuple):
@@ -29,12 +27,12 @@ def read_curve(path: Path) -> CurveColumns | None:
     """Read the curve in a CSV file (.gz) with columns soc (0..1), ocv_v [V] and optional hysteresis_v [V].
 
     Returns:
-        None when the file is no CSV or has no such columns.
+        None if the file is not CSV or has no such columns.
 
     Raises:
         UserError: The columns are there, but their values are not a curve.
     """
-    rows = _rows(path, COLUMNS)
+    rows = _rows(path, OCV_COLUMNS)
     return None if rows is None else _checked(path, rows, has_hysteresis=not np.isnan(rows[:, 2]).all())
 
 
@@ -42,13 +40,13 @@ def read_polarisation(path: Path) -> Floats | None:
     """Read the polarization curve in a CSV file (.gz) with columns current_a [A], voltage_v [V] and optional temperature_c [C].
 
     Returns:
-        Those columns, shape (n, 3), a missing temperature as NaN. None when the file is no CSV, has no such columns, or has
-        a column time_s: then it is a record.
+        The three columns, shape (n, 3); a missing temperature is NaN. None if the file is not CSV, has no such columns,
+        or has a column time_s, because then it is a capture.
 
     Raises:
-        UserError: It has, but not a number in every row.
+        UserError: The columns exist, but a row lacks a number.
     """
-    rows = _rows(path, POLARISATION, without="time_s")
+    rows = _rows(path, POLARISATION_COLUMNS, without="time_s")
     if rows is not None and (rows.shape[0] == 0 or not np.isfinite(rows[:, :2]).all()):
         raise UserError(
             f"{path}: {'no rows' if rows.shape[0] == 0 else 'a value is missing'}: give current_a and voltage_v"
@@ -57,7 +55,10 @@ def read_polarisation(path: Path) -> Floats | None:
 
 
 def _rows(path: Path, columns: tuple[str, str, str], without: str = "") -> Floats | None:
-    """Columns of a CSV file, shape (n, 3); NaN where the last, which may be missing, is. None when it is no such file."""
+    """Return three columns of a CSV file, shape (n, 3), or None if the file does not have the first two.
+
+    The third column is optional and NaN if absent. A file with the column ``without`` is not read.
+    """
     if not path.is_file() or not path.name.lower().endswith((".csv", ".csv.gz")):
         return None
     try:
@@ -65,10 +66,10 @@ def _rows(path: Path, columns: tuple[str, str, str], without: str = "") -> Float
             rows = csv.DictReader(line for line in text if line.strip() and not line.startswith("#"))
             if not set(columns[:2]) <= set(rows.fieldnames or ()) or without in (rows.fieldnames or ()):
                 return None
-            found = [[_number(path, rows.line_num, name, row.get(name)) for name in columns] for row in rows]
+            values = [[_number(path, rows.line_num, name, row.get(name)) for name in columns] for row in rows]
     except (OSError, EOFError, UnicodeDecodeError):
         return None  # the reader of captures reports errors
-    return np.array(found).reshape(-1, 3)
+    return np.array(values).reshape(-1, 3)
 
 
 def _number(path: Path, line: int, name: str, cell: str | None) -> float:

@@ -1,4 +1,4 @@
-r"""Raw captures: the bytes of a serial line with their arrival times, as the decoder saw them.
+r"""Raw captures: the bytes that a decoder was fed, with their arrival times.
 
 File format, version 1, numbers little-endian::
 
@@ -7,13 +7,13 @@ File format, version 1, numbers little-endian::
              JSON     UTF-8: version, started (wall clock, ISO 8601 UTC), mode ("binary", "text" or another protocol),
                       port, baud, current_sign, address; other names are ignored
              u16      CRC-16/CCITT-FALSE of the JSON
-    record   f64      arrival time [s], the very float that the decoder got
+    record   f64      arrival time [s], bit-identical to the decoder's input
              u32      length
              bytes
              u16      CRC-16/CCITT-FALSE of the record up to here
 
-Records follow to the end of the file, one for each read of the line. The file is only appended to, one system call
-for each record. A killed recorder leaves all complete records, and an incomplete last one is ignored. A file whose
+Each read of the line is one record, up to the end of the file. The file is only appended to, with one system call for
+each record. After a crash of the recorder all complete records are valid, and an incomplete last one is ignored. A file whose
 name ends in .gz is read as gzip.
 """
 
@@ -42,8 +42,9 @@ from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 MAGIC = b"BMSRAW1\n"
 VERSION = 1
 MAX_READ_BYTES = 1 << 20
-"""A record holds no more."""
+"""Maximum length of the bytes in a record."""
 CHUNK_BYTES = 1 << 20
+"""Size of the parts in which a capture is read [bytes]."""
 _HEAD = struct.Struct("<dI")
 _LENGTH = struct.Struct("<I")
 _CRC = struct.Struct("<H")
@@ -51,7 +52,7 @@ _MAX_HEADER_BYTES = 1 << 20
 
 
 @dataclass(config=ConfigDict(strict=True, extra="ignore", frozen=True))
-class _Versioned:
+class _HeaderVersion:
     """Fields of a header of any version."""
 
     version: int
@@ -66,17 +67,17 @@ class CaptureHeader:
     baud: int = 0
     current_sign: str = "discharge_positive"
     started: str = ""
-    """Wall clock at the first byte, ISO 8601 UTC; set by the writer when empty."""
+    """Start of the recording by the wall clock, ISO 8601 UTC; empty: set by the writer."""
     version: int = VERSION
     address: int | None = None
     """Address of the recorded pack, if the line had several."""
 
 
-_VERSIONED, _HEADER = TypeAdapter(_Versioned), TypeAdapter(CaptureHeader)
+_VERSIONED, _HEADER = TypeAdapter(_HeaderVersion), TypeAdapter(CaptureHeader)
 
 
 def header_of(sensor: SensorSettings, source: PolledSource | None = None) -> CaptureHeader:
-    """Return the header of a capture of this board's line, or of another source's lines."""
+    """Return the header of a capture, of the serial device or of ``source`` if there is one."""
     if source is not None:
         return CaptureHeader(sensor.protocol, source.described, 0, sensor.current_sign)
     return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign, address=sensor.address)
@@ -86,33 +87,33 @@ def sensor_of(path: Path) -> SensorSettings:
     """Return the board settings of the capture ``path`` that decoding needs.
 
     Raises:
-        UserError: As ``read_header``, or the board's protocol is unknown.
+        UserError: The header cannot be read, or its protocol is unknown.
     """
     header = read_header(path)
     try:
-        told = {"protocol": header.mode, "current_sign": header.current_sign, "address": header.address}
-        return SensorSettings.model_validate(told)
+        fields = {"protocol": header.mode, "current_sign": header.current_sign, "address": header.address}
+        return SensorSettings.model_validate(fields)
     except ValidationError:
         raise UserError(
             f"{path}: recorded from mode {header.mode!r}, current_sign {header.current_sign!r}: "
-            "this program does not know both"
+            "this program does not support one of them"
         ) from None
 
 
 @dataclasses.dataclass(frozen=True)
 class CaptureBatch:
-    """Some reads of the line, in the shape that a decoder's ``feed_reads`` takes."""
+    """Batch of recorded reads, as arguments of a decoder's ``feed_reads``."""
 
     arrivals_s: NDArray[np.float64]
     ends: NDArray[np.int64]
     data: NDArray[np.uint8]
     damaged: bool
-    """The file has no readable record behind these although it has not ended."""
+    """The record after this batch is damaged."""
     unread_bytes: int = 0
-    """Number of bytes at the end of the file without a whole record."""
+    """Number of bytes of an incomplete record at the end of the file."""
 
     def __iter__(self) -> Iterator[tuple[float, bytes]]:
-        """Each read: arrival [s], bytes."""
+        """Yield arrival time [s] and bytes of each read."""
         begin = 0
         for arrival_s, end in zip(self.arrivals_s.tolist(), self.ends.tolist(), strict=True):
             yield arrival_s, self.data[begin:end].tobytes()
@@ -120,14 +121,14 @@ class CaptureBatch:
 
 
 class CaptureWriter:
-    """Writes a capture; a context manager.
+    """Writer of a capture; a context manager.
 
     Args:
         path: A file that does not exist yet.
         header: Header of the capture.
 
     Raises:
-        UserError: The file exists or cannot be made.
+        UserError: The file exists or cannot be created.
     """
 
     def __init__(self, path: Path, header: CaptureHeader) -> None:
@@ -145,11 +146,11 @@ class CaptureWriter:
         """Append one read of the line.
 
         Args:
-            arrival_s: The very number that the decoder gets [s].
+            arrival_s: Arrival time, bit-identical to the decoder's input [s].
             data: The bytes, at most ``MAX_READ_BYTES``.
 
         Raises:
-            ValueError: More bytes.
+            ValueError: ``data`` is longer.
             OSError: The disk is full or gone.
         """
         if len(data) > MAX_READ_BYTES:
@@ -158,11 +159,11 @@ class CaptureWriter:
         self._append(record + _CRC.pack(binascii.crc_hqx(record, 0xFFFF)))
 
     def sync(self) -> None:
-        """Wait until all data are on disk, which is necessary only against a power failure."""
+        """Wait until all data are on disk, as a protection against power failures."""
         os.fdatasync(self._descriptor)
 
     def close(self) -> None:
-        """Have the disk take all, and close."""
+        """Sync to disk, and close the file."""
         if self._descriptor >= 0:
             try:
                 self.sync()
@@ -185,7 +186,7 @@ class CaptureWriter:
 
 
 def is_capture(path: Path) -> bool:
-    """Return True if a file begins as a raw capture does."""
+    """Return True if a file begins with the magic bytes of a raw capture."""
     try:
         with _open(path) as file:
             return file.read(len(MAGIC)) == MAGIC
@@ -194,10 +195,10 @@ def is_capture(path: Path) -> bool:
 
 
 def read_header(path: Path) -> CaptureHeader:
-    """Header of a capture.
+    """Read the header of a capture.
 
     Raises:
-        UserError: No capture, or one of a later version.
+        UserError: The file is not a raw capture, or has a later version.
     """
     try:
         with _open(path) as file:
@@ -207,13 +208,13 @@ def read_header(path: Path) -> CaptureHeader:
 
 
 def read_capture(path: Path) -> Iterator[CaptureBatch]:
-    """Batches of reads, each about ``CHUNK_BYTES`` of file, to the last whole record.
+    """Yield batches of about ``CHUNK_BYTES`` of the file, up to the last complete record.
 
-    Iterating a batch gives the calls that the live decoder got; ``decoder.feed_reads(batch.arrivals_s, batch.ends,
-    batch.data)`` makes the same samples faster.
+    The items of a batch are the arguments of the recorded calls of ``feed``. One call of ``decoder.feed_reads`` with the
+    arrays of the batch decodes the same samples faster.
 
     Raises:
-        UserError: No capture, or one of a later version.
+        UserError: The file is not a raw capture, or has a later version.
     """
     try:
         file = _open(path)
@@ -227,8 +228,8 @@ def read_capture(path: Path) -> Iterator[CaptureBatch]:
         rest = b""
         while more := _read_some(file, CHUNK_BYTES):
             raw = np.frombuffer(rest + more, dtype=np.uint8)
-            batch, taken = _split(raw)
-            rest = raw[taken:].tobytes()
+            batch, parsed_bytes = _split(raw)
+            rest = raw[parsed_bytes:].tobytes()
             if batch.ends.size or batch.damaged:
                 yield batch
             if batch.damaged:
@@ -238,14 +239,14 @@ def read_capture(path: Path) -> Iterator[CaptureBatch]:
 
 
 def _split(raw: NDArray[np.uint8]) -> tuple[CaptureBatch, int]:
-    """Whole records of ``raw``, and how many bytes they took."""
-    most = raw.size // RECORD_OVERHEAD_BYTES + 1
-    arrival_bits, ends = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
+    """Return the complete records of ``raw``, and their length in ``raw`` [bytes]."""
+    max_records = raw.size // RECORD_OVERHEAD_BYTES + 1
+    arrival_bits, ends = np.empty(max_records, dtype=np.int64), np.empty(max_records, dtype=np.int64)
     payload = np.empty(raw.size, dtype=np.uint8)
-    taken, records, filled, damaged = split_records(raw, MAX_READ_BYTES, arrival_bits, ends, payload)
-    payload.setflags(write=False)  # as bytes from the line are: the decoder is compiled for one of both
+    parsed_bytes, records, payload_bytes, damaged = split_records(raw, MAX_READ_BYTES, arrival_bits, ends, payload)
+    payload.setflags(write=False)  # as for live bytes, because the decoder is compiled for read-only arrays
     arrivals_s = arrival_bits[:records].view(np.float64)
-    return CaptureBatch(arrivals_s, ends[:records], payload[:filled], bool(damaged)), taken
+    return CaptureBatch(arrivals_s, ends[:records], payload[:payload_bytes], bool(damaged)), parsed_bytes
 
 
 def _open(path: Path) -> IO[bytes]:
@@ -255,7 +256,7 @@ def _open(path: Path) -> IO[bytes]:
 
 
 def _read_some(file: IO[bytes], size: int) -> bytes:
-    """Up to ``size`` bytes; a gzip file that was cut off or is damaged ends where it is."""
+    """Read up to ``size`` bytes. A truncated or damaged gzip file counts as ended."""
     try:
         return file.read(size)
     except (EOFError, gzip.BadGzipFile, zlib.error):
@@ -265,7 +266,7 @@ def _read_some(file: IO[bytes], size: int) -> bytes:
 def _read_header(path: Path, file: IO[bytes]) -> CaptureHeader:
     head = file.read(len(MAGIC) + _LENGTH.size)
     if not head.startswith(MAGIC):
-        raise UserError(f"{path}: no raw capture: it does not begin with {MAGIC!r}")
+        raise UserError(f"{path}: not a raw capture: it does not begin with {MAGIC!r}")
     if len(head) < len(MAGIC) + _LENGTH.size:
         raise UserError(f"{path}: cut off within its header")
     (length,) = _LENGTH.unpack(head[len(MAGIC) :])
@@ -279,14 +280,14 @@ def _checked_header(path: Path, text: bytes) -> CaptureHeader:
     """Parse and check a header's JSON.
 
     Raises:
-        UserError: It is not a header, or one of a later version; the message names the file and the error.
+        UserError: The JSON is not a valid header, or has a later version; the message names the file and the error.
     """
     try:
-        found = _VERSIONED.validate_json(text)
-        if found.version != VERSION:
-            raise UserError(f"{path}: version {found.version}, this program reads version {VERSION}")
+        header = _VERSIONED.validate_json(text)
+        if header.version != VERSION:
+            raise UserError(f"{path}: version {header.version}, this program reads version {VERSION}")
         return _HEADER.validate_json(text)
     except ValidationError as error:
-        wrong = error.errors(include_url=False)[0]
-        where = "".join(f"{key}: " for key in wrong["loc"])
-        raise UserError(f"{path}: its header is none of this program's: {where}{wrong['msg'].lower()}") from None
+        detail = error.errors(include_url=False)[0]
+        field_path = "".join(f"{key}: " for key in detail["loc"])
+        raise UserError(f"{path}: its header is not valid: {field_path}{detail['msg'].lower()}") from None

@@ -1,4 +1,4 @@
-"""Recording beside the estimate: the reader of the source never waits for the disk."""
+"""Recorder of a source's chunks. Its own thread writes them, so that the source never waits for the disk."""
 
 import errno
 import queue
@@ -13,70 +13,68 @@ from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 
 SYNC_S = 5.0
-"""The disk has all but the last seconds, even when the power fails [s]."""
-WAITING_READS = 1 << 16
-"""Maximum number of chunks waiting for the disk: a minute at a thousand samples a second."""
-
-END_S = 5.0
-"""Time that the recorder waits at its end for the disk to accept waiting chunks [s]."""
+"""Interval between two syncs to disk [s]. A power failure loses at most the data since the last sync."""
+MAX_QUEUED_CHUNKS = 1 << 16
+"""Maximum number of chunks waiting for the disk: one minute at 1000 samples per second."""
+SHUTDOWN_TIMEOUT_S = 5.0
+"""Timeout at shutdown [s]: the recorder waits for the disk as long as it writes a chunk within this time."""
 
 log = structlog.get_logger(__name__)
 
 
 class CaptureRecorder:
-    """A tap that writes a capture in a thread of its own.
+    """Tap that writes a capture in its own thread; a context manager that writes the queued chunks on exit.
 
-    A context manager that writes the remaining chunks at its end.
-
-    A disk that fails, or stays behind for too long, ends the recording and nothing else. The file contains complete
-    records only.
-    One that hangs does not hold up the end, either.
+    A disk that fails or is too slow ends the recording, but not the service. The file then contains complete records
+    only. A hung disk does not delay the exit beyond ``SHUTDOWN_TIMEOUT_S``.
 
     Args:
         path: A file that does not exist yet.
         header: Header of the capture.
-        waiting_reads: Maximum number of chunks waiting for the disk.
+        max_queued_chunks: Maximum number of chunks waiting for the disk.
         sync_s: Interval at which data are synced to the disk [s].
 
     Attributes:
-        bytes: Number of recorded bytes.
-        ended: Done when the recording has ended; holds the ``OSError`` if one has ended it.
+        bytes: Number of received bytes, queued ones included.
+        ended: Future that is done when the recording has ended, with the ``OSError`` if one ended it.
 
     Raises:
-        UserError: The file exists or cannot be made.
+        UserError: The file exists or cannot be created.
     """
 
     def __init__(
-        self, path: Path, header: CaptureHeader, *, waiting_reads: int = WAITING_READS, sync_s: float = SYNC_S
+        self, path: Path, header: CaptureHeader, *, max_queued_chunks: int = MAX_QUEUED_CHUNKS, sync_s: float = SYNC_S
     ) -> None:
         self._writer = CaptureWriter(path, header)
-        self._path, self._waiting_reads, self._sync_s = path, waiting_reads, sync_s
+        self._path, self._max_queued_chunks, self._sync_s = path, max_queued_chunks, sync_s
         self._waiting: queue.SimpleQueue[tuple[float, bytes] | OSError | None] = queue.SimpleQueue()
-        self._behind = False
-        self._reads = self._written = self.bytes = 0
-        self.ended: Future[None] = DiskThread("recording").submit(self._run)
+        self._overflowed = False
+        self._received = self._written = self.bytes = 0
+        self.ended: Future[None] = DiskThread("recording").submit(self._record)
 
     @property
     def missed_reads(self) -> int:
-        """Reads that are not in the file, once the recording has ended."""
-        return self._reads - self._written if self.ended.done() else 0
+        """Number of chunks missing in the file; 0 until the recording has ended."""
+        return self._received - self._written if self.ended.done() else 0
 
     @property
     def fault(self) -> str:
-        """Why the file has not all that was taken; empty when it has. For after the end."""
+        """Reason why chunks are missing in the file; empty if none are. Valid after the exit."""
         if not self.ended.done():
-            return f"the disk has not answered for {END_S:g} s"
+            return f"the disk has not answered for {SHUTDOWN_TIMEOUT_S:g} s"
         error = self.ended.exception()
         return "" if error is None else getattr(error, "strerror", None) or str(error)
 
     def write(self, arrival_s: float, data: bytes) -> None:
-        """Take one read of the line; after the end of the recording it is only counted."""
-        self._reads += 1
-        if self._behind or self.ended.done():
+        """Queue one chunk. After the end of the recording it is only counted."""
+        self._received += 1
+        if self._overflowed or self.ended.done():
             return
-        if self._waiting.qsize() >= self._waiting_reads:
-            self._behind = True
-            self._waiting.put(OSError(errno.ENOBUFS, f"the disk stays behind, {self._waiting_reads:,} reads wait"))
+        if self._waiting.qsize() >= self._max_queued_chunks:
+            self._overflowed = True
+            self._waiting.put(
+                OSError(errno.ENOBUFS, f"the disk is too slow, {self._max_queued_chunks:,} chunks are queued")
+            )
             return
         self.bytes += len(data)
         self._waiting.put((arrival_s, data))
@@ -86,25 +84,25 @@ class CaptureRecorder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Have the disk take all that waits, and close; one that takes nothing for ``END_S`` is left alone."""
+        """Wait until the queued chunks are written, unless the disk writes none for ``SHUTDOWN_TIMEOUT_S``."""
         self._waiting.put(None)
         before = -1
         while not self.ended.done() and self._written > before:
             before = self._written
-            wait([self.ended], END_S)
+            wait([self.ended], SHUTDOWN_TIMEOUT_S)
         if not self.ended.done():
             log.warning("recording not ended", file=str(self._path), reason=self.fault)
 
-    def _run(self) -> None:
-        """Write until stopped; the writer's close waits for the disk."""
+    def _record(self) -> None:
+        """Write chunks until stopped. Closing the writer waits for the disk."""
         try:
             with self._writer:
-                self._write_on()
+                self._write_chunks()
         except OSError as error:
             log.warning("recording ended", file=str(self._path), reason=error.strerror)
             raise
 
-    def _write_on(self) -> None:
+    def _write_chunks(self) -> None:
         sync_s = time.monotonic() + self._sync_s
         while True:
             if (now_s := time.monotonic()) >= sync_s:

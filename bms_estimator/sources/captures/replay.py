@@ -1,4 +1,4 @@
-"""A capture as a source: at full speed, or paced by its timestamps."""
+"""Replay of a capture as a source, at full speed or paced by its timestamps."""
 
 import asyncio
 import itertools
@@ -20,20 +20,20 @@ from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, sensor_of
 from bms_estimator.sources.captures.tables import READERS, ColumnTable, Sign, samples_of, table_reader
 
-TICK_S = 0.05
-"""Interval at which a paced replay returns due samples [s]."""
+PACED_INTERVAL_S = 0.05
+"""Interval at which a paced replay yields due samples [s]."""
 
 
 class Capture(Protocol):
-    """Something recorded. Each iteration reads it from its start."""
+    """Recorded samples. Each iteration starts at the first one."""
 
     @property
     def fraction(self) -> float:
-        """Fraction that has been read, 0..1."""
+        """Fraction of the file that has been read, 0..1."""
 
     @property
     def implausible(self) -> int:
-        """Readings that no pack has, handed on as not measured."""
+        """Number of implausible readings, which were replaced by NaN."""
 
     def __iter__(self) -> Iterator[SampleBlock]:
         """Blocks of samples.
@@ -44,41 +44,41 @@ class Capture(Protocol):
 
 
 class RawCapture:
-    """The samples in the bytes of a raw capture.
+    """Samples of a raw capture, decoded from its bytes.
 
     Args:
-        path: What ``CaptureWriter`` wrote.
-        sensor: Settings of the decoder; None: that of the capture's header.
-        current_sign: What its current calls positive; None: that of ``sensor``.
+        path: File written by ``CaptureWriter``.
+        sensor: Settings of the decoder; None: those of the capture's header.
+        current_sign: Direction of positive current; None: that of ``sensor``.
 
     Attributes:
-        decoder: What the bytes have gone through so far.
-        damaged: The file has no readable record behind those that were read although it has not ended.
-        unread_bytes: Number of bytes at its end without a whole record: it was cut off there, or a length is damaged.
+        decoder: Decoder that has been fed the bytes read so far.
+        damaged: True if the next record is damaged; the rest of the file is not read.
+        unread_bytes: Number of bytes of an incomplete record at the end, because of a truncated file or a damaged length.
 
     Raises:
-        UserError: No capture, or one of a later version.
+        UserError: The file is not a raw capture, or has a later version.
     """
 
     def __init__(
         self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
     ) -> None:
         recorded = sensor_of(path)
-        told = sensor or recorded
-        if told.protocol != recorded.protocol:
+        used = sensor or recorded
+        if used.protocol != recorded.protocol:
             raise UserError(
-                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {told.protocol!r}: "
+                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {used.protocol!r}: "
                 "give settings with that protocol, or none"
             )
-        self.decoder = make_protocol(told.model_copy(update={"current_sign": current_sign or told.current_sign}))
+        self.decoder = make_protocol(used.model_copy(update={"current_sign": current_sign or used.current_sign}))
         self.damaged, self.unread_bytes = False, 0
         self._path = path
-        self._read, self._size = 0, path.stat().st_size
+        self._read_bytes, self._size = 0, path.stat().st_size
 
     @property
     def fraction(self) -> float:
         """Fraction that has been read, 0..1; too large for a compressed file."""
-        return min(self._read / self._size, 1.0)
+        return min(self._read_bytes / self._size, 1.0)
 
     @property
     def implausible(self) -> int:
@@ -86,9 +86,9 @@ class RawCapture:
         return self.decoder.counters["implausible"]
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of samples, as in ``Capture``."""
+        """Yield blocks of samples."""
         for batch in read_capture(self._path):
-            self._read += batch.data.size + RECORD_OVERHEAD_BYTES * batch.ends.size
+            self._read_bytes += batch.data.size + RECORD_OVERHEAD_BYTES * batch.ends.size
             self.damaged, self.unread_bytes = batch.damaged, batch.unread_bytes
             block = self.decoder.feed_reads(batch.arrivals_s, batch.ends, batch.data)
             if block.size:
@@ -96,19 +96,19 @@ class RawCapture:
 
 
 class Replay:
-    """Source of the samples of a capture; ends with its last one.
+    """Source of the samples of a capture; it ends after the last one.
 
-    How the samples are cut into blocks never shows in the estimates.
+    The estimates do not depend on the division of the samples into blocks.
 
     Args:
         capture: Capture to replay.
-        speed: Times as fast as it was recorded; None: full speed.
+        speed: Speed relative to the recording; None: full speed.
         longest_s: At full speed, maximum duration of a block on the samples' clock [s].
         monotonic: Monotonic clock [s].
     """
 
     message: str | None = None
-    """Fault message; None, because there is always a sample."""
+    """Reason why no samples arrive; None, because a capture always has a next sample or ends."""
 
     def __init__(
         self,
@@ -126,14 +126,14 @@ class Replay:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The decoder's; number of rows of a table, and invalid temperatures."""
+        """Counters of the decoder; for a table the number of rows and of implausible temperatures."""
         if self._decoder:
             return self._decoder.counters
         return {"frames_received": self.samples, "implausible": self.capture.implausible}
 
     @property
     def board(self) -> Mapping[str, str]:
-        """Hello of the board when it was recorded."""
+        """Properties from the board's hello in the capture; empty without one."""
         return self._decoder.board if self._decoder else {}
 
     @property
@@ -142,19 +142,19 @@ class Replay:
         return self._decoder.clock_ppm if self._decoder else None
 
     async def __aenter__(self) -> Self:
-        """Nothing to open: iterating does."""
+        """Return the replay; the file is opened by the iteration."""
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Nothing to close."""
+        """Do nothing; the file is closed by the iteration."""
 
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:
-        """Blocks of samples, none of them empty."""
-        async for block in self._at_once() if self._speed is None else self._paced(self._speed):
+        """Yield blocks of samples; none of them is empty."""
+        async for block in self._unpaced() if self._speed is None else self._paced(self._speed):
             self.samples += block.size
             yield block
 
-    async def _at_once(self) -> AsyncIterator[SampleBlock]:
+    async def _unpaced(self) -> AsyncIterator[SampleBlock]:
         for block in self.capture:
             cells = self._cells()
             for part in _parts(block["time_s"], self._longest_s):
@@ -162,11 +162,11 @@ class Replay:
                 yield block[part]
 
     def _cells(self) -> CellBlock:
-        """Beside the capture's last block."""
+        """Return the cell voltages of the capture's last block."""
         return self._decoder.cells if self._decoder else NO_CELLS
 
     async def _paced(self, speed: float) -> AsyncIterator[SampleBlock]:
-        """Each sample at its time; the first is immediate."""
+        """Yield each sample when it is due; the first one immediately."""
         start_s, last_s, elapsed_s = self._monotonic(), math.nan, 0.0
         for block in self.capture:
             due_s = elapsed_s + _elapsed(block["time_s"], last_s)
@@ -179,12 +179,12 @@ class Replay:
                     yield block[first:end]
                     first = end
                 else:
-                    await asyncio.sleep(min((due_s[first] - now_s) / speed + TICK_S, 1.0))
+                    await asyncio.sleep(min((due_s[first] - now_s) / speed + PACED_INTERVAL_S, 1.0))
             last_s, elapsed_s = float(block["time_s"][-1]), float(due_s[-1])
 
 
 def _parts(time_s: NDArray[np.float64], longest_s: float) -> Iterator[slice]:
-    """Return the indices that cut a block into parts of limited duration."""
+    """Yield slices that divide a block into parts of limited duration."""
     if math.isinf(longest_s):
         yield slice(None)
         return
@@ -195,7 +195,7 @@ def _parts(time_s: NDArray[np.float64], longest_s: float) -> Iterator[slice]:
 
 
 def _elapsed(time_s: NDArray[np.float64], last_s: float) -> NDArray[np.float64]:
-    """Time since ``last_s`` [s]; steps back and stamps that are not finite take none."""
+    """Return the time elapsed since ``last_s`` [s]; backward steps and timestamps that are not finite count as 0."""
     steps = np.diff(time_s, prepend=last_s)
     return np.cumsum(np.where(np.isfinite(steps), steps, 0.0).clip(min=0.0))
 
@@ -207,11 +207,12 @@ def open_capture(
 
     Args:
         path: The file.
-        sensor: Settings for decoding raw bytes and for the current sign of a table without its own; None: that of the header of raw bytes, otherwise discharge.
+        sensor: Settings for decoding a raw capture, and the current sign of a table that defines none. None: the settings
+            in the header of a raw capture; discharge is positive in a table.
         current_sign: Direction of positive current, which overrides ``sensor``, header and format.
 
     Raises:
-        UserError: No such file, or it is neither.
+        UserError: The file does not exist, or is neither a table nor a raw capture.
     """
     if not path.is_file():
         raise UserError(f"{path}: {'is a directory' if path.is_dir() else 'no such file'}")
@@ -224,12 +225,12 @@ def open_capture(
 
 
 def load_capture(source: str | Path | ColumnTable, *, current_sign: CurrentSign | None = None) -> Columns:
-    """All samples of a capture in memory.
+    """Load all samples of a capture into memory.
 
     Args:
         source: Path of a raw capture or of a table (CSV, gzipped CSV, Parquet), or a table in memory: a DataFrame, a
             dict of arrays. A table has our columns or the Battery Data Format's.
-        current_sign: What its current calls positive, ``discharge_positive`` or ``charge_positive``; None: that of
+        current_sign: Direction of positive current, ``discharge_positive`` or ``charge_positive``; None: that of
             the format, otherwise discharge.
 
     Returns:
@@ -237,7 +238,7 @@ def load_capture(source: str | Path | ColumnTable, *, current_sign: CurrentSign 
         ``status``, bits of ``SampleStatus``.
 
     Raises:
-        UserError: There is no such file, it cannot be read, or a column is missing; no such sign.
+        UserError: The file does not exist or cannot be read, a column is missing, or ``current_sign`` is not valid.
     """
     if current_sign not in (None, *get_args(CurrentSign)):
         raise UserError(f"current_sign = {current_sign!r}: must be one of {', '.join(get_args(CurrentSign))}")

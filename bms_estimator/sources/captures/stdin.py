@@ -1,4 +1,4 @@
-"""Capture from a pipe as a file: readers measure a file's size and read it twice."""
+"""Capture from a pipe, copied to a file because readers need a file's size and read it twice."""
 
 import gzip
 import shutil
@@ -12,42 +12,42 @@ from tempfile import TemporaryDirectory
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.raw_capture import MAGIC
 
-NAME = "stdin"
+DISPLAY_NAME = "stdin"
 """Name used in messages."""
-GZIP, PARQUET = b"\x1f\x8b", b"PAR1"
-"""First bytes of such files."""
+GZIP_MAGIC, PARQUET_MAGIC = b"\x1f\x8b", b"PAR1"
+"""First bytes of gzip and Parquet files."""
 
 
 @contextmanager
 def standard_input() -> Iterator[Path]:
-    """All of stdin as a file, with the suffix of its format; closed on exit.
+    """Copy stdin to a temporary file with the suffix of its format; yield its path, and delete it on exit.
 
     Raises:
-        UserError: It is closed; or as raised while it is used, its folder left out of the message.
+        UserError: Stdin is closed. An error raised inside the context shows ``stdin`` instead of the temporary path.
     """
     if not sys.stdin:
-        raise UserError(f"{NAME}: closed; nothing can be read from it")
+        raise UserError(f"{DISPLAY_NAME}: closed; nothing can be read from it")
     with TemporaryDirectory() as folder:
-        plain = Path(folder) / NAME
+        plain = Path(folder) / DISPLAY_NAME
         with plain.open("wb") as file:
             shutil.copyfileobj(sys.stdin.buffer, file)
-        path = plain.rename(plain.with_name(NAME + _ending(plain)))
+        path = plain.rename(plain.with_name(DISPLAY_NAME + _suffix(plain)))
         try:
             yield path
         except UserError as error:
-            raise UserError(str(error).replace(str(path), NAME)) from None
+            raise UserError(str(error).replace(str(path), DISPLAY_NAME)) from None
 
 
-def _ending(path: Path) -> str:
+def _suffix(path: Path) -> str:
     """Return the file name extension that selects the reader of ``path``."""
     with path.open("rb") as file:
         first = file.read(len(MAGIC))
-    if first.startswith(PARQUET):
+    if first.startswith(PARQUET_MAGIC):
         return ".parquet"
-    if not first.startswith(GZIP):
+    if not first.startswith(GZIP_MAGIC):
         return "" if first == MAGIC else ".csv"
     try:
         with gzip.open(path) as packed:
             return ".gz" if packed.read(len(MAGIC)) == MAGIC else ".csv.gz"
     except (OSError, EOFError, zlib.error):
-        return ".csv.gz"  # whose reader reports errors
+        return ".csv.gz"  # the reader of such files reports the error

@@ -1,4 +1,4 @@
-"""Captures as tables: CSV, gzipped CSV and Parquet, read in blocks so that length does not cost memory.
+"""Captures as tables: CSV, gzipped CSV and Parquet, read in blocks so that memory does not grow with the file.
 
 Two spellings of the columns are supported: this project's, and that of the Battery Data Format, which is positive on
 charge.
@@ -21,7 +21,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import MAX_C, MIN_C, SAMPLE, CurrentSign, SampleBlock, forget_beyond
 
 BLOCK_ROWS = 65_536
-SHOWN = 40
+MAX_SHOWN_CHARACTERS = 40
 """Maximum number of characters of an invalid number that are shown."""
 
 
@@ -33,10 +33,10 @@ class ColumnNaming(NamedTuple):
     voltage_v: str
     temperature_c: str
     current_sign: CurrentSign | None
-    """Direction that the columns call positive; None if they do not define it."""
+    """Direction of positive current; None if the column names do not define it."""
 
 
-SPELLINGS = (
+NAMINGS = (
     ColumnNaming("time_s", "current_a", "voltage_v", "temperature_c", None),
     ColumnNaming("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", "charge_positive"),
 )
@@ -44,16 +44,16 @@ SPELLINGS = (
 
 
 class Sign(NamedTuple):
-    """Direction that a table's current calls positive."""
+    """Direction of positive current in a table."""
 
     given: CurrentSign | None = None
     """Direction given for this very table; it takes precedence over column names."""
     otherwise: CurrentSign = "discharge_positive"
     """Direction if neither ``given`` nor the column names define it."""
 
-    def of(self, spelling: ColumnNaming) -> float:
-        """Factor that makes discharge positive."""
-        return 1.0 if (self.given or spelling.current_sign or self.otherwise) == "discharge_positive" else -1.0
+    def factor(self, naming: ColumnNaming) -> float:
+        """Return the factor, 1 or -1, that makes discharge positive."""
+        return 1.0 if (self.given or naming.current_sign or self.otherwise) == "discharge_positive" else -1.0
 
 
 class ColumnTable(Protocol):
@@ -91,7 +91,7 @@ class CsvTable:
 
     @property
     def fraction(self) -> float:
-        """Fraction that has been read, 0..1."""
+        """Fraction of the file that has been read, 0..1."""
         if self._raw is None:
             return 0.0
         return 1.0 if self._raw.closed else self._raw.tell() / max(self._size, 1)
@@ -132,12 +132,12 @@ class CsvTable:
             raise UserError(f"{self._path}: no samples after the header in line {line}")
 
     def _values(self, lines: Sequence[str], first_line: int, columns: _Columns, width: int) -> NDArray[np.float64]:
-        """Return the wanted columns of some lines, shape (rows, columns)."""
+        """Return the values of a sample's columns in some lines, shape (rows, columns)."""
         if not any(_is_data(line) for line in lines):
             return np.empty((0, len(columns.indices)))
         try:
             return np.loadtxt(lines, delimiter=",", usecols=columns.indices, ndmin=2, quotechar='"')
-        except ValueError:  # an empty cell, or something to complain about with line and column
+        except ValueError:  # an empty cell, or an error, which is reported with line and column
             return self._values_one_by_one(lines, first_line, columns, width)
 
     def _values_one_by_one(
@@ -155,11 +155,13 @@ class CsvTable:
         return np.array(rows)
 
     def _number(self, cell: str, line: int, column: str) -> float:
-        """Parse a cell of a table; an empty cell, or a word for it, is NaN."""
+        """Parse a cell of a table; an empty cell, or a word such as nan, is NaN."""
         try:
             return measured(cell) if cell.strip() else np.nan
         except ValueError:
-            raise UserError(f"{self._path}: line {line}: {column} = {cell[:SHOWN]!r}: must be a number") from None
+            raise UserError(
+                f"{self._path}: line {line}: {column} = {cell[:MAX_SHOWN_CHARACTERS]!r}: must be a number"
+            ) from None
 
 
 class ParquetTable:
@@ -218,7 +220,7 @@ READERS: dict[str, type[CsvTable | ParquetTable]] = {
     ".bdf.gz": CsvTable,
     ".parquet": ParquetTable,
 }
-"""Suffix -> reader."""
+"""Readers of tables by file name suffix."""
 
 
 def table_reader(path: Path, sign: Sign) -> CsvTable | ParquetTable | None:
@@ -231,7 +233,7 @@ def samples_of(table: ColumnTable, sign: Sign) -> SampleBlock:
     """Return the samples of a table in memory.
 
     Raises:
-        UserError: A column is missing, or is not of numbers.
+        UserError: A column is missing or does not contain numbers.
     """
     columns = _columns("the table", list(table), sign)
     return _block([_numeric(name, table[name]) for name in columns.names], columns)[0]
@@ -241,7 +243,7 @@ def _numeric(name: str, column: ArrayLike) -> NDArray[np.float64]:
     """Return a numeric column of a table in memory; None becomes NaN.
 
     Raises:
-        UserError: There are not numbers in it.
+        UserError: The column contains other values than numbers.
     """
     values = np.asarray(column)
     if values.dtype.kind == "O" and all(value is None or isinstance(value, int | float) for value in values.flat):
@@ -258,36 +260,36 @@ def _is_data(line: str) -> bool:
 
 
 def _header(path: Path, text: TextIOWrapper) -> tuple[list[str], int]:
-    """Names in the first line that is not empty or a comment, and its number."""
+    """Return the names in the first line that is neither empty nor a comment, and the number of that line."""
     for number, line in enumerate(iter(text.readline, ""), 1):
         if _is_data(line):
             return [name.strip() for name in next(csv.reader([line]))], number
-    raise UserError(f"{path}: empty: the first line must name the columns, {_wanted(SPELLINGS[0])}")
+    raise UserError(f"{path}: empty: the first line must name the columns, {_header_text(NAMINGS[0])}")
 
 
 def _columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
-    """Find the columns.
+    """Find the columns of a sample.
 
     Raises:
-        UserError: Some are missing; the message lists it and the existing columns.
+        UserError: Columns are missing; the message lists them and the existing columns.
     """
-    spelling = max(SPELLINGS, key=lambda d: sum(name in header for name in d[:3]))
-    missing = [name for name in spelling[:3] if name not in header]
+    naming = max(NAMINGS, key=lambda naming: sum(name in header for name in naming[:3]))
+    missing = [name for name in naming[:3] if name not in header]
     if missing:
         raise UserError(
             f"{path}: no column {' nor '.join(missing)}; found {', '.join(header)}; "
-            f"needed: {_wanted(SPELLINGS[0])}, or {_wanted(SPELLINGS[1])} (Battery Data Format)"
+            f"needed: {_header_text(NAMINGS[0])}, or {_header_text(NAMINGS[1])} (Battery Data Format)"
         )
-    names = tuple(name for name in spelling[:4] if name in header)
-    return _Columns(tuple(header.index(name) for name in names), names, sign.of(spelling))
+    names = tuple(name for name in naming[:4] if name in header)
+    return _Columns(tuple(header.index(name) for name in names), names, sign.factor(naming))
 
 
-def _wanted(spelling: ColumnNaming) -> str:
-    return f"{','.join(spelling[:3])}[,{spelling.temperature_c}]"
+def _header_text(naming: ColumnNaming) -> str:
+    return f"{','.join(naming[:3])}[,{naming.temperature_c}]"
 
 
 def _block(values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns: _Columns) -> tuple[SampleBlock, int]:
-    """Return samples of columns in the order of ``columns``, and the number of implausible temperatures."""
+    """Return the samples of a table's columns, and the number of implausible temperatures."""
     block = np.zeros(len(values[0]), dtype=SAMPLE)
     block["time_s"] = values[0]
     block["current_a"] = columns.discharge_sign * values[1]

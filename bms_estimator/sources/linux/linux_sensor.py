@@ -1,4 +1,7 @@
-"""``kind = "linux"``: a current sensor by its files in sysfs, polled in a thread: a bus that hangs holds up nothing."""
+"""``kind = "linux"``: a current sensor with a kernel driver, polled through its sysfs files.
+
+A thread reads the files, so that a hung bus does not block the event loop.
+"""
 
 import asyncio
 import errno
@@ -11,53 +14,56 @@ from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.linux_source import LinuxSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import SILENT_PERIODS, LineProducer, SourceUnavailableError
-from bms_estimator.sources.linux.sysfs import SYS, Channel, JunkError, find_channel, find_chip, read_number
+from bms_estimator.sources.linux.sysfs import SYS, Channel, NotANumberError, find_channel, find_chip, read_number
 
 MIN_INTERVAL_S = 0.1
-"""Minimum interval between two readings [s]; chips update as often as each 2 ms."""
-HUNG_S = 5.0
-"""A second is long for a bus, but not for a machine that swaps [s]."""
-GONE = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
-"""Errors of a chip, or its driver, that was removed."""
+"""Minimum interval between two readings [s]. Some chips update every 2 ms."""
+READ_TIMEOUT_S = 5.0
+"""Timeout of a reading [s]. A bus answers within a second, but a machine that swaps may take longer."""
+REMOVED_ERRORS = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
+"""Errors that show that the chip or its driver was removed."""
 
 T = TypeVar("T")
 
 
-class _Chip(NamedTuple):
+class _Channels(NamedTuple):
     """Channels that are read for each sample."""
 
     voltage: Channel
     current: Channel
     temperature: Channel | None
-    amperes: float
-    """Amperes for one unit of the current's channel [A/A or A/V]."""
+    amperes_per_unit: float
+    """Current per unit of the current channel: [A/A], or [A/V] if the channel is a voltage over a shunt."""
     interval_s: float
 
 
 class LinuxSensor(LineProducer):
-    """Polls the files of a chip.
+    """Line producer that polls the sysfs files of a chip.
 
     Args:
         settings: Chip, files, divider and shunt.
         root: Root of sysfs.
-        hung_s: Timeout of the bus [s].
+        read_timeout_s: Timeout of a reading [s].
     """
 
-    def __init__(self, settings: LinuxSource, root: Path = SYS, hung_s: float = HUNG_S) -> None:
-        self._settings, self._root, self._hung_s = settings, root, hung_s
+    def __init__(self, settings: LinuxSource, root: Path = SYS, read_timeout_s: float = READ_TIMEOUT_S) -> None:
+        self._settings, self._root, self._read_timeout_s = settings, root, read_timeout_s
         self._thread = DiskThread("sysfs")
-        self._left: asyncio.Future[Any] | None = None  # a call that hung: only one runs at a time
+        self._hung_call: asyncio.Future[Any] | None = None  # it must end before the next call: only one runs at a time
         self._counters = {"read_errors": 0, "value_errors": 0}
         self._fault: str | None = None
 
     @property
     def name(self) -> str:
-        """The chip."""
+        """Chip and files of the sensor."""
         return self._settings.described
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """``read_errors``: files that could not be read, ``value_errors``: those that held no number."""
+        """Number of faults since start.
+
+        ``read_errors`` counts files that could not be read, ``value_errors`` files without a number.
+        """
         return self._counters
 
     @property
@@ -66,12 +72,12 @@ class LinuxSensor(LineProducer):
         return self._fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """Yield a line each interval.
+        """Yield one line in each interval.
 
         Raises:
-            SourceUnavailableError, OSError: The chip or a file of it is not there, or its bus hangs.
+            SourceUnavailableError, OSError: The chip or one of its files is missing, or its bus hangs.
         """
-        chip = await self._read(self._find)
+        chip = await self._read(self._find_channels)
         yield CONNECTED
         loop = asyncio.get_running_loop()
         due_s = loop.time()
@@ -84,103 +90,115 @@ class LinuxSensor(LineProducer):
 
     async def _read(self, call: Callable[[], T]) -> T:
         """Run a call that may wait for the bus; return its result."""
-        if self._left is not None:
-            await self._wait(self._left)
-            self._left = None
+        if self._hung_call is not None:
+            await self._wait(self._hung_call)
+            self._hung_call = None
         future = asyncio.get_running_loop().run_in_executor(self._thread, call)
         try:
             await self._wait(future)
         except SourceUnavailableError:
-            future.add_done_callback(lambda late: late.exception())  # no caller waits for it any more
-            self._left = future
+            future.add_done_callback(
+                lambda late: late.exception()
+            )  # retrieved, because no caller waits for it any more
+            self._hung_call = future
             raise
         return future.result()
 
     async def _wait(self, future: asyncio.Future[T]) -> None:
-        """Wait for the bus; raises SourceUnavailableError if it hangs."""
-        done, _ = await asyncio.wait({future}, timeout=self._hung_s)
-        if not done:
-            raise SourceUnavailableError(f"the bus has not answered for {self._hung_s:g} s")
-
-    def _find(self) -> _Chip:
-        """Find the chip, in the thread."""
-        told = self._settings
-        voltage, current = (find_channel(name, told.chip, self._root) for name in (told.voltage, told.current))
-        temperature = find_channel(told.temperature, told.chip, self._root) if told.temperature else None
-        amperes = told.current_scale * self._amperes(current)
-        return _Chip(voltage, current, temperature, amperes, told.interval_s or self._own_interval_s())
-
-    def _amperes(self, current: Channel) -> float:
-        """Return amperes per unit of the channel, by the shunt.
+        """Wait for a call.
 
         Raises:
-            SourceUnavailableError: Neither the settings nor the driver define it.
+            SourceUnavailableError: The bus has not answered in time.
+        """
+        done, _ = await asyncio.wait({future}, timeout=self._read_timeout_s)
+        if not done:
+            raise SourceUnavailableError(f"the bus has not answered for {self._read_timeout_s:g} s")
+
+    def _find_channels(self) -> _Channels:
+        """Find the channels of the chip; runs in the thread."""
+        settings = self._settings
+        voltage, current = (
+            find_channel(name, settings.chip, self._root) for name in (settings.voltage, settings.current)
+        )
+        temperature = find_channel(settings.temperature, settings.chip, self._root) if settings.temperature else None
+        amperes_per_unit = settings.current_scale * self._amperes_per_unit(current)
+        return _Channels(
+            voltage, current, temperature, amperes_per_unit, settings.interval_s or self._chip_interval_s()
+        )
+
+    def _amperes_per_unit(self, current: Channel) -> float:
+        """Return the current per unit of the channel, from the shunt.
+
+        Raises:
+            SourceUnavailableError: Neither the settings nor the driver define the shunt.
         """
         shunt_ohm = self._settings.shunt_ohm
         if current.kind == "in":
             if shunt_ohm is None:
-                raise SourceUnavailableError(f"{current.path}: a voltage; tell by source.shunt_ohm over which shunt")
+                raise SourceUnavailableError(
+                    f"{current.path}: a voltage; set source.shunt_ohm to the resistance of its shunt"
+                )
             return 1.0 / shunt_ohm
         if shunt_ohm is None:
             return 1.0
-        taken = current.path.with_name("shunt_resistor")
+        driver_shunt = current.path.with_name("shunt_resistor")
         try:
-            return 1e-6 * read_number(taken) / shunt_ohm
-        except (OSError, JunkError) as error:
+            return 1e-6 * read_number(driver_shunt) / shunt_ohm
+        except (OSError, NotANumberError) as error:
             raise SourceUnavailableError(
-                f"{taken}: {_why(error)}: nobody knows which shunt the driver takes; tell the ratio by "
-                "source.current_scale, without source.shunt_ohm"
+                f"{driver_shunt}: {_reason(error)}: the shunt that the driver assumes is unknown; set the ratio "
+                "source.current_scale instead of source.shunt_ohm"
             ) from None
 
-    def _own_interval_s(self) -> float:
-        """Return the chip's own interval, at least 0.1 s, else the default [s].
+    def _chip_interval_s(self) -> float:
+        """Return the update interval of the chip, at least 0.1 s; the default if the driver does not report one [s].
 
         Raises:
             SourceUnavailableError: The interval is longer than the estimator accepts without gaps.
         """
         try:
-            own_s = 1e-3 * read_number(find_chip(self._settings.chip, self._root) / "update_interval")
-        except (OSError, JunkError):
+            chip_interval_s = 1e-3 * read_number(find_chip(self._settings.chip, self._root) / "update_interval")
+        except (OSError, NotANumberError):
             return self._settings.period_s
-        if own_s > SILENT_PERIODS * self._settings.period_s:
+        if chip_interval_s > SILENT_PERIODS * self._settings.period_s:
             raise SourceUnavailableError(
-                f"the chip measures each {own_s:g} s only; say so by source.interval_s = {own_s:g}"
+                f"the chip measures only every {chip_interval_s:g} s; set source.interval_s = {chip_interval_s:g}"
             )
-        return max(own_s, MIN_INTERVAL_S)
+        return max(chip_interval_s, MIN_INTERVAL_S)
 
-    def _sample(self, chip: _Chip) -> bytes:
-        """Read a line in the thread; empty if voltage or current cannot be read now.
+    def _sample(self, chip: _Channels) -> bytes:
+        """Return the line of a sample; empty if voltage or current cannot be read now. Runs in the thread.
 
         Raises:
             OSError: The chip is gone.
         """
-        told, self._fault = self._settings, None
+        settings, self._fault = self._settings, None
         voltage, current = self._value(chip.voltage), self._value(chip.current)
         temperature_c = self._value(chip.temperature) if chip.temperature else None
         if voltage is None or current is None:
             return b""
         return sample_json_line(
-            told.voltage_scale * voltage + told.voltage_offset_v,
-            chip.amperes * current + told.current_offset_a,
+            settings.voltage_scale * voltage + settings.voltage_offset_v,
+            chip.amperes_per_unit * current + settings.current_offset_a,
             temperature_c=temperature_c,
         )
 
     def _value(self, channel: Channel) -> float | None:
-        """Read a value; None if it cannot be read now, which is counted.
+        """Read a value. If that fails now, count the fault and return None.
 
         Raises:
             OSError: The chip is gone.
         """
         try:
             return channel.read()
-        except JunkError as error:
+        except NotANumberError as error:
             self._counters["value_errors"] += 1
             self._fault = str(error)
         except OSError as error:
-            if error.errno in GONE:
+            if error.errno in REMOVED_ERRORS:
                 raise
             self._counters["read_errors"] += 1
-            self._fault = f"{channel.path}: {_why(error)}"
+            self._fault = f"{channel.path}: {_reason(error)}"
         return None
 
 
@@ -190,5 +208,5 @@ def producer(settings: Settings) -> LinuxSensor:
     return LinuxSensor(settings.source)
 
 
-def _why(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)

@@ -1,1 +1,1 @@
-"""Samples from readings that others publish over MQTT."""
+"""Samples from readings that other programs publish over MQTT."""

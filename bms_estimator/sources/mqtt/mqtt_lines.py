@@ -1,4 +1,4 @@
-"""``kind = "mqtt"``: readings that another program publishes."""
+"""``kind = "mqtt"``: readings that another program publishes to an MQTT broker."""
 
 import asyncio
 import itertools
@@ -21,25 +21,25 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 
-MAX_WAITING = 2000
-"""Maximum number of unread messages: a broker sends all retained messages of a wildcard at once."""
+MAX_QUEUED_MESSAGES = 2000
+"""Maximum number of unread messages. A broker sends all retained messages of a wildcard at once."""
 MAX_BYTES = 65_536
-"""Maximum size of a battery's message [bytes]."""
+"""Maximum size of a received message [bytes]."""
 
 log = structlog.get_logger(__name__)
 
 
-class MqttReports(LineProducer):
-    """Subscribes, polls the publisher if necessary, and assembles samples.
+class MqttProducer(LineProducer):
+    """Line producer that subscribes, polls the publisher if configured, and assembles samples.
 
     Args:
         settings: Topics and paths.
-        mqtt: The brokers, and what opens their doors.
-        connect: Makes a connection; over TCP when left out.
+        mqtt: URLs and credentials of the brokers.
+        connect: Connects to a broker; None: over TCP.
         monotonic: Monotonic clock [s].
 
     Raises:
-        UserError: A URL or a file of ``mqtt`` cannot be used.
+        UserError: A URL or a file in ``mqtt`` is not valid.
     """
 
     def __init__(
@@ -52,13 +52,15 @@ class MqttReports(LineProducer):
     ) -> None:
         check(mqtt)
         self._settings, self._monotonic = settings, monotonic
-        self._assembly = SampleAssembler(settings)
-        found = brokers(mqtt)
-        self._broker, self._brokers = found[0], itertools.cycle(found)
+        self._assembler = SampleAssembler(settings)
+        configured = brokers(mqtt)
+        self._broker, self._brokers = configured[0], itertools.cycle(configured)
         self._connect = connect or BrokerConnector(mqtt)
         self._conflicting = False
         self._lost: Counter[str] = Counter({"too_long": 0, "overflow": 0})
-        self._hello = ConnectOptions(f"bms-source-{secrets.token_hex(4)}", None, self._lose, MAX_WAITING, MAX_BYTES)
+        self._options = ConnectOptions(
+            f"bms-source-{secrets.token_hex(4)}", None, self._count_lost, MAX_QUEUED_MESSAGES, MAX_BYTES
+        )
 
     @property
     def name(self) -> str:
@@ -67,25 +69,25 @@ class MqttReports(LineProducer):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The assembly's; messages that were too long or arrived too fast."""
-        return {**self._assembly.counters, **self._lost}
+        """Counters of the assembler, and of messages that were too long or arrived too fast."""
+        return {**self._assembler.counters, **self._lost}
 
     @property
     def fault(self) -> str | None:
         """Fault of the assembler."""
-        return self._assembly.fault
+        return self._assembler.fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """Lines as samples are complete; each time the next broker is tried.
+        """Yield a line for each complete sample. Each call tries the next broker.
 
         Raises:
-            SourceUnavailableError: The broker cannot be reached, was lost, or denies the subscription.
+            SourceUnavailableError: The broker cannot be reached, its connection was lost, or it denies the subscription.
         """
         self._broker = next(self._brokers)
         try:
-            async with self._connect(self._broker, self._hello) as connection:
-                for topic, why in (await connection.subscribe(None, self._assembly.topics)).items():
-                    raise SourceUnavailableError(f"not allowed to read {topic}: {why}")
+            async with self._connect(self._broker, self._options) as connection:
+                for topic, reason in (await connection.subscribe(None, self._assembler.topics)).items():
+                    raise SourceUnavailableError(f"not allowed to read {topic}: {reason}")
                 yield CONNECTED
                 async for line in self._lines(connection):
                     yield line
@@ -95,33 +97,33 @@ class MqttReports(LineProducer):
     async def _lines(self, connection: Connection) -> AsyncGenerator[bytes, None]:
         """Yield the lines of a connection; raises ``BrokerConnectionError`` when it is lost."""
         receiving: asyncio.Future[ReceivedMessage] | None = None
-        asked_s = -float("inf")
+        poll_sent_s = -float("inf")
         try:
             while True:
                 now_s = self._monotonic()
-                if self._settings.ask and now_s - asked_s >= self._settings.ask_s:
-                    asked_s = now_s
-                    await self._ask(connection)
+                if self._settings.ask and now_s - poll_sent_s >= self._settings.ask_s:
+                    poll_sent_s = now_s
+                    await self._poll(connection)
                 receiving = receiving or asyncio.ensure_future(connection.receive())
-                await asyncio.wait({receiving}, timeout=self._wait_s(now_s, asked_s))
+                await asyncio.wait({receiving}, timeout=self._wait_s(now_s, poll_sent_s))
                 if receiving.done():
                     message, receiving = receiving.result(), None
-                    self._assembly.take(message.topic, message.payload, self._monotonic(), retained=message.retain)
+                    self._assembler.take(message.topic, message.payload, self._monotonic(), retained=message.retain)
                     self._log_conflict()
-                if line := self._assembly.line(self._monotonic()):
+                if line := self._assembler.line(self._monotonic()):
                     yield line
         finally:
             if receiving is not None:
                 receiving.cancel()
                 await asyncio.gather(receiving, return_exceptions=True)
 
-    def _wait_s(self, now_s: float, asked_s: float) -> float | None:
+    def _wait_s(self, now_s: float, poll_sent_s: float) -> float | None:
         """Return the time to wait for a message [s]; None without limit."""
-        ask_s = max(asked_s + self._settings.ask_s - now_s, 0.0) if self._settings.ask else None
-        return min((s for s in (ask_s, self._assembly.wait_s(now_s)) if s is not None), default=None)
+        poll_due_s = max(poll_sent_s + self._settings.ask_s - now_s, 0.0) if self._settings.ask else None
+        return min((s for s in (poll_due_s, self._assembler.wait_s(now_s)) if s is not None), default=None)
 
-    async def _ask(self, connection: Connection) -> None:
-        """Have the publisher speak."""
+    async def _poll(self, connection: Connection) -> None:
+        """Publish the messages that make the publisher report its values."""
         for topic, payload in self._settings.ask.items():
             message = Message(self._settings.substitute(topic), payload.encode(), 0, retain=False)
             refusal = await connection.publish(message)
@@ -129,8 +131,8 @@ class MqttReports(LineProducer):
                 raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.reason}")
 
     def _log_conflict(self) -> None:
-        """Log the first message of a second publisher, and its end."""
-        conflict = self._assembly.conflict
+        """Log the begin and the end of a conflict between two publishers."""
+        conflict = self._assembler.conflict
         if bool(conflict) == self._conflicting:
             return
         self._conflicting = bool(conflict)
@@ -139,25 +141,25 @@ class MqttReports(LineProducer):
         else:
             log.info("one publisher writes the topic again")
 
-    def _lose(self, kind: str, _topic: str) -> None:
+    def _count_lost(self, kind: str, _topic: str) -> None:
         self._lost[kind] += 1
 
 
-def producer(settings: Settings) -> MqttReports:
+def producer(settings: Settings) -> MqttProducer:
     """Make the line producer of ``[source]``.
 
     Raises:
-        UserError: There is no broker, or what opens its door cannot be used.
+        UserError: No broker is configured, or its URL or credentials are not valid.
     """
     source = settings.source
     assert isinstance(source, MqttSource)  # noqa: S101 - as KINDS has it
     if source.url is not None:
-        told = {"url": source.url, "username": source.username}
-        mqtt = MqttSettings(**told, password_file=source.password_file, ca_file=source.ca_file)
+        broker = {"url": source.url, "username": source.username}
+        mqtt = MqttSettings(**broker, password_file=source.password_file, ca_file=source.ca_file)
         try:
-            return MqttReports(source, mqtt)
+            return MqttProducer(source, mqtt)
         except UserError as error:
             raise UserError(str(error).replace("mqtt.", "source.", 1)) from None
     if settings.mqtt is None:
-        raise UserError("source.url: missing, and there is no [mqtt] whose broker could be meant")
-    return MqttReports(source, settings.mqtt)
+        raise UserError("source.url: missing, and there is no section [mqtt] with a broker to use instead")
+    return MqttProducer(source, settings.mqtt)

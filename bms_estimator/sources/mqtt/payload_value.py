@@ -10,53 +10,53 @@ from typing import Any
 from bms_estimator.model.decimal_text import number
 from bms_estimator.settings.mqtt_source import ValueLocation
 
-SHOWN = 40
+MAX_SHOWN_CHARACTERS = 40
 """Maximum number of characters of an invalid number that are shown."""
-MAX_CELLS = 400
-"""A path or topic may name no cell beyond."""
-CELL = re.compile(r"\{cell\}")
+MAX_CELL_NUMBER = 400
+"""Highest cell number in a path or topic."""
+CELL_PLACEHOLDER = re.compile(r"\{cell\}")
 
 
 class InvalidValueError(Exception):
-    """A payload without the quantity; the message gives the reason."""
+    """The payload has no valid value of the quantity; the message gives the reason."""
 
     kind = "no_number"
-    """Under which it is counted."""
+    """Name of the counter."""
 
 
 class MissingError(InvalidValueError):
-    """The payload is JSON without the path."""
+    """The payload is JSON, but the path does not exist in it."""
 
     kind = "missing"
 
 
 def cell_pattern(text: str) -> re.Pattern[str]:
     """Return the pattern of a topic or key with ``{cell}``; the cell's number is its only group."""
-    return re.compile(r"0*([0-9]{1,3})".join(map(re.escape, CELL.split(text))))
+    return re.compile(r"0*([0-9]{1,3})".join(map(re.escape, CELL_PLACEHOLDER.split(text))))
 
 
-def read_value(payload: bytes, place: ValueLocation, path: str) -> float:
-    """Read the quantity in SI units.
+def read_value(payload: bytes, location: ValueLocation, path: str) -> float:
+    """Return the quantity in SI units.
 
     Raises:
-        InvalidValueError: It is not there, or no finite number.
+        InvalidValueError: The payload has no such value, or it is not a finite number.
     """
-    return _si(_found(_parsed(payload, path), path), place)
+    return _si(_value_at(_parsed(payload, path), path), location)
 
 
-def read_cells(payload: bytes, place: ValueLocation, path: str) -> dict[int, float]:
-    """Cells by their numbers from 1.
+def read_cells(payload: bytes, location: ValueLocation, path: str) -> dict[int, float]:
+    """Return the cell voltages by cell number, beginning with 1.
 
-    From a list, or from the values of ``{cell}`` in the path. A cell that has no number is NaN.
+    The path leads to a list, or contains ``{cell}`` in place of the number. A cell without a valid value is NaN.
 
     Raises:
-        InvalidValueError: There are no cells.
+        InvalidValueError: No cell has a valid value.
     """
     found = dict(_cells(_parsed(payload, path), path))
     cells = {}
     for cell, value in found.items():
         try:
-            cells[cell] = _si(value, place)
+            cells[cell] = _si(value, location)
         except InvalidValueError:
             cells[cell] = math.nan
     if all(map(math.isnan, cells.values())):
@@ -67,36 +67,36 @@ def read_cells(payload: bytes, place: ValueLocation, path: str) -> dict[int, flo
 def _cells(value: Any, path: str) -> Iterator[tuple[int, Any]]:
     before, cell, after = path.partition("{cell}")
     if not cell:
-        listed = _found(value, path)
+        listed = _value_at(value, path)
         if not isinstance(listed, list):
             raise InvalidValueError(f"{path or 'payload'}: no list of cells: {_shown(listed)}")
-        yield from enumerate(listed[:MAX_CELLS], start=1)
+        yield from enumerate(listed[:MAX_CELL_NUMBER], start=1)
         return
     *above, begin = before.split(".")
     end, *below = after.split(".")
-    among = _found(value, ".".join(above))
-    keys = among if isinstance(among, dict) else ()
+    parent = _value_at(value, ".".join(above))
+    keys = parent if isinstance(parent, dict) else ()
     pattern = cell_pattern(f"{begin}{{cell}}{end}")
     for key in keys:
         match = pattern.fullmatch(key)
-        if match and 1 <= int(match[1]) <= MAX_CELLS:
-            yield int(match[1]), _found(among[key], ".".join(below))
+        if match and 1 <= int(match[1]) <= MAX_CELL_NUMBER:
+            yield int(match[1]), _value_at(parent[key], ".".join(below))
 
 
 def _parsed(payload: bytes, path: str) -> Any:
     try:
         text = payload.decode()
         return json.loads(text, parse_constant=str) if path else text
-    except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are one
+    except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are subclasses
         what = "no JSON" if path else "no text"
         raise InvalidValueError(f"{what}: {_shown(payload.decode('utf-8', 'replace'))}") from None
 
 
-def _found(value: Any, path: str) -> Any:
+def _value_at(value: Any, path: str) -> Any:
     """Return the value at a path.
 
     Raises:
-        MissingError: It leads nowhere.
+        MissingError: The path does not exist.
     """
     for key in path.split(".") if path else ():
         if isinstance(value, dict) and key in value:
@@ -108,23 +108,23 @@ def _found(value: Any, path: str) -> Any:
     return value
 
 
-def _si(value: Any, place: ValueLocation) -> float:
-    if place.unit == "iso":
+def _si(value: Any, location: ValueLocation) -> float:
+    if location.unit == "iso":
         return _epoch_s(value)
     try:
         found = number(value) if isinstance(value, str) else value
         if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
             raise InvalidValueError(f"no number: {_shown(value)}")
-        made = place.si(float(found))
+        value_si = location.si(float(found))
     except (ValueError, OverflowError):
         raise InvalidValueError(f"no number: {_shown(value)}") from None
-    if not math.isfinite(made):
+    if not math.isfinite(value_si):
         raise InvalidValueError(f"no number: {_shown(value)}")
-    return made
+    return value_si
 
 
 def _epoch_s(value: Any) -> float:
-    """Time of ISO 8601, without a zone in UTC [s since 1970]."""
+    """Convert an ISO 8601 time to s since 1970; a time without zone is UTC."""
     try:
         moment = datetime.fromisoformat(value)
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
@@ -134,4 +134,4 @@ def _epoch_s(value: Any) -> float:
 
 def _shown(value: Any) -> str:
     text = repr(value)
-    return text[:SHOWN] + ("..." if len(text) > SHOWN else "")
+    return text[:MAX_SHOWN_CHARACTERS] + ("..." if len(text) > MAX_SHOWN_CHARACTERS else "")

@@ -1,4 +1,7 @@
-"""Detection of two publishers on one topic. MQTT does not name the publisher, so values and times must show it."""
+"""Detection of two publishers on one topic.
+
+MQTT does not identify the publisher of a message. Two publishers are recognized from values and arrival times.
+"""
 
 import itertools
 from collections import deque
@@ -6,24 +9,24 @@ from collections.abc import Sequence
 from statistics import median, quantiles
 from typing import NamedTuple
 
-HISTORY = 64
-"""Number of remembered messages of a topic."""
+MAX_MESSAGES = 64
+"""Number of stored messages of a topic."""
 MIN_INTERVALS = 8
 """Minimum number of intervals for estimating the usual interval."""
 QUICK_FRACTION = 0.5
-"""A message is out of turn if it follows the previous one within this fraction of the usual interval."""
+"""A message is quick if it follows the previous one within this fraction of the usual interval."""
 MIN_RETURNS = 4
-"""Number of quick returns to an earlier value, among the remembered messages, that show two publishers."""
-GRID_FRACTION = 0.1
-"""Largest deviation of a publisher's interval, as a fraction of their median, when another publisher's message lies between."""
-BACK_FRACTION = 0.75
-"""Fraction of the jumps that must go back: a load that varies at random has fewer."""
-MIN_REPEATS = 0.25
-"""Fraction of messages without a jump that shows a publisher that does not only publish changes."""
+"""Minimum number of quick returns to an earlier value, among the stored messages, that shows two publishers."""
+MAX_INTERVAL_DEVIATION = 0.1
+"""Maximum deviation of one publisher's interval from the median of its intervals, as a fraction of the median."""
+MIN_RETURN_FRACTION = 0.75
+"""Minimum fraction of jumps that return to the previous value. A load that varies at random has fewer."""
+MIN_REPEAT_FRACTION = 0.25
+"""Minimum fraction of messages without a jump. It shows that a publisher does not publish changes only."""
 MAX_SPREAD = 0.5
 """Largest interquartile range of a publisher's intervals, as a fraction of their median."""
 MIN_JUMPS = {"voltage": 0.01, "current": 0.2}
-"""Smallest difference between two publishers, as a fraction of the larger value."""
+"""Minimum difference between the values of two publishers, as a fraction of the larger value, by quantity."""
 SAME_FRACTION = 0.2
 """Two values belong to one publisher if they differ by less than this fraction of the jump between the two publishers."""
 
@@ -32,7 +35,7 @@ class _Message(NamedTuple):
     """A message.
 
     Attributes:
-        is_back: The value returned to that before the last jump.
+        is_back: The value jumped back to the value before the last jump.
         is_quick: It arrived sooner than one publisher would publish.
     """
 
@@ -47,24 +50,26 @@ class PublisherConflict:
     """Detects a second publisher of one quantity on one topic.
 
     Two publishers with different values make the value jump back and forth, and one of the two jumps arrives sooner
-    than one publisher would publish. A load that switches on and off jumps, too, but in step with its publisher. If a
-    publisher
-    sends changes only, such a load can look like two publishers; therefore values must also be repeated or regular.
+    than one publisher would publish. A load that switches on and off jumps, too, but in step with its publisher. If the
+    publisher sends changes only, such a load can look like two publishers. Therefore values must also repeat, or the
+    jumps must be regular.
 
     Args:
-        min_jump: Smallest difference between two publishers, as a fraction of the larger value.
+        min_jump: Minimum difference between the values of two publishers, as a fraction of the larger value.
         interval_s: Expected interval between messages [s].
     """
 
     def __init__(self, min_jump: float, interval_s: float) -> None:
         self._min_jump, self._interval_s = min_jump, interval_s
-        self._messages: deque[_Message] = deque(maxlen=HISTORY)
+        self._messages: deque[_Message] = deque(maxlen=MAX_MESSAGES)
         self._levels: tuple[float, float] | None = None  # before and after the last jump
 
     def take(self, value: float, now_s: float) -> bool:
-        """Take a value that arrived at ``now_s`` of the monotonic clock [s].
+        """Add a value; return True if there are two publishers.
 
-        Return whether there are two publishers.
+        Args:
+            value: Received value.
+            now_s: Monotonic clock [s].
         """
         message = _Message(value, now_s)
         if self._messages and self._is_jump(self._messages[-1].value, value):
@@ -73,47 +78,47 @@ class PublisherConflict:
             is_back = levels is not None and _is_back(levels, value)
             message = _Message(value, now_s, True, is_back, self._is_quick(now_s - before.at_s))
         self._messages.append(message)
-        return self._are_two
+        return self._has_two_publishers
 
     @property
     def text(self) -> str:
-        """The two values, for people."""
+        """The two values as text."""
         return " and ".join(f"{level:g}" for level in self._levels or ())
 
     @property
-    def _are_two(self) -> bool:
+    def _has_two_publishers(self) -> bool:
         jumps = [message for message in self._messages if message.is_jump]
-        backs = [message for message in jumps if message.is_back]
-        if self._quick_returns() < MIN_RETURNS or len(backs) < BACK_FRACTION * len(jumps):
+        returns = [message for message in jumps if message.is_back]
+        if self._quick_returns() < MIN_RETURNS or len(returns) < MIN_RETURN_FRACTION * len(jumps):
             return False
         repeats = len(self._messages) - len(jumps)
-        return repeats >= MIN_REPEATS * len(self._messages) or self._are_regular(jumps)
+        return repeats >= MIN_REPEAT_FRACTION * len(self._messages) or self._jumps_are_regular(jumps)
 
     def _quick_returns(self) -> int:
-        """Count quick returns to the more frequent value that arrive when its publisher was due anyway.
+        """Count quick returns to the more frequent value that arrive on the regular schedule of its publisher.
 
-        A publisher that also reports changes returns to its value between two of its regular messages.
+        A single publisher that also sends changes returns to its value between two regular messages instead.
         """
         messages, levels = list(self._messages), self._levels
         if levels is None:
             return 0
-        same = max(
+        frequent = max(
             (
                 [i for i, each in enumerate(messages) if _is_back((level, other), each.value)]
                 for level, other in (levels, levels[::-1])
             ),
             key=len,
         )
-        pairs = list(itertools.pairwise(same))
+        pairs = list(itertools.pairwise(frequent))
         usual_s = median([messages[j].at_s - messages[i].at_s for i, j in pairs] or [0.0])
         return sum(
             any(each.is_back and each.is_quick for each in messages[i + 1 : j + 1])
-            and abs(messages[j].at_s - messages[i].at_s - usual_s) < GRID_FRACTION * usual_s
+            and abs(messages[j].at_s - messages[i].at_s - usual_s) < MAX_INTERVAL_DEVIATION * usual_s
             for i, j in pairs
         )
 
-    def _are_regular(self, jumps: Sequence[_Message]) -> bool:
-        """Return whether every second jump arrives at the expected interval or faster, with little spread."""
+    def _jumps_are_regular(self, jumps: Sequence[_Message]) -> bool:
+        """Return True if every second jump arrives at the expected interval or faster, with little spread."""
         intervals_s = _intervals_s(jumps[::2])
         if len(intervals_s) < MIN_RETURNS:
             return False
@@ -124,9 +129,9 @@ class PublisherConflict:
         return abs(value - before) > self._min_jump * max(abs(value), abs(before))
 
     def _is_quick(self, interval_s: float) -> bool:
-        """Return whether a message arrived sooner than one publisher would publish.
+        """Return True if a message arrived sooner than one publisher would publish.
 
-        The upper quartile of the intervals stays that of one publisher while there are two.
+        The usual interval is the upper quartile, because a second publisher adds short intervals only.
         """
         intervals_s = _intervals_s(self._messages)
         if len(intervals_s) < MIN_INTERVALS:
@@ -139,6 +144,6 @@ def _intervals_s(messages: Sequence[_Message]) -> list[float]:
 
 
 def _is_back(levels: tuple[float, float], value: float) -> bool:
-    """Return whether a value is that before the last jump."""
+    """Return True if a value is close to the value before the last jump."""
     before, after = levels
     return abs(value - before) < SAME_FRACTION * abs(after - before)

@@ -1,4 +1,4 @@
-"""Assembly of one sample from several topics with their own times. Pure: the time is an argument."""
+"""Assembly of samples from values that arrive on several topics at different times. No I/O; time is an argument."""
 
 import math
 import re
@@ -7,21 +7,28 @@ from typing import NamedTuple
 
 from bms_estimator.protocols.base.reading import sample_json_line
 from bms_estimator.settings.mqtt_source import MqttSource, ValueLocation
-from bms_estimator.sources.mqtt.payload_value import MAX_CELLS, InvalidValueError, cell_pattern, read_cells, read_value
+from bms_estimator.sources.mqtt.payload_value import (
+    MAX_CELL_NUMBER,
+    InvalidValueError,
+    cell_pattern,
+    read_cells,
+    read_value,
+)
 from bms_estimator.sources.mqtt.publisher_conflict import MIN_JUMPS, PublisherConflict
 
 NEEDED = ("voltage", "current")
+"""Quantities without which there is no sample."""
 
 
 class _TopicBinding(NamedTuple):
     """A topic of a quantity."""
 
     quantity: str
-    place: ValueLocation
+    location: ValueLocation
     path: str
     topic: str
     pattern: re.Pattern[str]
-    """Pattern of the topic; with a group for the cell's number, if it has one."""
+    """Pattern of the topic. Its group, if any, is the cell number."""
 
 
 class _TimestampedValue(NamedTuple):
@@ -32,74 +39,79 @@ class _TimestampedValue(NamedTuple):
 
 
 class SampleAssembler:
-    """Takes messages, gives lines.
+    """Assembler of lines, one for each sample, from MQTT messages.
 
-    A sample is complete when voltage and current have arrived, or one of them has and the other has not within
-    ``settle_s``: some publishers send only changes. That one counts for ``max_age_s``.
+    A sample is complete when voltage and current have arrived. If only one of them arrives within ``settle_s``, the
+    last value of the other is used up to ``max_age_s``, because some publishers send only changes.
     Retained messages are rejected, because their age is unknown.
     """
 
     def __init__(self, settings: MqttSource) -> None:
         self._settings = settings
-        self._ways = [
-            _TopicBinding(quantity, place, settings.substitute(place.path), topic, cell_pattern(topic))
-            for quantity, place in settings.places()
-            for topic in settings.topics(place)
+        self._bindings = [
+            _TopicBinding(quantity, location, settings.substitute(location.path), topic, cell_pattern(topic))
+            for quantity, location in settings.places()
+            for topic in settings.topics(location)
         ]
         self._availability = settings.substitute(settings.availability_topic or "")
         self._offline = ""  # latest status from the publisher or its last will
-        self._told: dict[str, _TimestampedValue] = {}
+        self._values: dict[str, _TimestampedValue] = {}
         self._cells: dict[int, _TimestampedValue] = {}
         self._faults: dict[str, str] = {}  # latest error of each quantity
-        self._new: dict[str, float] = {}  # voltage and current received since the last sample, with their times
+        self._unused: dict[str, float] = {}  # arrival times of voltage and current since the last sample
         self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
         self._detectors = {
-            (way.quantity, way.topic): PublisherConflict(MIN_JUMPS[way.quantity], settings.interval_s)
-            for way in self._ways
-            if way.quantity in NEEDED
+            (binding.quantity, binding.topic): PublisherConflict(MIN_JUMPS[binding.quantity], settings.interval_s)
+            for binding in self._bindings
+            if binding.quantity in NEEDED
         }
         self._conflicts: dict[tuple[str, str], str] = {}  # by quantity and topic
 
     @property
     def topics(self) -> list[str]:
-        """Return the topics to subscribe to without those that another one covers, which some brokers would deliver twice."""
-        topics = [way.topic for way in self._ways] + ([self._availability] if self._availability else [])
+        """Topic filters to subscribe to.
+
+        A filter that another one covers is omitted, because some brokers would deliver its messages twice.
+        """
+        topics = [binding.topic for binding in self._bindings] + ([self._availability] if self._availability else [])
         filters = list(dict.fromkeys(_filter(topic) for topic in topics))
         return [topic for topic in filters if not any(_covers(other, topic) for other in filters if other != topic)]
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Retained messages, payloads without the quantity or without a number; samples that lacked one of two.
+        """Number of faults since start, by kind.
 
-        ``publisher_errors`` counts messages on a topic while two publishers write there.
+        ``retained`` counts retained messages, ``missing`` payloads without the quantity, ``no_number`` payloads without
+        a number, ``stale`` samples without a recent voltage or current, and ``publisher_errors`` messages on a topic to
+        which two publishers write.
         """
         return self._counters
 
     @property
     def conflict(self) -> str:
-        """Topics on which two publishers write, with the two values, as text for people; empty without a conflict."""
+        """Topics on which two publishers write, with the two values, as text; empty without a conflict."""
         return "; ".join(self._conflicts.values())
 
     @property
     def fault(self) -> str | None:
         """Reason why no sample is complete; None if unknown."""
         if self._offline:
-            return f"the publisher says {self._offline} on {self._availability}"
-        wrong = [fault for name in NEEDED if (fault := self._faults.get(name))]
-        if wrong:
-            return "; ".join(wrong)
-        if not self._told:
-            kept = ", but what the broker has kept from earlier" if self._counters["retained"] else ""
-            return f"nothing comes on {', '.join(dict.fromkeys(self._topics_of(*NEEDED)))}{kept}"
-        absent = [name for name in NEEDED if name not in self._told]
-        return f"{absent[0]}: nothing comes on {', '.join(self._topics_of(absent[0]))}" if absent else None
+            return f"the publisher reports {self._offline} on {self._availability}"
+        errors = [fault for name in NEEDED if (fault := self._faults.get(name))]
+        if errors:
+            return "; ".join(errors)
+        if not self._values:
+            retained = " but retained messages" if self._counters["retained"] else ""
+            return f"no message on {', '.join(dict.fromkeys(self._topics_of(*NEEDED)))}{retained}"
+        absent = [name for name in NEEDED if name not in self._values]
+        return f"{absent[0]}: no message on {', '.join(self._topics_of(absent[0]))}" if absent else None
 
     def wait_s(self, now_s: float) -> float | None:
-        """Return the time until a sample is complete without another message [s]; None if it needs one."""
-        return max(min(self._new.values()) + self._settings.settle_s - now_s, 0.0) if self._new else None
+        """Return the time until a sample is complete without a further message [s]; None if one is needed."""
+        return max(min(self._unused.values()) + self._settings.settle_s - now_s, 0.0) if self._unused else None
 
     def take(self, topic: str, payload: bytes, now_s: float, *, retained: bool) -> None:
-        """Take a message.
+        """Store the values of a message.
 
         Args:
             topic: Topic of the message.
@@ -111,32 +123,32 @@ class SampleAssembler:
             text = payload.decode("utf-8", "replace").strip()
             self._offline = text[:80] if "offline" in text.lower() else ""
             return
-        ways = [(way, match) for way in self._ways if (match := way.pattern.fullmatch(topic))]
+        bindings = [(binding, match) for binding in self._bindings if (match := binding.pattern.fullmatch(topic))]
         if retained:
-            self._counters["retained"] += bool(ways)
+            self._counters["retained"] += bool(bindings)
             return
         conflict = False
-        for way, match in ways:
+        for binding, match in bindings:
             cell = int(match[1]) if match.re.groups else None
             try:
-                self._put(way, payload, cell, now_s)
+                self._store_value(binding, payload, cell, now_s)
             except InvalidValueError as error:
-                self._drop(way.quantity, cell)
+                self._remove(binding.quantity, cell)
                 self._counters[error.kind] += 1
-                self._faults[way.quantity] = f"{way.quantity}: {topic}: {error}"
+                self._faults[binding.quantity] = f"{binding.quantity}: {topic}: {error}"
             else:
-                self._faults.pop(way.quantity, None)
-                conflict |= self._has_conflict(way, now_s)
+                self._faults.pop(binding.quantity, None)
+                conflict |= self._has_conflict(binding, now_s)
         self._counters["publisher_errors"] += conflict
 
     def line(self, now_s: float) -> bytes:
-        """Return the line of a complete sample; None without one."""
-        if not self._new or (len(self._new) < len(NEEDED) and (self.wait_s(now_s) or 0.0) > 0.0):
+        """Return the line of a complete sample; empty without one."""
+        if not self._unused or (len(self._unused) < len(NEEDED) and (self.wait_s(now_s) or 0.0) > 0.0):
             return b""
-        self._new.clear()
+        self._unused.clear()
         voltage_v, current_a = (self._value(name, now_s, self._settings.max_age_s) for name in NEEDED)
         if voltage_v is None or current_a is None:
-            self._miss("current" if current_a is None else "voltage")
+            self._count_stale("current" if current_a is None else "voltage")
             return b""
         return sample_json_line(
             voltage_v,
@@ -146,62 +158,65 @@ class SampleAssembler:
             time_s=self._value("time", now_s, self._settings.settle_s),
         )
 
-    def _put(self, way: _TopicBinding, payload: bytes, cell: int | None, now_s: float) -> None:
+    def _store_value(self, binding: _TopicBinding, payload: bytes, cell: int | None, now_s: float) -> None:
         """Store the values of a payload.
 
         Raises:
-            InvalidValueError: Nothing.
+            InvalidValueError: The payload has no valid value; nothing is stored.
         """
-        if way.quantity != "cells":
-            self._told[way.quantity] = _TimestampedValue(read_value(payload, way.place, way.path), now_s)
-            if way.quantity in NEEDED:
-                self._new.setdefault(way.quantity, now_s)
+        if binding.quantity != "cells":
+            self._values[binding.quantity] = _TimestampedValue(
+                read_value(payload, binding.location, binding.path), now_s
+            )
+            if binding.quantity in NEEDED:
+                self._unused.setdefault(binding.quantity, now_s)
         elif cell is None:
             self._cells |= {
-                number: _TimestampedValue(v, now_s) for number, v in read_cells(payload, way.place, way.path).items()
+                number: _TimestampedValue(v, now_s)
+                for number, v in read_cells(payload, binding.location, binding.path).items()
             }
-        elif 1 <= cell <= MAX_CELLS:
-            self._cells[cell] = _TimestampedValue(read_value(payload, way.place, way.path), now_s)
+        elif 1 <= cell <= MAX_CELL_NUMBER:
+            self._cells[cell] = _TimestampedValue(read_value(payload, binding.location, binding.path), now_s)
 
-    def _drop(self, quantity: str, cell: int | None) -> None:
-        """Forget a quantity that is no longer measured; ``cell`` None: all cells."""
-        self._told.pop(quantity, None)
-        self._new.pop(quantity, None)
+    def _remove(self, quantity: str, cell: int | None) -> None:
+        """Remove the stored value of a quantity; for cells that of one cell, or of all if ``cell`` is None."""
+        self._values.pop(quantity, None)
+        self._unused.pop(quantity, None)
         if quantity == "cells":
-            gone = tuple(self._cells) if cell is None else (cell,)
-            for each in gone:
+            removed = tuple(self._cells) if cell is None else (cell,)
+            for each in removed:
                 self._cells.pop(each, None)
 
-    def _has_conflict(self, way: _TopicBinding, now_s: float) -> bool:
-        """Return whether two publishers write the latest value on this topic."""
-        key = way.quantity, way.topic
+    def _has_conflict(self, binding: _TopicBinding, now_s: float) -> bool:
+        """Return True if two publishers write to this topic, by its latest value."""
+        key = binding.quantity, binding.topic
         detector = self._detectors.get(key)
-        if detector is None or not detector.take(self._told[way.quantity].value, now_s):
+        if detector is None or not detector.take(self._values[binding.quantity].value, now_s):
             self._conflicts.pop(key, None)
             return False
-        self._conflicts[key] = f"{way.topic}: {way.quantity} {detector.text}"
+        self._conflicts[key] = f"{binding.topic}: {binding.quantity} {detector.text}"
         return True
 
-    def _miss(self, name: str) -> None:
+    def _count_stale(self, name: str) -> None:
         """Count a sample that lacks voltage or current."""
         self._counters["stale"] += 1
-        if name in self._told:
+        if name in self._values:
             topics = ", ".join(self._topics_of(name))
-            self._faults.setdefault(name, f"{name}: nothing on {topics} for {self._settings.max_age_s:g} s")
+            self._faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.max_age_s:g} s")
 
-    def _value(self, name: str, now_s: float, most_s: float) -> float | None:
-        """Return a value unless it is older than ``most_s``."""
-        told = self._told.get(name)
-        return told.value if told and now_s - told.at_s <= most_s else None
+    def _value(self, name: str, now_s: float, max_age_s: float) -> float | None:
+        """Return a value unless it is older than ``max_age_s``."""
+        stored = self._values.get(name)
+        return stored.value if stored and now_s - stored.at_s <= max_age_s else None
 
     def _cells_v(self, now_s: float) -> list[float]:
-        """Return the cells from the first to the last recent one; NaN for those in between without a recent value."""
-        most_s = self._settings.slow_max_age_s
-        fresh = {cell: told.value for cell, told in self._cells.items() if now_s - told.at_s <= most_s}
+        """Return the voltages from cell 1 to the last cell with a recent value [V]; NaN for a cell without one."""
+        max_age_s = self._settings.slow_max_age_s
+        fresh = {cell: stored.value for cell, stored in self._cells.items() if now_s - stored.at_s <= max_age_s}
         return [fresh.get(cell, math.nan) for cell in range(1, max(fresh, default=0) + 1)]
 
     def _topics_of(self, *quantities: str) -> list[str]:
-        return [way.topic for way in self._ways if way.quantity in quantities]
+        return [binding.topic for binding in self._bindings if binding.quantity in quantities]
 
 
 def _filter(topic: str) -> str:

@@ -10,7 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
-from bms_estimator.protocols.base.polled_protocol import GAP_S, PACE_S, UNANSWERED_ROUNDS, PolledProtocol
+from bms_estimator.protocols.base.polled_protocol import (
+    MAX_UNANSWERED_CYCLES,
+    POLL_CYCLE_S,
+    QUERY_INTERVAL_S,
+    PolledProtocol,
+)
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.daly import sealed
 from bms_estimator.protocols.registry import make_protocol
@@ -131,7 +136,7 @@ def test_an_answer_that_claims_to_be_longer_than_any_holds_up_nothing() -> None:
         device = decoder(protocol)
         fed(device, long)
         assert device.counters["length_errors"] == 1
-        assert "impossible lengths" in (device.fault or "")
+        assert "invalid lengths" in (device.fault or "")
         assert fed(device, PUBLISHED[protocol if protocol != "jk" else "jk_old"].frames)[0].size == 1
 
 
@@ -247,7 +252,7 @@ def test_of_several_packs_on_a_line_the_first_or_the_one_that_was_told_is_taken(
     assert first.counters["other_packs"] == told.counters["other_packs"] == 2
     only = decoder("jk", address=5)
     fed(only, two)
-    assert only.fault == "pack 0 answers, and pack 5 is wanted: see sensor.address"
+    assert only.fault == "pack 0 responds, but pack 5 is selected: see sensor.address"
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -281,7 +286,7 @@ def questions(device: PolledProtocol, seconds: float, answer: bytes = b"") -> li
 @pytest.mark.parametrize("name", ["jbd", "daly", "jk_old"])
 def test_a_device_that_answers_is_asked_once_a_second_and_one_that_is_silent_again_and_again(name: str) -> None:
     asked = questions(decoder(OF[name]), 20.0, A_ROUND[name])
-    assert min(np.diff([at_s for at_s, _ in asked])) >= GAP_S
+    assert min(np.diff([at_s for at_s, _ in asked])) >= QUERY_INTERVAL_S
     assert [question for _, question in asked].count(asked[-1][1]) == 20
     assert len(questions(decoder(OF[name]), 20.0)) >= 20
 
@@ -302,7 +307,7 @@ def test_what_may_be_another_pack_is_asked_anew_how_many_cells_it_has() -> None:
 
 def test_silence_makes_it_try_the_other_ways_of_asking() -> None:
     asked = [question for _, question in questions(decoder("jk"), 20.0)]
-    assert asked[: UNANSWERED_ROUNDS + 1] == [jk.OLD_QUESTION] * (UNANSWERED_ROUNDS + 1)
+    assert asked[: MAX_UNANSWERED_CYCLES + 1] == [jk.OLD_QUESTION] * (MAX_UNANSWERED_CYCLES + 1)
     assert {jk.question(1), jk.question(0)} < set(asked)
     assert {question for _, question in questions(decoder("jk", address=7), 20.0)} == {
         jk.OLD_QUESTION,
@@ -313,7 +318,7 @@ def test_silence_makes_it_try_the_other_ways_of_asking() -> None:
 
 def test_the_way_that_is_answered_is_kept_to() -> None:
     device = decoder("jk")
-    questions(device, (UNANSWERED_ROUNDS + 1.5) * PACE_S)
+    questions(device, (MAX_UNANSWERED_CYCLES + 1.5) * POLL_CYCLE_S)
     answered = [device.next_output(100.0 + tick) for tick in range(20) if device.feed(100.0 + tick, newer(1)).size]
     assert set(answered) == {jk.question(1)}
 

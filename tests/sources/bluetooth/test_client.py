@@ -57,5 +57,5 @@ async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeyp
 
 
 def test_a_bms_that_nobody_knows() -> None:
-    with pytest.raises(UserError, match=r"source\.bms = 'jbdd': aiobmsble knows abc, .*jbd"):
+    with pytest.raises(UserError, match=r"source\.bms = 'jbdd': aiobmsble supports abc, .*jbd"):
         producer(address=bluez.ADDRESS, bms="jbdd")

@@ -10,7 +10,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.bluetooth.bms_sample import reading_of
-from bms_estimator.sources.bluetooth.source import NEEDED_PYTHON
+from bms_estimator.sources.bluetooth.source import MIN_PYTHON_HEX
 from bms_estimator.sources.factory import open_line_source
 
 
@@ -75,7 +75,7 @@ def test_settings_that_cannot_be(told: dict[str, object]) -> None:
         Settings.model_validate({"source": {"kind": "ble"} | told})
 
 
-@pytest.mark.skipif(sys.hexversion >= NEEDED_PYTHON, reason="this Python is new enough")
+@pytest.mark.skipif(sys.hexversion >= MIN_PYTHON_HEX, reason="this Python is new enough")
 def test_an_old_python_is_told_what_is_needed() -> None:
     with pytest.raises(UserError, match=r"needs Python 3\.12 or newer; this is 3\."):
         open_line_source(Settings.model_validate({"source": {"kind": "ble", "name": "a"}}))

@@ -70,7 +70,7 @@ def test_a_disk_that_hangs_holds_nobody_up_and_has_all_in_order_at_the_end(tmp_p
 
 def test_a_disk_that_stays_behind_ends_the_recording_and_what_was_missed_is_counted(tmp_path: Path, disk: Disk) -> None:
     disk.works.clear()
-    with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(), waiting_reads=10) as recording:
+    with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(), max_queued_chunks=10) as recording:
         give(recording)
         disk.works.set()
     kept = recorded(tmp_path / "line.bms")
@@ -132,7 +132,7 @@ import sys, threading
 from pathlib import Path
 from bms_estimator.sources.captures import raw_capture, recorder
 
-recorder.END_S = 0.01
+recorder.SHUTDOWN_TIMEOUT_S = 0.01
 raw_capture.CaptureWriter.write = lambda *_: threading.Event().wait()
 with recorder.CaptureRecorder(Path(sys.argv[1]), raw_capture.CaptureHeader()) as recorded:
     recorded.write(0.0, b"3.7,0.1\\n")

@@ -22,7 +22,9 @@ EIO = Path("/proc/self/mem")
 
 
 def sensor(root: Path, **settings: Any) -> LinuxSensor:
-    return LinuxSensor(LinuxSource.model_validate({"kind": "linux", "interval_s": 0.01} | settings), root, hung_s=0.05)
+    return LinuxSensor(
+        LinuxSource.model_validate({"kind": "linux", "interval_s": 0.01} | settings), root, read_timeout_s=0.05
+    )
 
 
 async def first(lines: AsyncGenerator[bytes, None]) -> Reading:
@@ -87,11 +89,11 @@ async def test_an_ads1115_over_a_divider_and_a_shunt_and_another_chip_for_the_te
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"chip": "ina228"}, "ina228: no such chip in hwmon or iio; there: ina219, ina226. Is its driver loaded?"),
-        ({"chip": "ina219"}, "ina219: there are 2 (1-0041, 1-0042); name one by its place on the bus"),
+        ({"chip": "ina228"}, "ina228: no such chip in hwmon or iio; present: ina219, ina226. Is its driver loaded?"),
+        ({"chip": "ina219"}, "ina219: 2 chips have this name (1-0041, 1-0042); set the bus address of one of them"),
         ({"chip": "/nowhere"}, "/nowhere: no such folder; is the driver loaded?"),
         ({"current": "curr2_input"}, "curr2_input: no such file; the chip has curr1_input, in0_input, in1_input"),
-        ({"current": "in0_input"}, "in0_input: a voltage; tell by source.shunt_ohm over which shunt"),
+        ({"current": "in0_input"}, "in0_input: a voltage; set source.shunt_ohm to the resistance of its shunt"),
         (
             {"chip": "1-0041", "shunt_ohm": 0.1},
             "tell the ratio by source.current_scale, without source.shunt_ohm",
@@ -175,6 +177,6 @@ def test_it_is_polled_as_fast_as_the_chip_is_set_but_not_faster_than_anybody_nee
 
 async def test_a_chip_slower_than_it_is_taken_for_says_what_to_set(tmp_path: Path):
     hwmon(tmp_path, **INA226 | {"update_interval": "17000"})
-    with pytest.raises(SourceUnavailableError, match=r"measures each 17 s only; .*source\.interval_s = 17$"):
+    with pytest.raises(SourceUnavailableError, match=r"measures only every 17 s; .*source\.interval_s = 17$"):
         await first(sensor(tmp_path, interval_s=None).iter_lines())
     assert await first(sensor(tmp_path, interval_s=17.0).iter_lines())

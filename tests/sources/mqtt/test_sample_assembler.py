@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.mqtt.payload_value import MAX_CELLS, InvalidValueError, read_cells, read_value
+from bms_estimator.sources.mqtt.payload_value import MAX_CELL_NUMBER, InvalidValueError, read_cells, read_value
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 
 Messages = list[tuple[str, str]]
@@ -206,16 +206,16 @@ def test_paths_units_scales_and_times(where: dict[str, Any], payload: str, sampl
 
 def test_a_pack_with_as_many_cells_as_are_taken_is_a_sample_of_the_dialect() -> None:
     assembly, decoder = SampleAssembler(own(cells="c")), TextProtocol()
-    payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELLS})
+    payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELL_NUMBER})
     assembly.take("home/pack", payload.encode(), 0.0, retained=False)
     assert decoder.feed(0.0, assembly.line(0.0)).size == 1
-    assert decoder.cells.shape == (1, MAX_CELLS)
+    assert decoder.cells.shape == (1, MAX_CELL_NUMBER)
 
 
 def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ever() -> None:
     assembly = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
     assert told(assembly, [("v", "52")]) == []
-    assert assembly.fault == "current: nothing comes on i"
+    assert assembly.fault == "current: no message on i"
     assert told(assembly, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
     assembly.take("i", b"2", 20.0, retained=False)
     assert assembly.line(20.4) == b""
@@ -224,7 +224,7 @@ def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ev
     assert assembly.wait_s(20.5) is None
     assert told(assembly, [("i", "3")], 40.0) == []
     assert assembly.counters["stale"] == 2
-    assert assembly.fault == "voltage: nothing on v for 30 s"
+    assert assembly.fault == "voltage: no message on v for 30 s"
     assert told(assembly, [("v", "50")], 41.0) == [{"voltage_v": 50.0, "current_a": 3.0}]
     assert assembly.fault is None
 
@@ -241,9 +241,9 @@ def test_what_the_broker_had_kept_is_not_taken() -> None:
     assembly = SampleAssembler(own(availability_topic="home/status"))
     assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
     assert assembly.counters["retained"] == 1
-    assert assembly.fault == "nothing comes on home/pack, but what the broker has kept from earlier"
+    assert assembly.fault == "no message on home/pack but retained messages"
     told(assembly, [("home/status", "offline")], retained=True)
-    assert assembly.fault == "the publisher says offline on home/status"
+    assert assembly.fault == "the publisher reports offline on home/status"
     told(assembly, [("home/status", '{"state":"online"}')])
     assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
     assert assembly.fault is None

@@ -108,7 +108,7 @@ async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -
     source = SerialSource(SensorSettings(port="auto", sample_rate_hz=50), first_retry_s=0.05)
     async with taken(source, blocks):
         async with plugged_in(auto, serial=1):
-            await until(lambda: source._door.serial)
+            await until(lambda: source._board_check.serial)
         await until(lambda: source.message)
         async with plugged_in(auto, serial=2, voltage_v=11.1):
             await until(lambda: source.message and "refused" in source.message)
@@ -125,7 +125,7 @@ async def test_auto_says_what_comes_in_place_of_its_own_board(auto: Path) -> Non
     source = SerialSource(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
     async with taken(source, []):
         async with plugged_in(auto, serial=1):
-            await until(lambda: source._door.serial)
+            await until(lambda: source._board_check.serial)
         await until(lambda: source.message)
         with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, linked(auto, other.path):
             task = asyncio.create_task(other.run())

@@ -111,7 +111,7 @@ async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(lin
         try:
             await until(lambda: source.message and "no frame yet" in source.message)
             line.write(ours.hello() + b"".join(ours.frames(10)))
-            await until(lambda: source._door.serial)
+            await until(lambda: source._board_check.serial)
             heard = line.received()
             line.write(b"".join(other.frames(10)))
 
@@ -146,7 +146,7 @@ def test_nothing_of_a_board_that_was_refused_passes_before_the_port_is_opened_an
     frame = other.frames(1)[0]
     assert door.accept((BEGIN_S, frame), dialect) == ()
     assert door.unadmitted_bytes == len(other.hello() + frame)
-    door.opened()
+    door.on_port_opened()
     assert len(door.accept((BEGIN_S, own.hello()), dialect)) == 1
 
 
@@ -154,12 +154,12 @@ def test_each_byte_of_a_board_that_is_not_known_yet_passes_once_or_is_counted() 
     board = Running(1, 6.1)
     door, dialect = door_of_ours()
     reads = [(BEGIN_S, frame) for frame in board.frames(MAX_PENDING_READS + 5)]
-    door.opened()
+    door.on_port_opened()
     assert not any(door.accept(read, dialect) for read in reads[:7])
-    door.opened()  # the port was lost
+    door.on_port_opened()  # the port was lost
     assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7])
     assert not any(door.accept(read, dialect) for read in reads)
     hello = BEGIN_S, board.hello()
     assert door.accept(hello, dialect) == [*reads[6:], hello]
-    door.opened()
+    door.on_port_opened()
     assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])

@@ -49,7 +49,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     there.mkdir()
     monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path)) for path in there.iterdir()])
     monkeypatch.setattr(port_list, "BY_ID", tmp_path / "by-id")
-    monkeypatch.setattr(serial_source, "TALK_S", 0.02)
+    monkeypatch.setattr(serial_source, "SEND_INTERVAL_S", 0.02)
     return there
 
 
@@ -111,9 +111,7 @@ async def test_another_board_on_the_named_port_is_refused_after_a_restart(folder
         await remembered(memory, "00000001")
     async with source(port, memory) as taken, board(port, serial=2, voltage_v=OTHERS_V):
         await until(lambda: taken.message and "refused" in taken.message)
-        said = (
-            f"{port}: refused: board 00000002 is not the pack's, 00000001: plug that in, or, if it takes its place, run"
-        )
+        said = f"{port}: refused: board 00000002 is not the pack's, 00000001: connect that one, or, to use this board instead, run"
         assert said in (taken.message or "")
         assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (taken.message or "")
         await until(lambda: taken.counters["reconnects"] >= 1)
@@ -124,7 +122,7 @@ async def test_another_board_on_the_named_port_is_refused_within_a_run(folder: P
     port = folder / "ttyUSB0"
     async with source(port) as taken:
         async with board(port):
-            await until(lambda: taken._door.serial)
+            await until(lambda: taken._board_check.serial)
         await until(lambda: taken.message)
         async with board(port, serial=2, voltage_v=OTHERS_V):
             await until(lambda: taken.message and "refused" in taken.message)
@@ -163,7 +161,7 @@ async def test_a_board_that_takes_the_place_of_another_behind_the_same_adapter_i
     """The port stays: nothing but the hello tells."""
     port = folder / "ttyUSB0"
     async with source(port) as taken, board(port) as virtual:
-        await until(lambda: taken._door.serial)
+        await until(lambda: taken._board_check.serial)
         virtual._kept[20] = 2
         virtual._converter = VirtualBoard(lambda _: Reading(0.5, 1.0), parts=BoardParts(divider=9.0))._converter
         virtual.reset()
@@ -175,7 +173,7 @@ async def test_a_board_back_under_another_name_is_found(folder: Path, memory: Kn
     port = folder / "ttyUSB0"
     async with source(port, memory) as taken:
         async with board(port):
-            await until(lambda: taken._door.serial)
+            await until(lambda: taken._board_check.serial)
         await until(lambda: taken.message)
         seen = len(taken.blocks)
         async with board(folder / "ttyUSB1", serial=2, voltage_v=OTHERS_V), board(folder / "ttyUSB2"):
@@ -227,7 +225,7 @@ async def test_the_search_writes_nothing_to_a_silent_device_and_leaves_it(folder
     os.set_blocking(master, False)
     try:
         async with source(folder / "gone", serial="00000001") as taken:
-            await until(lambda: taken._where._left)
+            await until(lambda: taken._discovery._skipped)
             async with board(folder / "ttyUSB1"):
                 await until(lambda: taken.blocks)
         with pytest.raises(BlockingIOError):
@@ -319,8 +317,8 @@ async def test_a_board_that_prints_text_is_taken_whatever_board_was_remembered(
 async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_it_does(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(board_check, "RETRY_S", 0.05, raising=False)
-    memory, said = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be remembered"
+    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05, raising=False)
+    memory, said = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be stored"
     memory.path.parent.touch()  # a file where the folder should be
     with capture_logs() as logs:
         async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
@@ -336,7 +334,7 @@ async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_i
 async def test_a_folder_that_is_deleted_comes_back_with_the_board(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(board_check, "RETRY_S", 0.05)
+    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05)
     memory = KnownBoardFile(tmp_path / "state", "house")
     async with source(folder / "ttyUSB0", memory), board(folder / "ttyUSB0"):
         await remembered(memory, "00000001")
@@ -347,7 +345,7 @@ async def test_a_folder_that_is_deleted_comes_back_with_the_board(
 async def test_a_board_that_is_to_be_forgotten_is_not_written_down_again(
     folder: Path, memory: KnownBoardFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(board_check, "RETRY_S", 0.0)
+    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.0)
     async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
         await remembered(memory, "00000001")
         memory.save(NO_BOARD)

@@ -54,7 +54,7 @@ def test_auto_leaves_radio_sticks_and_unknown_chips_alone(
     there: list[ListPortInfo], vid: int, pid: int, product: str
 ) -> None:
     there.append(usb_port("/dev/ttyUSB0", vid, pid, product))
-    with pytest.raises(NoPortError, match="no port of a known board is there") as refused:
+    with pytest.raises(NoPortError, match="no port of a known board is connected") as refused:
         resolve_port("auto")
     assert f"/dev/ttyUSB0 ({product})" in str(refused.value)
 

@@ -169,7 +169,7 @@ async def test_ports_that_all_go_while_they_are_listed_are_waited_for(tmp_path: 
         patch.setattr(Path, "is_dir", lambda _: True)  # it was there a moment ago
         patch.setattr(list_ports, "comports", list)
         async with SerialSource(SensorSettings(port="auto")) as source:
-            await until(lambda: source.message == "waiting for auto: no USB serial port is there")
+            await until(lambda: source.message == "waiting for auto: no USB serial port is connected")
 
 
 async def test_a_silent_board_and_one_at_another_baud_rate_are_told_apart(line: Line) -> None:
