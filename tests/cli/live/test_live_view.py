@@ -1,15 +1,22 @@
-"""The live view on a real pseudo-terminal: its content by size, and that nothing waits for it."""
+"""Live view on a real pseudo-terminal: its content by size, and a terminal that is not read."""
 
+import asyncio
 import re
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from tests.free_port import free_port
+from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
 from tests.pseudo_terminal import ALTERNATE, BACK, CURSOR, PseudoTerminal
+from tests.serial_line import Line
 
-SIZES = [(40, 15), (60, 20), (80, 24), (120, 40)]
+SIZES = [(40, 15), (80, 24)]
+TEN_SCREENS = 300
+"""Samples at 100 Hz while ten screens are drawn; a pseudo-terminal that is not read takes one or two screens."""
 
 
 @pytest.fixture(scope="module")
@@ -43,3 +50,35 @@ def test_a_demo_that_is_interrupted_says_what_came_of_it_and_leaves_the_terminal
     assert CURSOR in last
     assert re.search(r"SOC at first -20\.00% wrong, at last", last.replace("\r\n", " "))
     assert "Traceback" not in terminal.output
+
+
+async def test_a_service_whose_terminal_is_not_read_publishes_and_ends_on_sigterm(
+    tmp_path: Path, line: Line, broker: Broker
+) -> None:
+    line.plug()
+    pack = tmp_path / "pack.toml"
+    pack.write_text(f"""
+[sensor]
+port = "{line.path}"
+protocol = "text"
+[publish]
+rate_hz = 10
+[mqtt]
+url = "{broker.url}"
+[state]
+folder = "{tmp_path / "state"}"
+""")
+    board = asyncio.create_task(_feed(line))
+    async with Listener(broker) as listener:
+        with PseudoTerminal("run", str(pack)) as terminal:
+            await listener.wait_json("bms/pack/state", lambda s: s["frames_received"] > TEN_SCREENS)
+            terminal.process.send_signal(signal.SIGTERM)
+            assert await asyncio.to_thread(terminal.process.wait, LONG_S) == 0
+    board.cancel()
+
+
+async def _feed(line: Line) -> None:
+    """Print text at 100 Hz, as a board does."""
+    while True:
+        line.write(b"3.80,0.10,25.0\r\n")
+        await asyncio.sleep(0.01)
