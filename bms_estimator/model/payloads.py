@@ -5,9 +5,18 @@ are published as JSON schema.
 """
 
 from functools import cached_property
-from typing import Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from bms_estimator.model.quantity import (
+    FAST_INTERVAL_S,
+    Entity,
+    Quantity,
+    counter_entity,
+    raw_entity,
+    total_entity,
+)
 
 FRESH_PERIODS = 3
 """Number of periods without an accepted sample after which values are stale; the longer one of publish and sample
@@ -42,67 +51,126 @@ class Estimate(Payload):
 
     time: str = Field(description="arrival time of the window's last sample, ISO 8601, UTC")
     publish_time: str = Field(description="time at which this message was created, ISO 8601, UTC")
-    board_time_s: float = Field(description="source's clock at the last sample [s]")
-    voltage_v: float = Field(description="mean pack terminal voltage [V]")
-    current_a: float = Field(description="mean current [A], positive on discharge")
-    power_w: float = Field(description="mean of voltage times current [W], positive on discharge")
-    temperature_c: float | None = Field(description="mean temperature [C]; null without a sensor")
-    cell_lowest_v: float | None = Field(
-        description="lowest cell voltage at the last sample [V]; null without cell voltages"
+    board_time_s: Annotated[float, Quantity(prometheus="none")] = Field(
+        description="source's clock at the last sample [s]"
     )
-    cell_highest_v: float | None = Field(
-        description="highest cell voltage at the last sample [V]; null without cell voltages"
+    voltage_v: Annotated[float, Quantity(Entity(None, "V", 2, 0.02, "voltage", FAST_INTERVAL_S, is_primary=True))] = (
+        Field(description="mean pack terminal voltage [V]")
     )
-    cell_lowest: int | None = Field(description="number of the lowest cell, from 1")
-    cell_highest: int | None = Field(description="number of the highest cell, from 1")
+    current_a: Annotated[
+        float, Quantity(Entity(None, "A", 2, 0.05, "current", FAST_INTERVAL_S, is_primary=True, signed=True))
+    ] = Field(description="mean current [A], positive on discharge")
+    power_w: Annotated[
+        float, Quantity(Entity(None, "W", 1, 0.5, "power", FAST_INTERVAL_S, is_primary=True, signed=True))
+    ] = Field(description="mean of voltage times current [W], positive on discharge")
+    temperature_c: Annotated[float | None, Quantity(Entity(None, "°C", 1, 0.3, "temperature", is_primary=True))] = (
+        Field(description="mean temperature [C]; null without a sensor")
+    )
+    cell_lowest_v: Annotated[
+        float | None, Quantity(Entity("Weakest cell, voltage", "V", 3, 0.005, "voltage"), packs="with cell voltages")
+    ] = Field(description="lowest cell voltage at the last sample [V]; null without cell voltages")
+    cell_highest_v: Annotated[
+        float | None, Quantity(raw_entity("Highest cell, voltage", "V", 3, "voltage"), packs="with cell voltages")
+    ] = Field(description="highest cell voltage at the last sample [V]; null without cell voltages")
+    cell_lowest: Annotated[
+        int | None, Quantity(Entity("Weakest cell", None, 0, 1.0, state_class=None), packs="with cell voltages")
+    ] = Field(description="number of the lowest cell, from 1")
+    cell_highest: Annotated[
+        int | None,
+        Quantity(Entity("Highest cell", None, 0, 1.0, enabled=False, state_class=None), packs="with cell voltages"),
+    ] = Field(description="number of the highest cell, from 1")
     cells_v: list[float | None] | None = Field(
         description="cell voltages at the last sample [V]; null for an unknown cell, or without cell voltages"
     )
-    soc: float | None = Field(
+    soc: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         description="state of charge, 0..1; null for a fuel cell, like all values derived from it"
     )
-    soc_percent: float | None = Field(description="state of charge [%]")
-    soc_std: float | None = Field(
+    soc_percent: Annotated[
+        float | None,
+        Quantity(
+            Entity(None, "%", 1, 0.2, "battery", is_primary=True, immediate_step=2.0),
+            packs="batteries",
+            prometheus="none",
+        ),
+    ] = Field(description="state of charge [%]")
+    soc_std: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         description="standard deviation of soc; for cells in series it includes the weakest cell, a tenth of the "
         "charge drawn; null without the identifier"
     )
-    soc_coulomb: float | None = Field(description="state of charge by coulomb counting alone, 0..1")
-    soc_ocv: float | None = Field(description="state of charge by the inverted OCV (7.1), 0..1")
-    remaining_capacity_ah: float | None = Field(description="remaining charge to SOC 0 [Ah]")
-    usable_capacity_ah: float | None = Field(description="remaining charge to max(delta_1, delta_2) [Ah]")
-    remaining_energy_wh: float | None = Field(
-        description="remaining energy at the terminals to SOC 0 at current_a [Wh]"
+    soc_coulomb: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
+        description="state of charge by coulomb counting alone, 0..1"
     )
+    soc_ocv: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
+        description="state of charge by the inverted OCV (7.1), 0..1"
+    )
+    remaining_capacity_ah: Annotated[
+        float | None, Quantity(Entity("Remaining capacity", "Ah", 2, 0.02, is_primary=True), packs="batteries")
+    ] = Field(description="remaining charge to SOC 0 [Ah]")
+    usable_capacity_ah: Annotated[float | None, Quantity(raw_entity("Usable capacity", "Ah", 2), packs="batteries")] = (
+        Field(description="remaining charge to max(delta_1, delta_2) [Ah]")
+    )
+    remaining_energy_wh: Annotated[
+        float | None,
+        Quantity(Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", is_primary=True), packs="batteries"),
+    ] = Field(description="remaining energy at the terminals to SOC 0 at current_a [Wh]")
     time_to_empty_s: float | None = Field(description="time to SOC 0 at current_a [s]; null unless discharging")
     time_to_full_s: float | None = Field(description="time to SOC 1 at current_a [s]; null unless charging")
-    charge_out_ah: float = Field(description=f"discharged {_COUNTED} [Ah]")
-    charge_in_ah: float = Field(description=f"charged {_COUNTED} [Ah]")
-    energy_out_kwh: float = Field(description=f"discharged {_COUNTED} [kWh]")
-    energy_in_kwh: float = Field(description=f"charged {_COUNTED} [kWh]")
-    equivalent_cycles: float | None = Field(
-        description="charge_out_ah divided by the rated capacity; null for a fuel cell"
+    charge_out_ah: Annotated[
+        float, Quantity(total_entity("Charge out", "Ah", 2)._replace(enabled=False), prometheus="counter")
+    ] = Field(description=f"discharged {_COUNTED} [Ah]")
+    charge_in_ah: Annotated[
+        float, Quantity(total_entity("Charge in", "Ah", 2)._replace(enabled=False), prometheus="counter")
+    ] = Field(description=f"charged {_COUNTED} [Ah]")
+    energy_out_kwh: Annotated[float, Quantity(total_entity("Energy out", "kWh", 3, "energy"), prometheus="counter")] = (
+        Field(description=f"discharged {_COUNTED} [kWh]")
     )
-    voltage_estimate_v: float | None = Field(description="terminal voltage of the observer, (4.1) [V]")
-    innovation_v: float | None = Field(description="measured minus predicted voltage before the correction [V]")
+    energy_in_kwh: Annotated[float, Quantity(total_entity("Energy in", "kWh", 3, "energy"), prometheus="counter")] = (
+        Field(description=f"charged {_COUNTED} [kWh]")
+    )
+    equivalent_cycles: Annotated[
+        float | None, Quantity(total_entity("Equivalent cycles", None, 2), packs="batteries")
+    ] = Field(description="charge_out_ah divided by the rated capacity; null for a fuel cell")
+    voltage_estimate_v: Annotated[float | None, Quantity(raw_entity("Estimated voltage", "V", 2, "voltage"))] = Field(
+        description="terminal voltage of the observer, (4.1) [V]"
+    )
+    innovation_v: Annotated[float | None, Quantity(raw_entity("Innovation", "V", 3, "voltage"))] = Field(
+        description="measured minus predicted voltage before the correction [V]"
+    )
     tracking_error_v: float | None = Field(description="tracking error e of the observer, (3.15) [V]")
-    delta_1: float | None = Field(description="SOC below which C_ts is negative, (2.11)")
-    delta_2: float | None = Field(description="SOC below which C_tl is negative, (2.12)")
+    delta_1: Annotated[
+        float | None, Quantity(raw_entity("delta 1", None, 4), packs="batteries", prometheus="ratio")
+    ] = Field(description="SOC below which C_ts is negative, (2.11)")
+    delta_2: Annotated[
+        float | None, Quantity(raw_entity("delta 2", None, 4), packs="batteries", prometheus="ratio")
+    ] = Field(description="SOC below which C_tl is negative, (2.12)")
     delta_configured: bool = Field(
         description="true: delta_1 and delta_2 are constants of the cell file, because the learning law does not change the "
         "shape of C_ts and C_tl over SOC"
     )
-    stability_margin: float | None = Field(description="soc - max(delta_1, delta_2)")
-    adaptive_gain_k: float | None = Field(description="adaptive gain state k, (3.13) [V^2 s]")
-    nussbaum_gain: float | None = Field(description="N(k), (3.12); null with the learning law")
-    adaptation_gain_hz: float | None = Field(
+    stability_margin: Annotated[
+        float | None, Quantity(raw_entity("Stability margin", None, 3), packs="batteries", prometheus="ratio")
+    ] = Field(description="soc - max(delta_1, delta_2)")
+    adaptive_gain_k: Annotated[float | None, Quantity(raw_entity("Adaptive gain k", "V²s", 6))] = Field(
+        description="adaptive gain state k, (3.13) [V^2 s]"
+    )
+    nussbaum_gain: Annotated[float | None, Quantity(raw_entity("Nussbaum gain", None, 3), packs="batteries")] = Field(
+        description="N(k), (3.12); null with the learning law"
+    )
+    adaptation_gain_hz: Annotated[float | None, Quantity(raw_entity("Adaptation gain", "1/s", 4))] = Field(
         description="gamma k of the learning law [1/s]; null with a law of the thesis"
     )
     converged: bool = Field(description="|tracking_error_v| is below eps2 of Algorithm 1")
     lock: bool = Field(description="the observer tracks the measured voltage")
-    frames_received: int = Field(description="valid frames since start")
-    frames_lost: int = Field(description="missing frames by sequence number since start")
-    crc_errors: int = Field(description="frames with a wrong checksum since start")
-    sample_rate_hz: float | None = Field(description="sample rate on the source's clock in the window [Hz]")
+    frames_received: Annotated[int, Quantity(prometheus="counter")] = Field(description="valid frames since start")
+    frames_lost: Annotated[int, Quantity(counter_entity("Frames lost"), prometheus="counter")] = Field(
+        description="missing frames by sequence number since start"
+    )
+    crc_errors: Annotated[int, Quantity(counter_entity("CRC errors"), prometheus="counter")] = Field(
+        description="frames with a wrong checksum since start"
+    )
+    sample_rate_hz: Annotated[float | None, Quantity(raw_entity("Sample rate", "Hz", 1, "frequency"))] = Field(
+        description="sample rate on the source's clock in the window [Hz]"
+    )
 
 
 class Parameter(Payload):
@@ -210,8 +278,12 @@ class Health(Payload):
     uptime_s: float = Field(description="time since the service started [s]")
     rss_mib: float | None = Field(description="resident memory [MiB]")
     loop_lag_s: float = Field(description="longest delay of the event loop since the last health message [s]")
-    restarts: int = Field(description="starts with a checkpoint of an earlier run")
-    reconnects: int = Field(description="number of times that the source was reopened")
+    restarts: Annotated[int, Quantity(prometheus="counter")] = Field(
+        description="starts with a checkpoint of an earlier run"
+    )
+    reconnects: Annotated[int, Quantity(prometheus="counter")] = Field(
+        description="number of times that the source was reopened"
+    )
     sensor_online: bool = Field(description="true: a valid sample arrived within three publish or sample periods")
     sensor_message: str | None = Field(description="reason why the sensor is offline; null while online")
     clock_ppm: float | None = Field(
@@ -221,21 +293,27 @@ class Health(Payload):
     samples: dict[str, int] = Field(description="accepted and dropped samples by kind, since start")
     identifier: dict[str, int] = Field(description="samples skipped by the identifier, and its resets, since start")
     suspects: list[str] = Field(description="input diagnostics with remedies; empty: none")
-    lock_losses: int = Field(description="number of lock losses of the observer")
-    gain_rearms: int = Field(description="number of resets of k before the gain changed its sign")
-    publish_drops: int = Field(
+    lock_losses: Annotated[int, Quantity(prometheus="counter")] = Field(
+        description="number of lock losses of the observer"
+    )
+    gain_rearms: Annotated[int, Quantity(prometheus="counter")] = Field(
+        description="number of resets of k before the gain changed its sign"
+    )
+    publish_drops: Annotated[int, Quantity(prometheus="counter")] = Field(
         description="states and events dropped because the queue was full or the broker rejected them"
     )
     publish_waiting: int = Field(description="states and events that the broker has not acknowledged")
     store_trouble: str | None = Field(
         description="reason why the queue and history cannot be written; null: they can, or are not configured"
     )
-    broker_losses: int = Field(description="lost broker connections since start")
+    broker_losses: Annotated[int, Quantity(prometheus="counter")] = Field(
+        description="lost broker connections since start"
+    )
     broker_trouble: str | None = Field(
         description="reason of the last lost or failed connection to a broker; null: none since start"
     )
     refused_topics: list[str] = Field(description="topics that the broker denies, as far as known; empty: none")
-    availability_corrections: int = Field(
+    availability_corrections: Annotated[int, Quantity(prometheus="counter")] = Field(
         description="corrections of an availability topic that another client had changed"
     )
     requests: dict[str, int] = Field(description="requests by outcome, since start")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from bms_estimator.model.payloads import Estimate, Health, Snapshot
+from bms_estimator.model.quantity import quantity
 
 
 class Unit(NamedTuple):
@@ -34,27 +35,6 @@ UNITS = {
     "kwh": Unit("joules", 3.6e6),
 }
 """Units by the last part of a field's name."""
-RATIOS = ("soc", "soc_std", "soc_coulomb", "soc_ocv", "delta_1", "delta_2", "stability_margin")
-"""Fields from 0 to 1."""
-COUNTERS = (
-    "frames_received",
-    "frames_lost",
-    "crc_errors",
-    "energy_out_kwh",
-    "energy_in_kwh",
-    "charge_out_ah",
-    "charge_in_ah",
-    "restarts",
-    "reconnects",
-    "lock_losses",
-    "gain_rearms",
-    "publish_drops",
-    "broker_losses",
-    "availability_corrections",
-)
-"""Fields that never decrease, except after a restart."""
-LEFT_OUT = ("soc_percent", "board_time_s")
-"""Fields that repeat another one, or a clock with an arbitrary origin."""
 KINDS = {"line": "counters of the link", "samples": "samples by result", "requests": "requests by result"}
 """Help texts of the health payload's counters by kind."""
 LIST_ITEMS = {"cells_v": "cell"}
@@ -80,12 +60,12 @@ def metrics(snapshot: Snapshot) -> Iterator[Metric]:
 def _fields(device: str, report: Estimate | Health, model: type[Estimate | Health]) -> Iterator[Metric]:
     """Yield metrics of the numbers and Booleans of a payload."""
     for name, field in model.model_fields.items():
-        value, help_text = getattr(report, name), field.description or name
-        if name in LEFT_OUT:
+        value, help_text, kind = getattr(report, name), field.description or name, quantity(model, name).prometheus
+        if kind == "none":
             continue
         if isinstance(value, bool | int | float):
-            metric_name, factor = name_and_factor(name)
-            family = CounterMetricFamily if name in COUNTERS else GaugeMetricFamily
+            metric_name, factor = (f"bms_{name}_ratio", 1.0) if kind == "ratio" else name_and_factor(name)
+            family = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
             metric = family(metric_name, help_text, labels=["device"])
             metric.add_metric([device], value * factor)
             yield metric
@@ -138,8 +118,6 @@ def _watched(device: str, snapshot: Snapshot) -> Metric:
 
 def name_and_factor(field: str) -> tuple[str, float]:
     """Return a field's metric name without ``_total``, and its scale factor."""
-    if field in RATIOS:
-        return f"bms_{field}_ratio", 1.0
     stem, _, last = field.rpartition("_")
     unit = UNITS.get(last)
     if unit is None or not stem:

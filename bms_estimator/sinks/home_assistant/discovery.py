@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, get_args
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import FRESH_PERIODS, Info
+from bms_estimator.model.quantity import Entity
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
@@ -16,7 +17,6 @@ from bms_estimator.sinks.home_assistant.entities import (
     CELL,
     CELL_VOLTAGES,
     FUEL_CELL,
-    Entity,
     cell_key,
     entities,
 )

@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.quantity import Entity
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs
-from bms_estimator.sinks.home_assistant.entities import Entity, cell_key, entities
+from bms_estimator.sinks.home_assistant.entities import cell_key, entities
 
 MAX_ROWS = 18
 """Maximum number of published values of default-enabled entities in a minute, so that two of 20 are left for alarms."""
