@@ -16,7 +16,7 @@ from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sampling import BOARD, Sampling
@@ -167,6 +167,12 @@ def estimator_of(settings: Settings, cell: PackModel) -> Estimator:
         initial_soc=settings.pack.initial_soc,
         sampling=settings.sampling,
     )
+
+
+def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
+    """Create the estimator of a pack after loading its kernels, so that nothing compiles once samples arrive."""
+    estimator_of(settings, cell).run(np.zeros(1, dtype=SAMPLE))
+    return estimator_of(settings, cell)
 
 
 def estimate(

@@ -4,10 +4,10 @@ import gc
 
 import numpy as np
 
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
-from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload

@@ -3,24 +3,18 @@
 import asyncio
 import contextlib
 import math
-import reprlib
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Awaitable, Callable, Sequence
 
-import numpy as np
 import structlog
 
 from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile, RunCounters
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.clock import Clock, since_boot
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier
@@ -28,8 +22,9 @@ from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import CheckpointWriter
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ, Settings
-from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
+from bms_estimator.service.request_handlers import RequestHandlers
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Source, SourceHealth
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
@@ -109,7 +104,7 @@ async def run_estimation_loop(
     _restore_alarms(publisher, counters.alarms)
     hooks.restore_active(publisher.alarm_monitor.alarms.report())
     if requests is not None:
-        _offer(requests, estimator, publisher, current_zero)
+        RequestHandlers(estimator, publisher, current_zero).register(requests)
     interval_s = settings.state.checkpoint_s
     writer = (
         CheckpointWriter(checkpoint, estimator, publisher, totals, restarts=counters.restarts, interval_s=interval_s)
@@ -139,12 +134,6 @@ async def run_estimation_loop(
                 await writer.save_final(clean=clean)
         publisher.publish_last()
     return estimator
-
-
-def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
-    """Make the estimator of a pack with its kernels loaded, so that nothing compiles once samples arrive."""
-    estimator_of(settings, cell).run(np.zeros(1, dtype=SAMPLE))
-    return estimator_of(settings, cell)
 
 
 async def _estimate(
@@ -231,66 +220,3 @@ def _restore_alarms(publisher: Publisher, saved: str) -> None:
 def _soc_text(estimator: Estimator) -> str:
     soc = float(estimator.state["soc"][0])
     return "" if math.isnan(soc) else f": SOC {soc:.4f}"
-
-
-def _set_soc(estimator: Estimator, soc: float) -> float:
-    """Set the SOC on request.
-
-    Returns:
-        The previous SOC.
-
-    Raises:
-        UserError: It does not exist.
-    """
-    if not estimator.state["started"][0]:
-        raise UserError("no sample has been taken yet")
-    before = float(estimator.state["soc"][0])
-    try:
-        estimator.set_soc(soc)
-    except ValueError as error:
-        raise UserError(str(error)) from None
-    return before
-
-
-def _offer(
-    requests: RequestDispatcher,
-    estimator: Estimator,
-    publisher: Publisher,
-    board_zero: Callable[[], Awaitable[None]] | None,
-) -> None:
-    """Offer the requests that need the loop."""
-
-    async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        soc = number(arguments, "soc", 0.0, 1.0)
-        before = _set_soc(estimator, soc)
-        log.info("SOC set on request", before=before, soc=soc)
-        return {"soc": soc, "before": before}
-
-    async def current_zero(_: Mapping[str, Any]) -> Mapping[str, Any]:
-        if board_zero is None:
-            raise UserError("this source has no zero to be set")
-        if publisher.not_at_rest_reason:
-            raise UserError(publisher.not_at_rest_reason)
-        await board_zero()
-        log.info("present current taken as zero on request")
-        return {}
-
-    async def publish_rate(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        rate_hz, before = number(arguments, "rate_hz", MIN_RATE_HZ, MAX_RATE_HZ), 1.0 / publisher.period_s
-        publisher.set_rate(rate_hz)
-        log.info("publish rate set on request", before=before, rate_hz=rate_hz)
-        return {"rate_hz": rate_hz, "before": before}
-
-    for handler in (set_soc, current_zero, publish_rate):
-        requests.register(handler.__name__, handler)
-    requests.register("acknowledge_alarm", partial(_acknowledge_alarm, publisher))
-
-
-async def _acknowledge_alarm(publisher: Publisher, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Acknowledge the alarm ``name``, or all."""
-    name, watched = arguments.get("name"), publisher.alarm_monitor.alarms.names()
-    if name is not None and name not in watched:
-        raise UserError(f"name = {reprlib.repr(name)}: must be one of {', '.join(watched)}, or left out for all")
-    acknowledged = publisher.alarm_monitor.acknowledge(name)
-    log.info("alarms acknowledged on request", alarms=acknowledged)
-    return {"acknowledged": acknowledged}

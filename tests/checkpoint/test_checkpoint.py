@@ -19,11 +19,12 @@ from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_FILES, Checkpoi
 from bms_estimator.checkpoint.identity import fields, pack_identity
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.kernels.kalman_filter.records import NODE, OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads import Health
 from bms_estimator.service import checkpoint_writer, live_loop
-from bms_estimator.service.live_loop import new_estimator, run_estimation_loop
+from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.collector import Collector

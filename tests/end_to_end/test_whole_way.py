@@ -14,9 +14,9 @@ import pytest
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.cli.options.pack_options import load_pack
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.protocols.firmware.messages import ResetCause
-from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.simulation.simulated_pack import SimulatedPack, pulses
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp, synchronised
-from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.lifetime_totals import new_totals
 

@@ -13,10 +13,11 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_LATER_FILES, CheckpointFile, RunCounters
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.payloads import Totals
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.service import checkpoint_writer
-from bms_estimator.service.live_loop import new_estimator, run_estimation_loop
+from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import gap_lengths

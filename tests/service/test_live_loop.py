@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
@@ -19,7 +20,7 @@ from bms_estimator.model.payloads import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.process.systemd import SystemdNotifier
-from bms_estimator.service.live_loop import LAG_STEP_S, new_estimator, run_estimation_loop
+from bms_estimator.service.live_loop import LAG_STEP_S, run_estimation_loop
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings

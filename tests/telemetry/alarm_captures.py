@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads import Snapshot
-from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, header_of

@@ -20,11 +20,11 @@ from bms_estimator.cli.options.capture_options import OR_FUEL_CELL_HELP, AsJson,
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, open_capture
 from bms_estimator.sources.captures.stdin import standard_input

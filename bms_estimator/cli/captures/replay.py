@@ -29,11 +29,11 @@ from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_broker, with_pack
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher

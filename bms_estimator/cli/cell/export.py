@@ -13,11 +13,11 @@ from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_out, name_of
 from bms_estimator.cli.options.pack_options import load_pack, unpacked_cell
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import identified_cell, ocv_correction_with_std, relative_capacity
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.service.live_loop import new_estimator
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="What a pack's service has learned of its cells.")
 

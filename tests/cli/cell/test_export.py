@@ -9,8 +9,8 @@ import pytest
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import TableOcv, load_cell
-from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.command_line import run
 from tests.estimator.anywhere.cases import OXIDE, Case, capture

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.estimator.estimator import estimator_of, new_estimator
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.worker import partition as partition_module
 from bms_estimator.fleet.worker.block_order import ASKED_EACH, MAX_PASSED, TOLD_EACH
@@ -19,7 +19,6 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import load_any
 from bms_estimator.model.payloads import Estimate, ParameterReport
-from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.sources.captures.replay import Replay
