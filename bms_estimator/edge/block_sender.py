@@ -20,7 +20,6 @@ from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES
 from bms_estimator.edge.sample_clock import SampleClock
 from bms_estimator.model.clock import Clock, since_boot
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import EdgeHealth
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.broker_config import brokers, check
@@ -32,7 +31,6 @@ from bms_estimator.mqtt.queue_sender import QueueSender
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.edge import EdgeSettings
-from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.store.database import RETRY_S, Database
 
 MIB = 1 << 20
@@ -92,12 +90,11 @@ class BlockSender:
         self.delivery, self.unread = DeliveryStats(), 0
         self._denied = DeniedTopics(self.delivery, lambda: None, first_delay_s)
         self._sender = QueueSender(self.store, self.delivery, self._denied, first_delay_s)
-        for warning in check_edge(settings):
+        for warning in check(settings):
             log.warning("secret is readable by other users", reason=warning)
-        mqtt = _mqtt(settings)
         options = ConnectOptions(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._count_unread)
         self._link = ReconnectLoop(
-            brokers(mqtt), options, connect or BrokerConnector(mqtt), self._serve, self.delivery, first_delay_s
+            brokers(settings), options, connect or BrokerConnector(settings), self._serve, self.delivery, first_delay_s
         )
         self._sample_clock: SampleClock | None = None
         self._overdue_timer: asyncio.TimerHandle | None = None
@@ -204,24 +201,3 @@ class BlockSender:
 
 def _topic(subject: str) -> str:
     return subject.replace(".", "/")
-
-
-def check_edge(settings: EdgeSettings) -> list[str]:
-    """Check that addresses, password and certificates can be used.
-
-    Returns:
-        A sentence for each secret that every user of this machine can read.
-
-    Raises:
-        UserError: One of them cannot be used.
-    """
-    try:
-        return [warning.replace("mqtt.", "edge.", 1) for warning in check(_mqtt(settings))]
-    except UserError as error:
-        raise UserError(str(error).replace("mqtt.", "edge.")) from None
-
-
-def _mqtt(settings: EdgeSettings) -> MqttSettings:
-    """Return the connection settings of a server as MQTT settings."""
-    names = ("url", "username", "password_file", "ca_file", "cert_file", "key_file")
-    return MqttSettings(**{name: getattr(settings, name) for name in names})

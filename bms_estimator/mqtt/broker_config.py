@@ -1,13 +1,14 @@
 """Addresses, passwords and certificates of the brokers."""
 
 import ssl
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import credential
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.broker import BrokerSettings
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 
@@ -21,21 +22,24 @@ class Broker(NamedTuple):
     tls: bool
 
 
-def brokers(settings: MqttSettings) -> list[Broker]:
+def brokers(settings: BrokerSettings) -> list[Broker]:
     """Return the brokers in the order of attempts.
 
     Raises:
         UserError: A URL cannot be used, or a certificate or key is configured that no connection would use.
     """
-    addresses = [_broker(url) for url in settings.urls]
+    section = settings.section
+    addresses = [_broker(section, url) for url in settings.urls]
     if settings.cert_file and not any(broker.tls for broker in addresses):
-        raise UserError(f"mqtt.cert_file = {settings.cert_file}: of no use without TLS: mqtt.url must be mqtts://...")
+        raise UserError(
+            f"{section}.cert_file = {settings.cert_file}: of no use without TLS: {section}.url must be mqtts://..."
+        )
     if settings.key_file and not settings.cert_file:
-        raise UserError(f"mqtt.key_file = {settings.key_file}: of no use without mqtt.cert_file")
+        raise UserError(f"{section}.key_file = {settings.key_file}: of no use without {section}.cert_file")
     return addresses
 
 
-def password(settings: MqttSettings) -> str | None:
+def password(settings: BrokerSettings) -> str | None:
     """Read the broker's password.
 
     Raises:
@@ -43,31 +47,35 @@ def password(settings: MqttSettings) -> str | None:
     """
     if settings.password_file is None:
         return None
+    section = settings.section
     try:
         return credential(settings.password_file).read_text(encoding="utf-8").rstrip("\r\n")
     except OSError as error:
-        raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: {error.strerror}") from None
+        raise UserError(
+            f"{section}.password_file = {settings.password_file}: cannot be read: {error.strerror}"
+        ) from None
     except UnicodeDecodeError:  # its text would show bytes of the password
-        raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: not UTF-8 text") from None
+        raise UserError(f"{section}.password_file = {settings.password_file}: cannot be read: not UTF-8 text") from None
 
 
-def tls_context(settings: MqttSettings) -> ssl.SSLContext:
+def tls_context(settings: BrokerSettings) -> ssl.SSLContext:
     """Create a TLS context from the certificate files, which may have been replaced since the last connection.
 
     Raises:
         UserError: A file cannot be read, or is invalid.
     """
+    section = settings.section
     try:
         context = ssl.create_default_context(cafile=settings.ca_file)
     except OSError as error:  # includes ssl.SSLError
-        raise UserError(f"mqtt.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
+        raise UserError(f"{section}.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     if settings.cert_file is not None:
         _load_client_certificate(context, settings, settings.cert_file)
     return context
 
 
-def check(settings: MqttSettings) -> list[str]:
+def check(settings: BrokerSettings) -> list[str]:
     """Check that addresses, password and certificates can be used.
 
     Returns:
@@ -84,52 +92,58 @@ def check(settings: MqttSettings) -> list[str]:
         "key_file": settings.key_file or settings.cert_file,
     }
     return [
-        f"mqtt.{key} = {name}: every user of this machine may read it; take that away with chmod o-r"
+        f"{settings.section}.{key} = {name}: every user of this machine may read it; take that away with chmod o-r"
         for key, name in files.items()
         if name is not None and credential(name).exists() and credential(name).stat().st_mode & 0o004
     ]
 
 
-def _broker(address: str) -> Broker:
+def _broker(section: str, address: str) -> Broker:
     try:
         url = urlsplit(address)
         host, port = url.hostname, url.port or PORTS[url.scheme]
         (host or "").encode("idna")  # the resolver encodes the name this way and would fail later
     except ValueError as error:  # includes UnicodeError
-        raise UserError(f"mqtt.url = {address}: {error}") from None
+        raise UserError(f"{section}.url = {address}: {error}") from None
     if not host:
-        raise UserError(f"mqtt.url = {address}: must be mqtt://host:port")
+        raise UserError(f"{section}.url = {address}: must be mqtt://host:port")
     return Broker(address, host, port, url.scheme == "mqtts")
 
 
-def _load_client_certificate(context: ssl.SSLContext, settings: MqttSettings, cert_file: Path) -> None:
+def _load_client_certificate(context: ssl.SSLContext, settings: BrokerSettings, cert_file: Path) -> None:
     """Load the client certificate and its key. Without a key file, the certificate file contains the key.
 
     Raises:
         UserError: A file cannot be read, or the key does not match the certificate.
     """
-    key_file = settings.key_file or cert_file
+    key_file, section = settings.key_file or cert_file, settings.section
     # load_cert_chain does not name the file that it cannot read
     for name, path in (("cert_file", cert_file), ("key_file", key_file)):
         try:
             credential(path).read_bytes()
         except OSError as error:
-            raise UserError(f"mqtt.{name} = {path}: cannot be read: {error.strerror}") from None
+            raise UserError(f"{section}.{name} = {path}: cannot be read: {error.strerror}") from None
     try:
         # without a password callback, OpenSSL would prompt on the terminal
-        context.load_cert_chain(credential(cert_file), credential(key_file), password=_refuse_password)
+        context.load_cert_chain(
+            credential(cert_file), credential(key_file), password=partial(_refuse_password, section)
+        )
     except ssl.SSLError as error:
         if error.reason == "KEY_VALUES_MISMATCH":
-            raise UserError(f"mqtt.key_file = {key_file}: is not the key of mqtt.cert_file = {cert_file}") from None
+            raise UserError(
+                f"{section}.key_file = {key_file}: is not the key of {section}.cert_file = {cert_file}"
+            ) from None
         raise UserError(
-            f"mqtt.cert_file = {cert_file}, mqtt.key_file = {key_file}: no certificate in PEM with its key: {error}"
+            f"{section}.cert_file = {cert_file}, {section}.key_file = {key_file}: no certificate in PEM with its key: {error}"
         ) from None
 
 
-def _refuse_password() -> str:
+def _refuse_password(section: str) -> str:
     """Reject an encrypted key, because a service cannot prompt for its password.
 
     Raises:
         UserError: Always.
     """
-    raise UserError("mqtt.key_file: is encrypted, and nobody is there to type its password; give a key without one")
+    raise UserError(
+        f"{section}.key_file: is encrypted, and nobody is there to type its password; give a key without one"
+    )

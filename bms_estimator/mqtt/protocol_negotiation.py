@@ -19,7 +19,7 @@ from bms_estimator.mqtt.client import (
     should_retry_with_v311,
 )
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.broker import BrokerSettings
 
 
 class BrokerConnector:
@@ -30,7 +30,7 @@ class BrokerConnector:
         timeouts: Timeouts of the connection.
     """
 
-    def __init__(self, settings: MqttSettings, timeouts: Timeouts = DEFAULT_TIMEOUTS) -> None:
+    def __init__(self, settings: BrokerSettings, timeouts: Timeouts = DEFAULT_TIMEOUTS) -> None:
         self._settings, self._timeouts = settings, timeouts
         # URLs that did not answer MQTT 5 at all: the broker is stopped, or too old to reject the version
         self._silent: set[str] = set()

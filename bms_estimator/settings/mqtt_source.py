@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Positive, Strict
-from bms_estimator.settings.mqtt import validate_broker_urls
+from bms_estimator.settings.broker import BrokerSettings, BrokerUrls
 from bms_estimator.settings.mqtt_profiles import PROFILES, ProfileName
 from bms_estimator.settings.polled_source import Name, PolledSource
 
@@ -62,6 +62,12 @@ class ValueLocation(Strict):
         return factor * (self.scale * number + self.offset) + offset
 
 
+class SourceBroker(BrokerSettings):
+    """Connection to the broker of ``[source]``."""
+
+    section: ClassVar[str] = "source"
+
+
 class MqttSource(PolledSource):
     """Battery values that another program publishes over MQTT, see docs/pack/mqtt-source.md."""
 
@@ -94,7 +100,7 @@ class MqttSource(PolledSource):
         default={}, description="requests: payload by topic, for publishers that only answer"
     )
     ask_s: Positive = Field(default=10.0, description="interval of the requests")
-    url: Annotated[str | tuple[str, ...], AfterValidator(validate_broker_urls)] | None = Field(
+    url: BrokerUrls | None = Field(
         default=None, description="URL of the broker, or a list to try in turn; default: that of [mqtt]"
     )
     username: str | None = Field(default=None, description="user at the broker in url")
@@ -102,6 +108,15 @@ class MqttSource(PolledSource):
     ca_file: Path | None = Field(default=None, description="as mqtt.ca_file, for the broker at url")
 
     quantities: ClassVar[tuple[str, ...]] = tuple(UNITS)
+
+    @property
+    def broker(self) -> BrokerSettings | None:
+        """Broker of its own; None: that of ``[mqtt]``."""
+        if self.url is None:
+            return None
+        return SourceBroker(
+            url=self.url, username=self.username, password_file=self.password_file, ca_file=self.ca_file
+        )
 
     @model_validator(mode="before")
     @classmethod

@@ -10,7 +10,6 @@ import typer
 from bms_estimator.cli.live.ports import asking
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.cli.settings.settings_template import Given, settings_file
-from bms_estimator.edge.block_sender import check_edge
 from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.estimator.stability_conditions import Condition, failed_conditions
@@ -110,7 +109,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         settings = settings.model_copy(update={"mqtt": mqtt})
     if settings.edge is not None:
         edge, unseen = _here("edge", settings.edge)
-        warnings += unseen + check_edge(edge)
+        warnings += unseen + check_brokers(edge)
     if settings.page is not None:
         unread, unseen = _unread("page", settings.page, "token_file")
         warnings += unseen

@@ -15,7 +15,7 @@ from bms_estimator.mqtt.connection import BrokerConnectionError, Connect, Connec
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.protocols.base.reading import CONNECTED
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.broker import BrokerSettings
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
@@ -45,7 +45,7 @@ class MqttProducer(LineProducer):
     def __init__(
         self,
         settings: MqttSource,
-        mqtt: MqttSettings,
+        mqtt: BrokerSettings,
         *,
         connect: Connect | None = None,
         monotonic: Callable[[], float] = since_boot,
@@ -153,13 +153,8 @@ def producer(settings: Settings) -> MqttProducer:
     """
     source = settings.source
     assert isinstance(source, MqttSource)  # noqa: S101 - as KINDS has it
-    if source.url is not None:
-        broker = {"url": source.url, "username": source.username}
-        mqtt = MqttSettings(**broker, password_file=source.password_file, ca_file=source.ca_file)
-        try:
-            return MqttProducer(source, mqtt)
-        except UserError as error:
-            raise UserError(str(error).replace("mqtt.", "source.", 1)) from None
+    if source.broker is not None:
+        return MqttProducer(source, source.broker)
     if settings.mqtt is None:
         raise UserError("source.url: missing, and there is no section [mqtt] with a broker to use instead")
     return MqttProducer(source, settings.mqtt)
