@@ -1,92 +1,68 @@
-"""Progress of the compilation at a first start, which takes a minute or two."""
+"""Line on stderr while kernels compile: a first start takes a minute or two, later ones load them from the cache."""
 
-import math
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 
+from numba.core import event
 from rich.console import Console
-from rich.status import Status
+from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
-from bms_estimator.kernels.compile_events import report_compilation
-
-Show = Callable[[str], None]
-"""Takes a line."""
-LINE_S = 5.0
-"""Minimum interval between two lines where lines stay visible [s]."""
+TEXT = "compiling the kernels, once, a minute or two"
 
 
 @contextmanager
-def show_compile_progress(say: Show | None = None) -> Iterator[None]:
-    """Show meanwhile which kernel is compiled and how many there are; nothing where they are all in the cache.
+def show_compile_progress(say: Callable[[str], object] | None = None) -> Iterator[None]:
+    """Show a line with the elapsed time as soon as a kernel compiles; nothing if the cache has them all.
 
     Args:
-        say: Receives a line at intervals if stderr is not a terminal; else they go there.
-    """
-    console = Console(stderr=True)
-    shown = _status_line(console) if console.is_terminal else nullcontext(_now_and_then(say or _to_stderr))
-    with shown as show, _interrupted_between() as check:
-
-        def tell(kernel: str, number: int, most: int) -> None:
-            check()
-            show(f"compiling kernels, once: {number}/{most} {kernel}")
-
-        with report_compilation(tell):
-            yield
-
-
-@contextmanager
-def _status_line(console: Console) -> Iterator[Show]:
-    """One line that is gone in the end."""
-    status = Status("", console=console)
-
-    def show(text: str) -> None:
-        status.update(text)
-        status.start()
-
-    try:
-        yield show
-    finally:
-        status.stop()
-
-
-def _now_and_then(say: Show) -> Show:
-    said_s = -math.inf
-
-    def show(text: str) -> None:
-        nonlocal said_s
-        if time.monotonic() - said_s >= LINE_S:
-            said_s = time.monotonic()
-            say(text)
-
-    return show
-
-
-@contextmanager
-def _interrupted_between() -> Iterator[Callable[[], None]]:
-    """Make SIGINT wait for the next kernel: an exception inside the compiler is lost, and the compiler fails.
+        say: Receives the line if stderr is not a terminal; default: stderr.
 
     Raises:
-        KeyboardInterrupt: SIGINT arrived, and no kernel raised it.
+        KeyboardInterrupt: SIGINT arrived. It waits for the next kernel, because the compiler loses an exception.
     """
-    came = False
+    console = Console(stderr=True)
+    with ExitStack() as stack:
 
-    def note(*_: object) -> None:
-        nonlocal came
-        came = True
+        def show() -> None:
+            if console.is_terminal:
+                clock = Progress(TextColumn(TEXT), TimeElapsedColumn(), console=console, transient=True)
+                stack.enter_context(clock).add_task("")
+            else:
+                (say or _to_stderr)(TEXT)
 
-    def check() -> None:
-        if came:
+        listener = _Listener(show)
+        stack.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, listener.interrupt))
+        with event.install_listener("numba:compile", listener):
+            yield
+    listener.check()
+
+
+class _Listener(event.Listener):
+    """Listener for functions that numba compiles; it does not report cached ones."""
+
+    def __init__(self, show: Callable[[], None]) -> None:
+        self._show, self._shown, self._interrupted = show, False, False
+
+    def interrupt(self, *_: object) -> None:
+        """Handle SIGINT."""
+        self._interrupted = True
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt after SIGINT."""
+        if self._interrupted:
             raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield check
-    finally:
-        signal.signal(signal.SIGINT, before)
-    check()
+    def on_start(self, _: event.Event) -> None:
+        """Show the line at the first kernel; an inner function follows its caller."""
+        self.check()
+        if not self._shown:
+            self._shown = True
+            self._show()
+
+    def on_end(self, _: event.Event) -> None:
+        """Do nothing: the end of a compilation is not needed."""
 
 
 def _to_stderr(text: str) -> None:

@@ -1,4 +1,4 @@
-"""A first start shows which kernel is being compiled."""
+"""A first start shows that kernels are being compiled."""
 
 import os
 import signal
@@ -7,12 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.cli.options.compile_progress import TEXT, show_compile_progress
+from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.numba_cache import njit
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
 
 @pytest.mark.parametrize("command", ["demo", "replay", "run"])
-def test_a_first_start_says_which_kernel_it_compiles_and_can_be_interrupted(command: str, tmp_path: Path) -> None:
+def test_a_first_start_says_that_it_compiles_and_can_be_interrupted(command: str, tmp_path: Path) -> None:
     pack, table = tmp_path / "pack.toml", tmp_path / "table.csv"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
     table.write_text("time_s,current_a,voltage_v\n0,0,3.7\n1,0,3.7\n")
@@ -27,12 +30,23 @@ def test_a_first_start_says_which_kernel_it_compiles_and_can_be_interrupted(comm
     ) as process:
         try:
             assert process.stderr
-            first = next(line for line in process.stderr if "compiling kernels" in line)
+            first = next(line for line in process.stderr if TEXT in line)
             process.send_signal(signal.SIGINT)
             rest = process.stderr.read()
             assert process.wait(LONG_S) == 130
         finally:
             process.kill()
     assert "Traceback" not in rest
-    assert "compiling kernels, once: 1/" in first
     assert ('"level": "info"' in first) == (command == "run")
+
+
+def test_the_line_comes_once_and_only_if_a_kernel_compiles() -> None:
+    lines: list[str] = []
+    kernel = njit(chen_mora.crossing.py_func)  # not in the cache
+    with show_compile_progress(lines.append):
+        kernel(0.5, 1.0, 2.0)
+        njit(chen_mora.delta.py_func)(0.5, 1.0, 2.0)
+    assert lines == [TEXT]
+    with show_compile_progress(lines.append):
+        kernel(0.6, 1.0, 2.0)
+    assert lines == [TEXT]
