@@ -1,5 +1,7 @@
 """Fixtures that every test may use."""
 
+import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,8 +19,41 @@ __all__ = ["broker", "disk_without_files", "firmware", "full_disk", "line"]
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
+# OpenBLAS threads wait for each other in busy loops. With several workers that takes three times the CPU time of one
+# thread. Workers and the programs that tests start inherit the environment.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Without byte code, each worker and each started program compiles all modules again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+LONG_FILES = (
+    "tests/service/test_alarm_hooks.py",
+    "tests/home_assistant/test_home_assistant.py",
+    "tests/calibration/elements/test_identify.py",
+    "tests/page/test_browser.py",
+    "tests/fleet/simulation/test_demo.py",
+    "tests/fleet/worker/test_worker.py",
+    "tests/estimator/anywhere/test_anywhere.py",
+    "tests/service/test_process.py",
+    "tests/end_to_end/test_whole_way.py",
+    "tests/telemetry/test_alarms.py",
+    "tests/estimator/test_faults.py",
+    "tests/reports/test_errata.py",
+    "tests/firmware/test_firmware.py",
+    "tests/test_docs.py",
+    "tests/deploy/test_service.py",
+    "tests/fleet/page/test_browser.py",
+)
+"""Test files that take longest. They run first, so that no worker begins one when the others have ended."""
+
 DATA = Path(__file__).parent / "data"
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests of ``LONG_FILES`` first. The others follow in the order of collection."""
+    places = {file: place for place, file in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -7,6 +7,7 @@ that capture use a fit without it (hold-out).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -25,9 +26,9 @@ from bms_estimator.calibration.elements.ladder_fit import (
     MEASURED_PER_KELVIN_STD_V,
     PER_KELVIN_STD_V,
     SOC_NODES,
-    TYPICAL_DROP_V,
     ZERO_FRACTION,
     LadderFit,
+    Moments,
     Prior,
     correction_at,
     fit_ladder,
@@ -192,7 +193,9 @@ def identify(
         raise UserError("\n".join(found))
     runs = _recounted(runs, cell, refine_ocv=refine_ocv)
     left_out = tuple(load.name for load in cleaned if without_excitation(load, cell))
-    candidates = [_Candidate(runs, cell, refine_ocv=refine) for refine in ((False, True) if refine_ocv else (False,))]
+    moments_of_runs = _moments(runs, cell)
+    variants = (False, True) if refine_ocv else (False,)
+    candidates = [_Candidate(runs, moments_of_runs, cell, refine_ocv=refine) for refine in variants]
     before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
     after = [candidate.scores() for candidate in candidates]
     best = len(after) - 1  # without scores: the last candidate
@@ -215,29 +218,15 @@ def initial_soc(load: CleanCapture, cell: CellModel) -> float:
 class _Candidate:
     """One variant of the fit: with a corrected or with the given OCV."""
 
-    def __init__(self, runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> None:
-        self._runs, self._cell, self._refine = runs, cell, refine_ocv
-        steps = [ohm for ohm in (step_resistance(run.load) for run in runs) if ohm is not None]
-        self._scale_ohm = (
-            float(np.median(steps)) if steps else TYPICAL_DROP_V * cell.cell.series_count / cell.cell.capacity_ah
-        )
-        grid = np.linspace(0.0, 1.0, ocv_grid(cell)[0].size)
-        self._moments = []
-        for run in runs:
-            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + ocv_offset(cell, run.load_with_temperature, run.soc)
-            self._moments.append(
-                moments(
-                    run.load,
-                    run.soc,
-                    given_v,
-                    np.interp(run.soc, grid, ocv_grid(cell)[1]),
-                    run.temperature_c,
-                    self._scale_ohm,
-                    cell.cell.series_count,
-                    run.miscount,
-                )
-            )
-        self.fit, self.cell = self._fitted(range(len(runs)))
+    def __init__(self, runs: list[Run], moments_of_runs: list[Moments], cell: CellModel, *, refine_ocv: bool) -> None:
+        self._runs, self._moments, self._cell, self._refine = runs, moments_of_runs, cell, refine_ocv
+        self._scale_ohm = _resistance_scale(runs, cell)
+        self.fit = self._fit(range(len(runs)))
+
+    @cached_property
+    def cell(self) -> CellModel:
+        """Cell with the fit."""
+        return self._cell_from(self.fit, range(len(self._runs)))
 
     def miscounts(self) -> list[float]:
         """Return the additional miscount of each capture at which its voltage matches the fit."""
@@ -292,11 +281,12 @@ class _Candidate:
     def _cell_for(self, j: int) -> CellModel:
         if not self.held_back(j):
             return self.cell
-        return self._fitted([k for k in range(len(self._runs)) if k != j])[1]
+        others = [k for k in range(len(self._runs)) if k != j]
+        return self._cell_from(self._fit(others), others)
 
-    def _fitted(self, which: Sequence[int]) -> tuple[LadderFit, CellModel]:
-        runs = [self._runs[k] for k in which]
-        low_c, high_c = _temperature_range(runs)
+    def _fit(self, which: Sequence[int]) -> LadderFit:
+        """Fit the resistances to the captures ``which``."""
+        low_c, high_c = _temperature_range([self._runs[k] for k in which])
         given = self._cell.ladder
         spans_temperature = high_c - low_c >= SPAN_K
         series = self._cell.cell.series_count
@@ -309,7 +299,14 @@ class _Candidate:
             shapes=self._shapes(),
             weak_share=None if spans_temperature else weak_share(SOC_NODES) if given is None else _weak_share_of(given),
         )
-        fit = fit_ladder([self._moments[k] for k in which], prior)
+        return fit_ladder([self._moments[k] for k in which], prior)
+
+    def _cell_from(self, fit: LadderFit, which: Sequence[int]) -> CellModel:
+        """Return the cell with the fit to the captures ``which``."""
+        runs = [self._runs[k] for k in which]
+        low_c, high_c = _temperature_range(runs)
+        given = self._cell.ladder
+        spans_temperature = high_c - low_c >= SPAN_K
         if not spans_temperature and given is not None and given.std < GENERIC_STD:
             low_c, high_c = min(low_c, given.temperature_c[0]), max(high_c, given.temperature_c[1])
         ohm, ohm_std = fit.branches(0.5, 0, RESISTANCES)
@@ -326,7 +323,7 @@ class _Candidate:
             update["ocv"] = _corrected_ocv(self._cell, fit, entropy=spans_temperature)
         new = self._cell.model_copy(update=update)
         error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), 1e-5)
-        return fit, new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
+        return new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
 
     def _shapes(self) -> Floats:
         """Return the prior shape of the weak and strong part of each resistance over SOC, at ``SOC_NODES``.
@@ -357,10 +354,36 @@ def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: 
     return Run(load, start - load.discharged_ah / cell.cell.capacity_ah, temperature)
 
 
+def _resistance_scale(runs: list[Run], cell: CellModel) -> float:
+    """Return the scale of the resistances [ohm]: the median of the current steps, or a typical value without steps."""
+    steps = [ohm for ohm in (step_resistance(run.load) for run in runs) if ohm is not None]
+    return float(np.median(steps)) if steps else TYPICAL_DROP_V * cell.cell.series_count / cell.cell.capacity_ah
+
+
+def _moments(runs: list[Run], cell: CellModel) -> list[Moments]:
+    """Return the moments of the regression over each capture."""
+    scale_ohm = _resistance_scale(runs, cell)
+    grid_v, grid_slope_v = ocv_grid(cell)
+    grid = np.linspace(0.0, 1.0, grid_v.size)
+    return [
+        moments(
+            run.load,
+            run.soc,
+            np.interp(run.soc, grid, grid_v) + ocv_offset(cell, run.load_with_temperature, run.soc),
+            np.interp(run.soc, grid, grid_slope_v),
+            run.temperature_c,
+            scale_ohm,
+            cell.cell.series_count,
+            run.miscount,
+        )
+        for run in runs
+    ]
+
+
 def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
     """Return the captures with their charge corrected so that the knees of the OCV fit."""
     for _ in range(COUNT_PASSES):
-        miscounts = _Candidate(runs, cell, refine_ocv=refine_ocv).miscounts()
+        miscounts = _Candidate(runs, _moments(runs, cell), cell, refine_ocv=refine_ocv).miscounts()
         runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
     return runs
 
@@ -449,8 +472,8 @@ def _rms(cell: CellModel, run: Run) -> float:
 
 def _geometric_mean(scores: Floats) -> float:
     """Return the geometric mean, so that a capture with a high score for every cell file does not dominate."""
-    known = scores[np.isfinite(scores)]
-    return float(np.exp(np.log(known).mean())) if known.size else float("nan")
+    finite = scores[np.isfinite(scores)]
+    return float(np.exp(np.log(finite).mean())) if finite.size else float("nan")
 
 
 def _worse_replays(outcome: Identification) -> str:
