@@ -215,7 +215,7 @@ async def test_counters_that_cannot_be_are_not_believed_and_cost_nothing_else(
     CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTED, total=total))
     with capture_logs() as lines:
         health = (await run_samples(tmp_path, samples=1)).health
-    assert "counting begins anew" in lines[0]["event"]
+    assert "restart from zero" in lines[0]["event"]
     assert health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
     assert (health.restarts, health.total.crashes) == (1, 0)
     assert 0 <= health.total.samples["samples"] <= 1

@@ -1,4 +1,4 @@
-"""Keys of a terminal one by one, as they are pressed."""
+"""Key presses on a terminal, read one by one."""
 
 import asyncio
 import contextlib
@@ -21,14 +21,16 @@ KEYS = {
     b"\x1bOD": "previous",
     b"q": "quit",
 }
-"""Actions by the bytes that a terminal sends: Tab and the arrows, in both of their modes."""
-LONGEST = 3
+"""Actions by the bytes that a terminal sends: Tab, and arrow keys in normal and application mode."""
+MAX_SEQUENCE = 3
+"""Maximum length of a key's byte sequence."""
 READ_BYTES = 1024
+"""Maximum number of bytes read at once."""
 
 
 @contextlib.contextmanager
 def keys(press: Callable[[str], None]) -> Iterator[None]:
-    """Read key presses within the context; nothing where standard input is no terminal.
+    """Read key presses within the context, if standard input is a terminal.
 
     Args:
         press: Called with one of the values of ``KEYS``.
@@ -44,8 +46,8 @@ def keys(press: Callable[[str], None]) -> Iterator[None]:
         pressed = os.read(terminal, READ_BYTES)
         if not pressed:  # the terminal is gone
             loop.remove_reader(terminal)
-        for meaning in meanings(pressed):
-            press(meaning)
+        for action in actions(pressed):
+            press(action)
 
     tty.setcbreak(terminal)  # Ctrl-C still raises SIGINT
     loop.add_reader(terminal, read)
@@ -54,13 +56,14 @@ def keys(press: Callable[[str], None]) -> Iterator[None]:
     finally:
         loop.remove_reader(terminal)
         with contextlib.suppress(termios.error):  # the terminal is gone
-            termios.tcsetattr(terminal, termios.TCSANOW, before)  # stop before all is written: there may be no reader
+            # TCSANOW does not wait for the output, whose reader may be gone
+            termios.tcsetattr(terminal, termios.TCSANOW, before)
 
 
-def meanings(pressed: bytes) -> Iterator[str]:
-    """Return the actions of the keys in a terminal's input; skip keys without an action."""
+def actions(pressed: bytes) -> Iterator[str]:
+    """Yield the actions of the keys in a terminal's input; skip keys without an action."""
     while pressed:
-        for length in range(LONGEST, 0, -1):
+        for length in range(MAX_SEQUENCE, 0, -1):
             if pressed[:length] in KEYS:
                 yield KEYS[pressed[:length]]
                 break
