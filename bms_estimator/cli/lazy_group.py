@@ -1,4 +1,7 @@
-"""Commands that are imported when they run: ``--help`` stays fast, and a missing optional package hurts only what needs it."""
+"""Command group that imports a command only when it runs.
+
+``--help`` therefore stays fast, and a missing optional package affects only the commands that need it.
+"""
 
 import importlib
 from typing import Any, ClassVar, NamedTuple
@@ -8,7 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 
 
 class Entry(NamedTuple):
-    """A command that has not been imported yet."""
+    """Command that has not been imported yet."""
 
     target: str
     """``module:name`` of a function or a ``Typer``."""
@@ -16,16 +19,16 @@ class Entry(NamedTuple):
 
 
 class LazyGroup(TyperGroup):
-    """Lists commands from ``entries``, which a subclass has, and imports the one that is called."""
+    """Group that lists the commands in ``entries`` of a subclass and imports the one that is called."""
 
     entries: ClassVar[dict[str, Entry]]
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 - the signature is the base's
-        """Names of all commands, in the order in which one meets them."""
+        """Return the names of all commands in the order of ``entries``."""
         return list(self.entries)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Enough of a command to be listed."""
+        """Return a placeholder of a command, for listing."""
         entry = self.entries.get(cmd_name)
         return TyperCommand(cmd_name, help=entry.help) if entry else None
 

@@ -1,4 +1,4 @@
-"""``bms-estimator``: the table of commands, and what becomes of errors."""
+"""``bms-estimator``: table of commands, error messages and exit codes."""
 
 import errno
 import os
@@ -39,7 +39,7 @@ COMMANDS = {
     "capacity": Entry(
         "bms_estimator.cli.cell.capacity:capacity", "Measure the capacity from rests and the charge between them."
     ),
-    "cell": Entry("bms_estimator.cli.cell.export:app", "Write a cell file with what a pack's service has learned."),
+    "cell": Entry("bms_estimator.cli.cell.export:app", "Write a cell file from the learned state of a pack's service."),
     "history": Entry("bms_estimator.cli.live.history:history", "Print the history of a pack as CSV."),
     "validate": Entry(
         "bms_estimator.cli.captures.validate:validate_command", "Compare a cell's model with a capture, open loop."
@@ -67,9 +67,9 @@ EXTRAS = {
     "duckdb": "fleet",
     "nkeys": "fleet",
 }
-"""Optional package -> the extra that brings it."""
+"""Extras of ``bms_estimator`` by optional package."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""Errors of a full or broken disk. Space may be freed, so systemd should restart a service that ends with one."""
+"""Errors of a full or broken disk. Their exit code makes systemd restart a service, because space may be freed."""
 
 
 class _Commands(LazyGroup):
@@ -88,30 +88,30 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _root(
     _version: bool = typer.Option(
-        False, "--version", callback=_print_version, is_eager=True, help="Show the version and end."
+        False, "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
     ),
 ) -> None:
     """Real-time estimator of a Li-ion battery: SOC, parameters and stability margins."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and end the process.
+    """Run the command line and exit.
 
-    Exit codes: 0 done, 1 an internal error (with its traceback), or the reader of stdout has gone, or a disk is full or broken
-    (without), 2 something a person can mend, 130 interrupted.
+    Exit codes: 0 success; 1 an internal error (with traceback), a closed stdout, or a full or broken disk; 2 an error
+    that the user can correct; 130 interrupted.
 
     Args:
-        arguments: Without the program's name; None: the process's.
+        arguments: Arguments without the program's name; None: those of the process.
     """
     try:
         _run(arguments)
     except UserError as error:
-        _end(str(error), 1 if _is_of_a_disk(error) else 2)
+        _exit_with_error(str(error), 1 if _is_of_a_disk(error) else 2)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package not in EXTRAS:
             raise
-        _end(f"this needs {package}: pip install 'bms_estimator[{EXTRAS[package]}]'")
+        _exit_with_error(f"this needs {package}: pip install 'bms_estimator[{EXTRAS[package]}]'")
     except BrokenPipeError:
         _leave_stdout()
         sys.exit(1)
@@ -119,13 +119,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not _is_of_a_disk(error):
             raise
         _leave_stdout()
-        _end(f"cannot write{f' {error.filename}' if error.filename else ''}: {error.strerror}", 1)
-    except KeyboardInterrupt:  # while a command was imported
+        _exit_with_error(f"cannot write{f' {error.filename}' if error.filename else ''}: {error.strerror}", 1)
+    except KeyboardInterrupt:  # during the import of a command; typer handles later ones
         sys.exit(130)
 
 
 def _run(arguments: Sequence[str] | None) -> None:
-    """Run the command line; flush the remaining output here, where an error of stdout can still be reported."""
+    """Run the command line, and flush stdout while an error can still be reported."""
     try:
         app(None if arguments is None else list(arguments), prog_name="bms-estimator")
     except SystemExit:
@@ -142,14 +142,14 @@ def _is_of_a_disk(error: BaseException | None) -> bool:
 
 
 def _leave_stdout() -> None:
-    """Let nothing more fail: the interpreter flushes stdout once again as it ends."""
+    """Redirect stdout to the null device, because the interpreter's flush at exit would fail again."""
     if not sys.stdout:
         return
-    with Path(os.devnull).open("wb") as nowhere:
-        os.dup2(nowhere.fileno(), sys.stdout.fileno())
+    with Path(os.devnull).open("wb") as null:
+        os.dup2(null.fileno(), sys.stdout.fileno())
 
 
-def _end(message: str, code: int = 2) -> None:
+def _exit_with_error(message: str, code: int = 2) -> None:
     for line in message.splitlines():
         sys.stderr.write(f"error: {line}\n")
     sys.exit(code)

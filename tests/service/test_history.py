@@ -214,7 +214,7 @@ async def test_implausible_counters_are_reset_and_the_state_is_restored(tmp_path
     CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTED, total=total))
     with capture_logs() as lines:
         health = (await run_samples(tmp_path, samples=1)).health
-    assert "counting begins anew" in lines[0]["event"]
+    assert "restart from zero" in lines[0]["event"]
     assert health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
     assert (health.restarts, health.total.crashes) == (1, 0)
     assert 0 <= health.total.samples["samples"] <= 1

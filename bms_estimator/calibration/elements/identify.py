@@ -26,6 +26,7 @@ from bms_estimator.calibration.elements.ladder_fit import (
     MEASURED_PER_KELVIN_STD_V,
     PER_KELVIN_STD_V,
     SOC_NODES,
+    TYPICAL_DROP_V,
     ZERO_FRACTION,
     LadderFit,
     Moments,

@@ -1,4 +1,4 @@
-"""``bms-estimator alarms``: which alarms a capture would have raised, to try limits before they matter."""
+"""``bms-estimator alarms``: alarms that a capture would have raised, for choosing limits."""
 
 import asyncio
 import json
@@ -31,20 +31,20 @@ from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.telemetry.alarms import Change
 
 STEP_S = 1.0
-"""Interval at which the identifier's suspicions are read, on the capture's clock [s]."""
+"""Maximum length of a block, so that alarms are evaluated at this interval of the capture's clock [s]."""
 
 
 @dataclass
-class Raised:
-    """An alarm that was raised; times on the capture's clock [s]."""
+class RaisedAlarm:
+    """Alarm that was raised; times on the capture's clock [s]."""
 
     alarm: str
     severity: str
     raised_s: float
     ended_s: float | None
-    """Time of its end; None: active at the end."""
+    """Time of its end; None if it is active at the end of the capture."""
     latched: bool
-    """True if its cause has ended but it waits for acknowledgment."""
+    """True if it is active only because it was not acknowledged."""
     value: float | None
     limit: float | None
     unit: str | None
@@ -52,14 +52,14 @@ class Raised:
 
 
 @dataclass
-class Found:
-    """Alarms raised by a capture, and alarms that it has no data for."""
+class AlarmResult:
+    """Alarms raised by a capture, not raised, and not monitored for lack of data."""
 
-    raised: list[Raised]
+    raised: list[RaisedAlarm]
     quiet: Sequence[str]
-    """Watched, and not raised."""
+    """Monitored alarms that were not raised."""
     unmeasured: Sequence[str]
-    """Monitored alarms whose quantity the capture lacks."""
+    """Alarms whose quantity the capture lacks."""
 
 
 def alarms(
@@ -87,15 +87,15 @@ def alarms(
         settings = with_pack(settings, initial_soc=soc)
     with _quiet(), standard_input() if str(capture) == "-" else nullcontext(capture) as path:
         with show_compile_progress():
-            read = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
-        source = Replay(read, longest_s=STEP_S)
-        found = asyncio.run(_found(settings, model, source))
+            opened = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
+        source = Replay(opened, longest_s=STEP_S)
+        result = asyncio.run(_evaluate(settings, model, source))
         if source.samples == 0:
             raise UserError(f"{path}: holds no sample")
     if as_json:
-        sys.stdout.write(json.dumps(asdict(found)) + "\n")
+        sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
-        _show(path.name, found)
+        _print(path.name, result)
 
 
 @contextmanager
@@ -109,54 +109,54 @@ def _quiet() -> Iterator[None]:
         structlog.configure(**before)
 
 
-async def _found(settings: Settings, cell: PackModel, source: Replay) -> Found:
+async def _evaluate(settings: Settings, cell: PackModel, source: Replay) -> AlarmResult:
     now_s, changes = 0.0, list[Change]()
     with show_compile_progress():
         estimator = new_estimator(settings, cell)
     without_hooks = settings.alarms.model_copy(update={"hook": ()})
     settings = settings.model_copy(update={"alarms": without_hooks})
-    clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # only the capture's matters
-    watch = AlarmMonitor(settings, cell, estimator, source, clock, changes.append)
+    clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
+    monitor = AlarmMonitor(settings, cell, estimator, source, clock, changes.append)
     async for block in source:
         now_s = max(now_s, float(block["time_s"][-1]))
-        watch.add(block, estimator.run(block), now_s)
-    watch.evaluate(now_s)
-    shown = watch.alarms.report()
-    raised, latched = _paired(changes), {alarm.name for alarm in shown if alarm.latched}
+        monitor.add(block, estimator.run(block), now_s)
+    monitor.evaluate(now_s)
+    reported = monitor.alarms.report()
+    raised, latched = _pair_changes(changes), {alarm.name for alarm in reported if alarm.latched}
     for each in raised:
         each.latched = each.ended_s is None and each.alarm in latched
-    known, names = {alarm.name for alarm in shown}, {each.alarm for each in raised}
-    quiet = [name for name in watch.alarms.names() if name in known and name not in names]
-    return Found(raised, quiet, [name for name in watch.alarms.names() if name not in known])
+    measured, raised_names = {alarm.name for alarm in reported}, {each.alarm for each in raised}
+    quiet = [name for name in monitor.alarms.names() if name in measured and name not in raised_names]
+    return AlarmResult(raised, quiet, [name for name in monitor.alarms.names() if name not in measured])
 
 
-def _paired(changes: list[Change]) -> list[Raised]:
-    """Each alarm with its end."""
-    found: list[Raised] = []
-    for at_s, alarm, turn in changes:
-        if turn == "watched":
+def _pair_changes(changes: list[Change]) -> list[RaisedAlarm]:
+    """Combine the changes of alarms to raised alarms with their ends."""
+    raised: list[RaisedAlarm] = []
+    for at_s, alarm, kind in changes:
+        if kind == "watched":
             continue
         if alarm.active:
-            told = alarm.value, alarm.limit, alarm.unit, alarm.text
-            found.append(Raised(alarm.name, alarm.severity, at_s, None, False, *told))
+            values = alarm.value, alarm.limit, alarm.unit, alarm.text
+            raised.append(RaisedAlarm(alarm.name, alarm.severity, at_s, None, False, *values))
         else:
-            next(each for each in reversed(found) if each.alarm == alarm.name).ended_s = at_s
-    return found
+            next(each for each in reversed(raised) if each.alarm == alarm.name).ended_s = at_s
+    return raised
 
 
-def _show(title: str, found: Found) -> None:
+def _print(title: str, result: AlarmResult) -> None:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("raised", "ended", "alarm"):
         table.add_column(column, justify="left" if column == "alarm" else "right", no_wrap=True)
     table.add_column("")
-    for each in found.raised:
+    for each in result.raised:
         end = "latched" if each.latched else "active" if each.ended_s is None else f"{each.ended_s:,.1f} s"
         colour = "red" if each.severity == "critical" else "yellow"
         table.add_row(f"{each.raised_s:,.1f} s", end, f"[{colour}]{each.alarm}[/]", each.text)
     console = Console()
-    if found.raised:
+    if result.raised:
         console.print(table)
     else:
         console.print(f"{title}: no alarm")
-    console.print(f"not raised: {', '.join(found.quiet) or '-'}")
-    console.print(f"not measured here: {', '.join(found.unmeasured) or '-'}")
+    console.print(f"not raised: {', '.join(result.quiet) or '-'}")
+    console.print(f"not measured here: {', '.join(result.unmeasured) or '-'}")

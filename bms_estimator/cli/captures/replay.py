@@ -1,4 +1,4 @@
-"""``bms-estimator replay``: the estimator over a capture."""
+"""``bms-estimator replay``: estimates from a capture."""
 
 import asyncio
 import json
@@ -44,8 +44,8 @@ from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 
-MANY = 0.01
-"""Part of the samples that is more than a glitch now and then."""
+MAX_GLITCHES = 0.01
+"""Fraction of dropped samples above which a systematic cause is reported."""
 
 
 def replay(
@@ -85,8 +85,8 @@ def replay(
     with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
         with show_compile_progress():
             source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
-        replayed = Replay(source, speed=speed)
-        result = asyncio.run(_replay(settings, model, replayed, table_sink(out) if out else None))
+        replay_source = Replay(source, speed=speed)
+        result = asyncio.run(_replay(settings, model, replay_source, table_sink(out) if out else None))
         if isinstance(source, RawCapture):
             for warning in _unread(source, result.duration_s or 0.0):
                 typer.echo(f"warning: {capture}: {warning}", err=True)
@@ -103,17 +103,17 @@ def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
     if source.damaged:
         yield f"damaged after {duration_s:.1f} s; the rest was not read"
     if source.unread_bytes:
-        yield f"its last {source.unread_bytes:,} bytes are no whole record: cut off there, or a length is damaged"
+        yield f"the last {source.unread_bytes:,} bytes are no complete record: truncated, or a length is damaged"
 
 
 async def _replay(settings: Settings, cell: PackModel, source: Replay, table: TableSink | None) -> Result:
-    """Source -> estimator -> table, summary, broker."""
+    """Run the estimator over a source, and pass its trace to table, summary and broker."""
     with show_compile_progress():
         estimator, summary = new_estimator(settings, cell), Summary()
     async with AsyncExitStack() as stack:
         publisher = await _publisher(stack, settings, cell, estimator, source)
         stack.enter_context(table or nullcontext())
-        show = stack.enter_context(_progress(source))
+        update_progress = stack.enter_context(_progress(source))
         started_s, impossible = time.perf_counter(), None
         async for block in source:
             trace = estimator.run(block)
@@ -125,7 +125,7 @@ async def _replay(settings: Settings, cell: PackModel, source: Replay, table: Ta
             if publisher:
                 publisher.add(block, trace)
                 await asyncio.sleep(0)
-            show()
+            update_progress()
         wall_s = time.perf_counter() - started_s
         if publisher:
             publisher.publish_last()
@@ -136,7 +136,7 @@ async def _replay(settings: Settings, cell: PackModel, source: Replay, table: Ta
 async def _publisher(
     stack: AsyncExitStack, settings: Settings, cell: PackModel, estimator: Estimator, source: Replay
 ) -> Publisher | None:
-    """Return the publisher, if there is a broker."""
+    """Return the publisher; None without a broker."""
     if settings.mqtt is None:
         return None
     delivery = DeliveryStats()
@@ -198,23 +198,24 @@ def _soc(result: Result) -> dict[str, str]:
 
 
 def _temperature(result: Result) -> dict[str, str]:
-    unusable = f"{result.temperatures_dropped:,} values that no cell has"
+    dropped = f"{result.temperatures_dropped:,} implausible values"
     if not result.temperature_sensor:
-        none = unusable if result.temperatures_dropped else "not measured"
-        return {"temperature": f"{none}: the band is wider"}
-    return {"temperature": unusable} if result.temperatures_dropped else {}
+        reason = dropped if result.temperatures_dropped else "not measured"
+        return {"temperature": f"{reason}: the band is wider"}
+    return {"temperature": dropped} if result.temperatures_dropped else {}
 
 
 def _set_back(result: Result) -> str:
-    """Describe how often the clock was set back."""
+    """Return the number of backward steps of the clock, with the likely cause if there are many."""
     text = f"{result.time_steps_back:,} times"
-    return f"{text}: are the rows in the order of time?" if result.time_steps_back > MANY * result.samples else text
+    is_frequent = result.time_steps_back > MAX_GLITCHES * result.samples
+    return f"{text}: are the rows in the order of time?" if is_frequent else text
 
 
 def _dropped(result: Result) -> str:
-    """Return the rows on dropped samples, with the reasons if they are more than single samples."""
+    """Return the counts of dropped samples, with the likely cause if there are many."""
     text, number = dropped_text(result.dropped), sum(result.dropped.values())
-    return f"{text}; {result.impossible}" if result.impossible and number > MANY * result.samples else text
+    return f"{text}; {result.impossible}" if result.impossible and number > MAX_GLITCHES * result.samples else text
 
 
 def _text(value: float | None, form: str, unit: str = "", scale: float = 1.0) -> str:

@@ -1,4 +1,4 @@
-"""Summary of a replay: sums over the trace, then one object for tables and JSON."""
+"""Summary of a replay, for tables and JSON."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from bms_estimator.telemetry.state import finite
 
 @dataclass(frozen=True)
 class LearnedParameter:
-    """Parameter as learned at the end; None without a value."""
+    """Parameter learned at the end of a replay; None for missing numbers."""
 
     value: float | None
     std: float | None
@@ -26,36 +26,44 @@ class LearnedParameter:
 class Result:
     """Result of a replay; None for missing numbers."""
 
-    samples: int  # accepted
-    duration_s: float | None  # from the first to the last of them, on the capture's clock
+    samples: int
+    """Number of accepted samples."""
+    duration_s: float | None
+    """Time from the first to the last accepted sample, on the capture's clock."""
     soc_initial: float | None
     soc_final: float | None
-    soc_std_final: float | None  # of the identifier; None without it
+    soc_std_final: float | None
+    """Standard deviation by the identifier; None without it."""
     soc_rms_difference_to_coulomb: float | None
-    innovation_rms_v: float | None  # measured less predicted, before the correction
-    voltage_rms_error_v: float | None  # measured less estimated, after it
+    innovation_rms_v: float | None
+    """RMS of measured minus predicted voltage, before the correction by the measurement."""
+    voltage_rms_error_v: float | None
+    """RMS of measured minus estimated voltage, after the correction by the measurement."""
     lock_lost: bool
     lock_losses: int
     k_final: float | None
-    temperature_sensor: bool  # the capture has the cell's temperature
+    temperature_sensor: bool
+    """True if the capture has the cell's temperature."""
     suspects: list[str]
-    """Suspicions of the identifier at the end."""
+    """Input diagnostics of the identifier at the end."""
     gain_rearms: int
     dropped: dict[str, int]
-    """Kind of fault -> samples that were not used."""
+    """Number of dropped samples by kind of fault."""
     impossible: str | None
-    """The last sample that no such cell can give, and what may be the matter."""
-    temperatures_dropped: int  # values that no cell has
+    """Description of the last sample outside the cell's limits, with the likely cause."""
+    temperatures_dropped: int
+    """Number of implausible temperatures."""
     gaps: int
     time_steps_back: int
     parameters: dict[str, LearnedParameter]
     """Parameters of a fuel cell by the keys of its file; empty for a battery, whose parameters depend on SOC."""
-    samples_per_s: float | None  # read, whether used or not
+    samples_per_s: float | None
+    """Number of all samples, accepted or not, per second."""
     wall_s: float
 
 
 class Summary:
-    """Sums over trace blocks."""
+    """Accumulator of sums over trace blocks."""
 
     def __init__(self) -> None:
         self._rows = 0
@@ -65,7 +73,7 @@ class Summary:
         self._innovation = self._error = self._soc_difference = 0.0
 
     def add(self, trace: NDArray[np.void]) -> None:
-        """Take a block of dtype TRACE."""
+        """Add a block of dtype TRACE."""
         if trace.size == 0:
             return
         if self._first is None:
@@ -84,9 +92,9 @@ class Summary:
         """Return the result of the replay.
 
         Args:
-            estimator: After the last sample.
+            estimator: Estimator after the last sample.
             read: Number of samples in the capture.
-            wall_s: Duration [s].
+            wall_s: Duration of the replay [s].
         """
         record, settings = estimator.record[0], estimator.settings_record[0]
         state = record["observer"]
@@ -125,8 +133,8 @@ class Summary:
 def _learned(estimator: Estimator) -> dict[str, LearnedParameter]:
     if not isinstance(estimator.cell, FuelCellModel) or not estimator.state[0]["started"]:
         return {}
-    found = fuel_cell_parameters(estimator, 0.0)
-    return {name: LearnedParameter(p.value, p.std, p.valid) for name, p in found.items()}
+    parameters = fuel_cell_parameters(estimator, 0.0)
+    return {name: LearnedParameter(p.value, p.std, p.valid) for name, p in parameters.items()}
 
 
 def _field(row: np.void | None, name: str) -> float | None:

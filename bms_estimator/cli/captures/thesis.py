@@ -1,4 +1,4 @@
-"""``bms-estimator thesis``: the thesis recomputed, as a report."""
+"""``bms-estimator thesis``: report that recomputes the thesis."""
 
 import textwrap
 import time
@@ -25,16 +25,16 @@ from bms_estimator.reports.html import LONG_CELL, write
 from bms_estimator.reports.thesis_report import Report, build
 from bms_estimator.sources.captures.replay import load_capture
 
-WIDE = 160
-"""A table of the thesis is not squeezed into fewer columns."""
+MIN_WIDTH = 160
+"""Minimum width of a printed table of the thesis [characters]."""
 
 
 def thesis(
     captures: Annotated[
         list[Path] | None,
-        typer.Argument(help="for chapter 5: recorded captures, CSV (.gz) or Parquet; else a simulated 6S pack"),
+        typer.Argument(help="recorded captures for chapter 5, CSV (.gz) or Parquet; default: a simulated 6S pack"),
     ] = None,
-    cell: Annotated[str | None, typer.Option(help=f"of the captures: {CELL_HELP}", show_default=False)] = None,
+    cell: Annotated[str | None, typer.Option(help=f"cell of the captures: {CELL_HELP}", show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     resolution_v: Annotated[
         float, typer.Option(parser=decimal(1e-9), help="voltage step of the captures [V]")
@@ -69,7 +69,7 @@ def _recorded(
     captures: list[Path], cell: str | None, capacity_ah: float | None, resolution_v: float, current_sign: SignOfCurrent
 ) -> Recorded:
     if cell is None:
-        raise UserError("captures need --cell NAME|CELL.toml: its capacity, limits and bounds")
+        raise UserError("captures need --cell NAME|CELL.toml for capacity, limits and bounds")
     check_once(captures)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     named = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
@@ -96,7 +96,7 @@ def _show(console: Console, report: Report) -> None:
                 shown.add_column(textwrap.fill(column, 12), justify="left" if text else "right", no_wrap=not text)
             for row in item.rows:
                 shown.add_row(*row)
-            Console(width=max(console.width, WIDE)).print(shown)
+            Console(width=max(console.width, MIN_WIDTH)).print(shown)
         else:
             console.print(f"Figure {item.key}  {item.title}", highlight=False)
         console.print(f"{report_items.label(item)}: {item.reason}", highlight=False)

@@ -1,4 +1,4 @@
-"""``bms-estimator validate``: a cell's model against a capture."""
+"""``bms-estimator validate``: comparison of a cell's model with a capture."""
 
 import json
 import math
@@ -94,4 +94,4 @@ def _tables(capture: Path, found: Validation) -> Group:
             percents = (f"{e.mean_abs_percent:.3f} %", f"{e.max_abs_percent:.2f} %")
             table.add_row(name, f"{e.samples:,}", f"{1e3 * e.voltage_rms_v:.2f} mV", *percents)
     soc = f"SOC {found.initial_soc:.4f} ({found.initial_soc_from}) to {found.final_soc:.4f}"
-    return Group(table, f"{soc}; {found.glitches} glitches left out")
+    return Group(table, f"{soc}; {found.glitches} glitches skipped")

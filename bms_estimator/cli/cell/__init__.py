@@ -1,1 +1,1 @@
-"""Commands that make cell files."""
+"""Commands that write cell files."""

@@ -1,4 +1,4 @@
-"""``bms-estimator adapt``: the thesis's steps 2 and 3 on captures, into a cell file."""
+"""``bms-estimator adapt``: cell file by the thesis's steps 2 and 3 from captures."""
 
 import json
 import math
@@ -105,7 +105,7 @@ def _remarks(cell: str, found: Adaptation) -> list[str]:
 
 
 def _a_table(found: Adaptation) -> Table:
-    """a1..a15, a row for each element."""
+    """Return a1..a15 as a table with a row for each element."""
     table = Table("element", "amplitude", "exponent", "offset", box=box.SIMPLE_HEAD)
     for name, first in (("R_ts", 1), ("R_tl", 4), ("C_ts", 7), ("C_tl", 10), ("R_s", 13)):
         table.add_row(f"{name}: a{first}..a{first + 2}", *(f"{x:.4g}" for x in found.steps.a[first : first + 3]))

@@ -1,4 +1,4 @@
-"""``bms-estimator capacity``: capacity from rests and the charge counted between them."""
+"""``bms-estimator capacity``: capacity from rests and the charge between them."""
 
 import json
 import sys
@@ -19,29 +19,31 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import load_capture
 
 SHOWN_ANCHORS = 30
-UNITS = 30.0
-"""Maximum ratio of declared and measured capacity."""
-"""Maximum number of rows printed as a table; ``--json`` has all."""
+"""Maximum number of printed anchors; ``--json`` prints all."""
+MAX_RATIO = 30.0
+"""Maximum ratio of declared and measured capacity; a larger one comes from wrong units."""
 
 
 @dataclass(frozen=True)
 class AnchorResult:
-    """One anchor, as ``--json`` prints it."""
+    """Anchor (a rest with its SOC) in the output of ``--json``."""
 
     capture: str
     time_s: float
     rest_s: float
     ocv_v: float
-    ocv_std_v: float  # of the rest, without the curve's error
+    ocv_std_v: float
+    """Standard deviation of the rest's OCV, without the error of the OCV curve."""
     soc: float
     soc_std: float
     counted_ah: float
-    off: float  # SOC by the voltage less that by the charge
+    off: float
+    """SOC by the voltage minus SOC by the charge."""
 
 
 @dataclass(frozen=True)
 class CapacityResult:
-    """The outcome, as ``--json`` prints it."""
+    """Output of ``--json``."""
 
     capacity_ah: float
     capacity_std_ah: float
@@ -77,9 +79,10 @@ def capacity(
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     found = measure_capacity(loaded, model, offset_std_a=current_offset_std_a)
-    if not 1.0 / UNITS < found.capacity_ah / model.cell.capacity_ah < UNITS:
+    if not 1.0 / MAX_RATIO < found.capacity_ah / model.cell.capacity_ah < MAX_RATIO:
         raise UserError(
-            f"{found.capacity_ah:.4g} Ah where {model.cell.capacity_ah:.4g} Ah is declared: is the current in amperes, the time in seconds?"
+            f"{found.capacity_ah:.4g} Ah, but {model.cell.capacity_ah:.4g} Ah is declared: is the current in amperes and "
+            "the time in seconds?"
         )
     result = _result(found, model)
     if as_json:
@@ -114,7 +117,7 @@ def _anchor(anchor: Anchor, off: float) -> AnchorResult:
     )
 
 
-def _counted(anchors: int) -> str:
+def _anchor_count(anchors: int) -> str:
     more = f", the first {SHOWN_ANCHORS} above (--json: all)" if anchors > SHOWN_ANCHORS else ""
     return f"{anchors} anchors{more}"
 
@@ -124,19 +127,19 @@ def _shown(result: CapacityResult) -> Group:
     anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "off", box=box.SIMPLE_HEAD)
     for column in anchors.columns[1:]:
         column.justify, column.no_wrap = "right", True
-    for one in result.anchors[:SHOWN_ANCHORS]:
+    for anchor in result.anchors[:SHOWN_ANCHORS]:
         anchors.add_row(
-            one.capture,
-            f"{one.time_s:.0f} s",
-            f"{one.rest_s / 60.0:.0f} min",
-            f"{one.ocv_v:.4f} V",
-            f"{one.soc:.3f} ± {one.soc_std:.3f}",
-            f"{one.counted_ah:.3f} Ah",
-            f"{one.off:+.3f}",
+            anchor.capture,
+            f"{anchor.time_s:.0f} s",
+            f"{anchor.rest_s / 60.0:.0f} min",
+            f"{anchor.ocv_v:.4f} V",
+            f"{anchor.soc:.3f} ± {anchor.soc_std:.3f}",
+            f"{anchor.counted_ah:.3f} Ah",
+            f"{anchor.off:+.3f}",
         )
     lines = [
         f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah, declared {result.declared_ah:.4g} Ah",
         f"offset of the current sensor {1e3 * result.current_offset_a:+.1f} ± {1e3 * result.current_offset_std_a:.1f} mA",
-        f"{_counted(len(result.anchors))}, {len(result.rejected)} rests that are none",
+        f"{_anchor_count(len(result.anchors))}, {len(result.rejected)} rejected rests",
     ]
     return Group(anchors, *lines)

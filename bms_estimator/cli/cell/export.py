@@ -1,4 +1,4 @@
-"""``bms-estimator cell``: what a pack's service has learned, as a cell file."""
+"""``bms-estimator cell``: cell file from the learned state of a pack's service."""
 
 import json
 import math
@@ -19,27 +19,30 @@ from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="What a pack's service has learned of its cells.")
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Cell file from a service's learned state.")
 
 TENTHS = np.linspace(0.0, 1.0, 11)
 
 
 @dataclass(frozen=True)
 class Exported:
-    """The outcome, as ``--json`` prints it."""
+    """Output of ``--json``."""
 
     out: str
     checkpoint: str
     capacity_ah: float
     capacity_std_ah: float
-    r_s_factor: float  # over the configured cell's
-    ocv_correction_mv: list[float]  # of one cell of the file, at SOC 0, 0.1 ... 1
+    r_s_factor: float
+    """Ratio of the learned R_s to that of the configured cell."""
+    ocv_correction_mv: list[float]
+    """Correction of the OCV of one object of the cell file, at SOC 0, 0.1 ... 1."""
     ocv_error_mv: list[float]
+    """Standard deviation of the corrected OCV at these SOC."""
 
 
 @app.callback()
 def _group() -> None:
-    """Keep ``export`` a command of its own name."""
+    """Make typer keep ``export`` as a subcommand, although it is the only one."""
 
 
 @app.command()
@@ -54,7 +57,7 @@ def export(
 ) -> None:
     """Write a cell file from a pack's checkpoint: OCV, capacity and resistances, each with its error.
 
-    A service that uses the file starts with what this one has learned.
+    A service that uses the file starts with the learned values.
     """
     settings, model = load_pack(pack)
     cell, series = unpacked_cell(pack, settings), settings.pack.series
@@ -64,16 +67,16 @@ def export(
     check_out(out, [pack, file.path], force=force)
     if checkpoint and not checkpoint.exists():
         raise UserError(f"--checkpoint {checkpoint}: no such file")
-    found = file.load()
-    if found.reason:
+    content = file.load()
+    if content.reason:
         raise UserError(
-            f"{file.path}: no checkpoint to export: {found.reason}; a service of {pack} saves one each "
+            f"{file.path}: no checkpoint to export: {content.reason}; a service of {pack} saves one each "
             f"{settings.state.checkpoint_s:g} s (--checkpoint names another file)"
         )
     estimator = new_estimator(settings, model)
-    wrong = restore_state(estimator, found.state, 0.0)
-    if wrong or not estimator.record[0]["filter"]["started"]:
-        raise UserError(f"{file.path}: nothing to export: {wrong or 'the identifier was off, it has learned nothing'}")
+    reason = restore_state(estimator, content.state, 0.0)
+    if reason or not estimator.record[0]["filter"]["started"]:
+        raise UserError(f"{file.path}: nothing to export: {reason or 'the identifier was off, it has learned nothing'}")
     learned = identified_cell(estimator, cell, series)
     renamed = learned.model_copy(update={"cell": learned.cell.model_copy(update={"name": name_of(out)})})
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], TENTHS)

@@ -1,4 +1,4 @@
-"""``bms-estimator identify``: a cell's resistances from captures, into a cell file."""
+"""``bms-estimator identify``: cell file with resistances from captures."""
 
 import json
 import math
@@ -63,7 +63,7 @@ def identify_command(
     check_once(captures)
     if is_fuel_cell(cell):
         if capacity_ah is not None or soc is not None or keep_ocv:
-            raise UserError(f"{cell} is a fuel cell: --capacity-ah, --soc and --keep-ocv are of batteries")
+            raise UserError(f"{cell} is a fuel cell: --capacity-ah, --soc and --keep-ocv apply only to batteries")
         identify_fuel_cell(captures, cell, out, temperature_c=temperature_c, current_sign=current_sign, as_json=as_json)
         return
     model = load_cell(cell, capacity_ah)
@@ -165,7 +165,7 @@ def _tables(out: Path, found: Identification, seconds: float) -> Group:
     if found.ocv_correction_v:
         lines.append(f"OCV corrected by {1e3 * found.ocv_correction_v:.1f} mV RMS")
     if found.left_out:
-        lines.append(f"left out, too small a current to tell of resistances: {', '.join(found.left_out)}")
+        lines.append(f"skipped, because the current is too small for resistances: {', '.join(found.left_out)}")
     return Group(shown, fits, *lines, f"{seconds:.1f} s")
 
 

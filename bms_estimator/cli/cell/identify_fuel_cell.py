@@ -1,4 +1,4 @@
-"""``bms-estimator identify`` of a fuel cell: its parameters from polarisation curves and records, into a file."""
+"""``bms-estimator identify`` for a fuel cell: parameters from polarization curves and records."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, fit_fuel_cell
-from bms_estimator.cli.options.capture_options import name_of, unlike
+from bms_estimator.cli.options.capture_options import name_of, unique_names
 from bms_estimator.kernels.kalman_filter.temperature import MAX_PLAUSIBLE_C, MIN_PLAUSIBLE_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell_file import write_cell
@@ -26,21 +26,22 @@ from bms_estimator.sources.captures.curves import read_polarisation
 from bms_estimator.sources.captures.replay import load_capture
 
 DIGITS = 4
-FEWEST = 3
-"""Points that a curve or record needs."""
+"""Significant digits of printed values."""
+MIN_POINTS = 3
+"""Minimum number of usable points in a curve or record."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """A parameter as it is printed."""
+    """Identified parameter in the output."""
 
     value: float
     std: float | None
-    """Std of the value in its unit; None if the data did not determine it."""
+    """Standard deviation in the parameter's unit; None if the data do not determine the parameter."""
     of_start: float
     """Value in the file of --cell."""
     reason: str | None
-    """Reason why the data do not determine it."""
+    """Reason for which the data do not determine the parameter."""
 
 
 def identify_fuel_cell(
@@ -52,13 +53,13 @@ def identify_fuel_cell(
     current_sign: CurrentSign | None,
     as_json: bool,
 ) -> None:
-    """Identify, write the file and print the outcome; arguments as of ``identify_command``."""
+    """Identify the parameters, write the file and print the result; arguments as in ``identify_command``."""
     if temperature_c is not None and not MIN_PLAUSIBLE_C <= temperature_c <= MAX_PLAUSIBLE_C:
         raise UserError(
             f"--temperature-c {temperature_c:g}: must lie within {MIN_PLAUSIBLE_C:g} and {MAX_PLAUSIBLE_C:g} C"
         )
     start = load_fuel_cell(cell)
-    names = unlike([name_of(path) for path in paths], paths)
+    names = unique_names([name_of(path) for path in paths], paths)
     sources = [_source(*one, start, temperature_c, current_sign) for one in zip(names, paths, strict=True)]
     started_s = time.perf_counter()
     fit = fit_fuel_cell(sources, start)
@@ -85,7 +86,7 @@ def identify_fuel_cell(
 def _source(
     name: str, path: Path, model: FuelCellModel, temperature_c: float | None, sign: CurrentSign | None
 ) -> Source:
-    """Read a polarization curve if the file has no times, else a record; drop samples that no such stack can give."""
+    """Read a polarization curve, or a record if the file has times; drop samples outside the stack's limits."""
     points = read_polarisation(path)
     if points is not None:
         time_s, (current_a, voltage_v, sensed_c) = None, points.T
@@ -110,10 +111,10 @@ def _source(
 
 
 def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floats) -> NDArray[np.bool_]:
-    """Return which points such a stack can give, shape (n,).
+    """Return a mask of the points within the stack's limits, shape (n,).
 
     Raises:
-        UserError: Most have another sign, or too few are left.
+        UserError: Most currents have the wrong sign, or too few points are left.
     """
     c = model.cell
     charging = current_a < -model.fuel_cell.internal_current_a
@@ -121,16 +122,18 @@ def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floa
         raise UserError(f"{path}: the current is negative, but a fuel cell takes no charge: is --current-sign right?")
     good: NDArray[np.bool_] = (voltage_v >= c.voltage_min_v) & (voltage_v <= c.voltage_max_v)
     good &= (current_a <= c.current_max_a) & ~charging
-    if good.sum() < FEWEST:
+    if good.sum() < MIN_POINTS:
         limits = f"{c.voltage_min_v:g} to {c.voltage_max_v:g} V and up to {c.current_max_a:g} A"
-        raise UserError(f"{path}: {good.sum()} usable points: give at least {FEWEST} of {limits}, as {c.name} has them")
+        raise UserError(f"{path}: {good.sum()} usable points: give at least {MIN_POINTS} within {limits} of {c.name}")
     return good
 
 
 def _remarks(cell: str, fit: FuelCellFit) -> list[str]:
     fits = ", ".join(f"{name} ({1e3 * rms_v:.1f} mV RMS)" for name, rms_v in fit.rms_v.items())
-    kept = f"As in the file, because the data do not tell: {', '.join(fit.undetermined)}." if fit.undetermined else ""
-    return [line for line in (f"Identified from {fits}, begun at {Path(cell).name}.", kept) if line]
+    kept = (
+        f"Unchanged, because the data do not determine them: {', '.join(fit.undetermined)}." if fit.undetermined else ""
+    )
+    return [line for line in (f"Identified from {fits}, initial values from {Path(cell).name}.", kept) if line]
 
 
 def _tables(out: Path, values: dict[str, Value], fit: FuelCellFit, seconds: float) -> Group:

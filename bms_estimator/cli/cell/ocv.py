@@ -1,4 +1,4 @@
-"""``bms-estimator ocv``: open-circuit voltage from rests, slow curves and given curves, into a cell file."""
+"""``bms-estimator ocv``: cell file with the open-circuit voltage from rests, slow discharges and tabulated curves."""
 
 import json
 import sys
@@ -39,7 +39,7 @@ from bms_estimator.cli.options.capture_options import (
     check_once,
     check_out,
     name_of,
-    unlike,
+    unique_names,
 )
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
@@ -50,23 +50,22 @@ from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.replay import load_capture
 
 CELL_VOLTAGE_V = 3.7
-"""Voltage of one Li-ion cell in the middle of its discharge [V], which gives the number of cells in series."""
-LOWEST_CELL_V, HIGHEST_CELL_V, MAX_CELLS = 1.5, 4.5, 300
-"""Range of that voltage for any cell [V], and maximum number of cells in series."""
-LOWEST, HIGHEST = 0.55, 1.06
-"""Limits of a good sample: of the median voltage, of the full one."""
-MIN_EMPTY = 0.25
-"""An empty cell has at least this part of the voltage of a half full one."""
+"""Voltage of one Li-ion cell at half charge [V], from which the number of cells in series is estimated."""
+MIN_CELL_V, MAX_CELL_V, MAX_CELLS = 1.5, 4.5, 300
+"""Plausible range of the voltage of one cell at half charge [V], and maximum number of cells in series."""
+MIN_VOLTAGE_RATIO, MAX_VOLTAGE_RATIO = 0.55, 1.06
+"""Limits of a valid sample as fractions of the OCV at SOC 0.5 (minimum) and at SOC 1 (maximum)."""
+MIN_EMPTY_RATIO = 0.25
+"""Minimum plausible ratio of the OCV at SOC 0 to that at SOC 0.5."""
 MEASURED_CAPACITY_STD = 0.03
-"""Relative std of a capacity measured by a slow discharge: gain of the current sensor, other cells of the kind, some
-years."""
+"""Relative standard deviation of a capacity measured by a slow discharge. It covers the gain of the current sensor,
+differences between cells of the type, and ageing over some years."""
 CURRENT_MAX_C = 5.0
-"""Limit of a good sample when the capture itself has no larger current [1/h]."""
-
-
-STEEP = 0.05
-"""SOC from the ends within which curves are steep."""
+"""Current limit of a valid sample as a multiple of the capacity [1/h], if the captures have no larger current."""
+STEEP_SOC = 0.05
+"""Width of the ranges at both ends of the SOC in which OCV curves are steep."""
 TENTHS = np.linspace(0.0, 1.0, 11)
+"""SOC at which the error of the table is printed."""
 
 
 class Form(StrEnum):
@@ -78,39 +77,51 @@ class Form(StrEnum):
 
 @dataclass(frozen=True)
 class SourceResult:
-    """Kind of a source and quality of its fit, as printed by ``--json``."""
+    """Kind of a source and quality of its fit, in the output of ``--json``."""
 
     name: str
     kind: str
     points: int
     temperature_c: float | None
-    off_mv: float | None  # RMS of what the source is off as a whole; None for (2.10)
-    hysteresis_mv: float | None  # mean over SOC
+    off_mv: float | None
+    """RMS difference of the whole source from the curve; None for (2.10)."""
+    hysteresis_mv: float | None
+    """Mean hysteresis over SOC."""
     notes: list[str]
 
 
 @dataclass(frozen=True)
 class OcvResult:
-    """The outcome, as ``--json`` prints it."""
+    """Output of ``--json``."""
 
     form: str
     capacity_ah: float
-    capacity_measured_ah: float | None  # by a slow discharge from full to empty
-    generic: str  # the most similar generic cell supplies what the sources do not: resistances ...
-    usual_hysteresis: bool  # ... and hysteresis
+    capacity_measured_ah: float | None
+    """Capacity by a slow discharge from full to empty; None without one."""
+    generic: str
+    """Most similar generic cell, from which resistances are scaled."""
+    usual_hysteresis: bool
+    """True if the hysteresis is that of the generic cell, because no source determines it."""
     series_count: int
     points: int
     soc: list[float]
-    ocv_v: list[float]  # of rests extrapolated to infinite time
+    ocv_v: list[float]
+    """OCV of the points; that of rests is extrapolated to infinite time."""
     std_v: list[float]
-    rms_mv: float  # points less curve
+    rms_mv: float
+    """RMS of points minus curve."""
     max_mv: float
-    rms_inside_mv: float  # at SOC 0.05 to 0.95, away from the steep ends
-    error_mv: list[float]  # standard deviation of the table at SOC 0, 0.1 ... 1; none for (2.10)
-    parameters: dict[str, dict[str, float | None]]  # a16..a21: value, std (None at a bound); none for a table
+    rms_inside_mv: float
+    """RMS of points minus curve at SOC 0.05 to 0.95, away from the steep ends."""
+    error_mv: list[float]
+    """Standard deviation of the table at SOC 0, 0.1 ... 1; empty for (2.10)."""
+    parameters: dict[str, dict[str, float | None]]
+    """Values and standard deviations (None at a bound) of a16..a21; empty for a table."""
     sources: list[SourceResult]
-    captures: dict[str, dict[str, float]]  # those with rests
-    remaining_v: list[float]  # remaining relaxation at the end of each rest
+    captures: dict[str, dict[str, float]]
+    """Captures with rests."""
+    remaining_v: list[float]
+    """Remaining relaxation at the end of each rest."""
     rejected: list[str]
 
 
@@ -152,14 +163,14 @@ def ocv(
     check_out(out, captures, force=force)
     check_once(captures)
     recordings, curves = [], []
-    for name, path in zip(unlike([path.name for path in captures], captures), captures, strict=True):
+    for name, path in zip(unique_names([path.name for path in captures], captures), captures, strict=True):
         columns = read_curve(path)
         if columns is None:
             recordings.append(Recording(name, load_capture(path, current_sign=current_sign).rows))
         else:
             curves.append(ExternalCurve(name, *columns))
-    good = [_moving(one) for one in recordings]
-    count = _cells_in_series(np.concatenate([*good, *(curve.ocv_v for curve in curves)]), series)
+    voltages_v = [_checked_voltage(recording) for recording in recordings]
+    count = _cells_in_series(np.concatenate([*voltages_v, *(curve.ocv_v for curve in curves)]), series)
     found = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
     fitted: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
     curve_v = fitted(found.points)(NODES)
@@ -181,46 +192,46 @@ def ocv(
         console.print(_sources_table(result))
 
 
-def _moving(one: Recording) -> NDArray[np.float64]:
+def _checked_voltage(recording: Recording) -> NDArray[np.float64]:
     """Return the voltage without glitches [V].
 
     Raises:
-        UserError: It is always the same.
+        UserError: The voltage is constant.
     """
-    voltage_v = remove_glitches(one.samples, one.name)["voltage_v"]
+    voltage_v = remove_glitches(recording.samples, recording.name)["voltage_v"]
     if np.ptp(voltage_v) == 0.0:
-        raise UserError(f"{one.name}: the voltage is {voltage_v[0]:g} V throughout: is the sensor connected?")
+        raise UserError(f"{recording.name}: the voltage is {voltage_v[0]:g} V throughout: is the sensor connected?")
     return voltage_v
 
 
-def _cells_in_series(voltage_v: NDArray[np.float64], told: int | None) -> int:
-    """Return the configured value, else one by the usual voltage of a cell.
+def _cells_in_series(voltage_v: NDArray[np.float64], configured: int | None) -> int:
+    """Return the configured number of cells in series, or an estimate from the median voltage.
 
     Raises:
-        UserError: No cell has what each of them would have.
+        UserError: The voltage of one cell would be implausible.
     """
     middle_v = float(np.median(voltage_v))
-    count = told or max(round(middle_v / CELL_VOLTAGE_V), 1)
-    if not told and count > MAX_CELLS:
+    count = configured or max(round(middle_v / CELL_VOLTAGE_V), 1)
+    if not configured and count > MAX_CELLS:
         raise UserError(
-            f"the voltage is {middle_v:g} V, that of {count} cells in series: are these millivolts? else give --series"
+            f"the voltage is {middle_v:g} V, that of {count} cells in series: are these millivolts? If not, give --series"
         )
-    if not LOWEST_CELL_V <= middle_v / count <= HIGHEST_CELL_V:
+    if not MIN_CELL_V <= middle_v / count <= MAX_CELL_V:
         raise UserError(f"--series {count}: {middle_v:g} V would be {middle_v / count:.2f} V per cell")
     return count
 
 
 def _check_ends(fit: ChenMoraFit | TableFit, found: OcvSources) -> None:
-    """Check that the curve does not fall to 0 V beyond its points.
+    """Check that the curve, extrapolated beyond its points, does not fall to 0 V.
 
     Raises:
-        UserError: It does.
+        UserError: The OCV at SOC 0 is implausible.
     """
-    lowest_v, middle_v = (float(v) for v in fit(np.array([0.0, 0.5])))
-    if lowest_v > MIN_EMPTY * middle_v:
+    empty_v, middle_v = (float(v) for v in fit(np.array([0.0, 0.5])))
+    if empty_v > MIN_EMPTY_RATIO * middle_v:
         return
     raise UserError(
-        f"the points begin at SOC {found.points.soc[0]:.2f}, and their curve would be {lowest_v:.2f} V at SOC 0: give captures "
+        f"the points begin at SOC {found.points.soc[0]:.2f}, and their curve would be {empty_v:.2f} V at SOC 0: give captures "
         f"down to empty, or the right capacity; {found.capacity_ah:g} Ah is too much if the cell was emptied [--capacity-ah]"
     )
 
@@ -244,7 +255,7 @@ def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, found: 
         std_v=points.std_v.tolist(),
         rms_mv=1e3 * rms_v(fit.residual_v),
         max_mv=1e3 * max_v(fit.residual_v),
-        rms_inside_mv=1e3 * rms_v(fit.residual_v[(points.soc > STEEP) & (points.soc < 1.0 - STEEP)]),
+        rms_inside_mv=1e3 * rms_v(fit.residual_v[(points.soc > STEEP_SOC) & (points.soc < 1.0 - STEEP_SOC)]),
         error_mv=(1e3 * fit.error_at(TENTHS)).tolist() if isinstance(fit, TableFit) else [],
         parameters=parameters,
         sources=_source_results(fit, found),
@@ -274,8 +285,11 @@ def _or_none(value: float) -> float | None:
 
 
 def _elements(generic: CellModel, found: OcvSources, recordings: list[Recording]) -> tuple[Ladder, dict[str, object]]:
-    """Resistances over SOC, and a1..a15 by their sections: by the rests of one capture, else the generic cell's."""
-    test = _warmest(found.tests)
+    """Return resistances over SOC, and a1..a15 by section.
+
+    Both come from the rests of the warmest capture; without rests, from the generic cell.
+    """
+    test = _nearest_to_reference(found.tests)
     if test is None:
         return scaled_generic_ladder(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
     rests = initial_elements(next(r.samples for r in recordings if r.name == test.name), test, found.capacity_ah)
@@ -287,39 +301,39 @@ def _elements(generic: CellModel, found: OcvSources, recordings: list[Recording]
 def _cell(
     name: str, series_count: int, fit: ChenMoraFit | TableFit, found: OcvSources, recordings: list[Recording]
 ) -> dict[str, object]:
-    """Return the cell's section with limits of a good sample, and its OCV section."""
+    """Return the section ``cell`` with limits of a valid sample, and the section ``ocv``."""
     middle_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
-    lowest_v = float(fit(np.array([0.0]))[0])
-    largest_a = max((float(np.nanmax(np.abs(one.samples["current_a"]))) for one in recordings), default=0.0)
+    empty_v = float(fit(np.array([0.0]))[0])
+    peak_a = max((float(np.nanmax(np.abs(each.samples["current_a"]))) for each in recordings), default=0.0)
     cell = Cell(
         name=name,
         capacity_ah=round(found.capacity_ah, 4),
         capacity_std=MEASURED_CAPACITY_STD if found.capacity_ah == found.measured_ah else None,
         series_count=series_count,
         nominal_voltage_v=round(middle_v, 2),
-        voltage_min_v=round(min(LOWEST * middle_v, lowest_v), 2),
-        voltage_max_v=round(HIGHEST * full_v, 2),
-        current_max_a=round(max(CURRENT_MAX_C * found.capacity_ah, 1.5 * largest_a), 3),
+        voltage_min_v=round(min(MIN_VOLTAGE_RATIO * middle_v, empty_v), 2),
+        voltage_max_v=round(MAX_VOLTAGE_RATIO * full_v, 2),
+        current_max_a=round(max(CURRENT_MAX_C * found.capacity_ah, 1.5 * peak_a), 3),
     )
     ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(found.hysteresis_v, found.hysteresis_std_v)
     return {"cell": cell, "ocv": ocv}
 
 
-def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
-    """Return the test nearest to 25 C; the first test if none has a temperature."""
-    away_k = [np.nan_to_num(abs(test.temperature_c - REFERENCE_C), nan=np.inf) for test in tests]
-    return tests[int(np.argmin(away_k))] if tests else None
+def _nearest_to_reference(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
+    """Return the test nearest to 25 °C; the first test if none has a temperature."""
+    distance_k = [np.nan_to_num(abs(test.temperature_c - REFERENCE_C), nan=np.inf) for test in tests]
+    return tests[int(np.argmin(distance_k))] if tests else None
 
 
 def _remarks(result: OcvResult) -> list[str]:
-    like = f"the generic {result.generic}"
-    hysteresis = [f"Hysteresis: that of {like}, no source tells it."] if result.usual_hysteresis else []
-    elements = f"one value each from the rests of one capture, over SOC and temperature as those of {like}"
+    generic = f"the generic {result.generic}"
+    hysteresis = [f"Hysteresis: that of {generic}, because no source determines it."] if result.usual_hysteresis else []
+    elements = f"values from the rests of one capture, with the dependence on SOC and temperature of {generic}"
     return [
         f"OCV: {', '.join(f'{source.kind} of {source.name}' for source in result.sources)};",
-        f"the {result.form} form lies {result.rms_mv:.2f} mV RMS off the points, {result.max_mv:.2f} mV at most.",
+        f"the {result.form} form differs from the points by {result.rms_mv:.2f} mV RMS, at most {result.max_mv:.2f} mV.",
         *hysteresis,
-        f"Elements: {elements if result.captures else f'those of {like}'}, a start for identify.",
+        f"Elements: {elements if result.captures else f'those of {generic}'}; initial values for identify.",
     ]
 
 
@@ -336,14 +350,14 @@ def _table(out: Path, result: OcvResult, found: OcvSources) -> Table:
         + ("" if measured is None else f", a slow discharge {measured:.4g} Ah"),
         "cells in series": f"{result.series_count}",
         "std of a point": f"{np.median(std_mv):.2f} mV, at most {std_mv.max():.2f} mV",
-        "points less curve": f"{result.rms_mv:.2f} mV RMS, at most {result.max_mv:.2f} mV",
-        f"the same at SOC {STEEP:g} to {1.0 - STEEP:g}": f"{result.rms_inside_mv:.2f} mV RMS",
+        "points minus curve": f"{result.rms_mv:.2f} mV RMS, at most {result.max_mv:.2f} mV",
+        f"points minus curve, SOC {STEEP_SOC:g} to {1.0 - STEEP_SOC:g}": f"{result.rms_inside_mv:.2f} mV RMS",
     }
     if result.captures:
-        left_mv = 1e3 * np.abs(result.remaining_v)
-        rows["left to relax at a rest's end"] = f"{np.median(left_mv):.2f} mV, at most {left_mv.max():.2f} mV"
-        rows["rests that gave none"] = f"{len(result.rejected)}"
-        rows["glitches left out"] = f"{sum(test.glitches for test in found.tests)}"
+        remaining_mv = 1e3 * np.abs(result.remaining_v)
+        rows["relaxation after a rest"] = f"{np.median(remaining_mv):.2f} mV, at most {remaining_mv.max():.2f} mV"
+        rows["rejected rests"] = f"{len(result.rejected)}"
+        rows["skipped glitches"] = f"{sum(test.glitches for test in found.tests)}"
     if result.error_mv:
         rows["error of the curve at SOC 0, 0.1 ... 1"] = " ".join(f"{mv:.0f}" for mv in result.error_mv) + " mV"
     for name, parameter in result.parameters.items():
@@ -355,8 +369,8 @@ def _table(out: Path, result: OcvResult, found: OcvSources) -> Table:
 
 
 def _sources_table(result: OcvResult) -> Table:
-    """Return a table of the kind that each source was recognized as."""
-    table = Table("source", "found to be", "C", "off", "hysteresis", box=box.SIMPLE_HEAD)
+    """Return a table with the recognized kind of each source."""
+    table = Table("source", "recognized as", "°C", "off", "hysteresis", box=box.SIMPLE_HEAD)
     for source in result.sources:
         table.add_row(
             source.name,

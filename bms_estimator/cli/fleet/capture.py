@@ -1,4 +1,4 @@
-"""``bms-estimator fleet capture``: what a pack has sent, as a capture."""
+"""``bms-estimator fleet capture``: table of a pack's stored samples."""
 
 import asyncio
 import math
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.cli.options.capture_options import Force, check_out
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
@@ -18,11 +18,10 @@ if TYPE_CHECKING:
     from bms_estimator.fleet.identification.block_capture import BlockCapture
 
 FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
-FEW = 5
+MAX_SHOWN_GAPS = 5
 """Maximum number of gaps shown."""
-BLOCK_S = 120.0
-"""Maximum delay of the first block after the requested start that is not reported as missing [s]: a block has about a
-minute."""
+MAX_START_DELAY_S = 120.0
+"""Maximum delay of the first block after the requested start that is not reported [s]; a block lasts about a minute."""
 
 Since = Annotated[
     datetime | None, typer.Option("--from", formats=FORMATS, help="start time, UTC; default: the oldest block")
@@ -33,7 +32,7 @@ Until = Annotated[
 
 
 def capture(
-    pack: Annotated[str, typer.Argument(help="its name", show_default=False)],
+    pack: Annotated[str, typer.Argument(help="name of the pack", show_default=False)],
     out: Annotated[Path, typer.Argument(help="table to write: .parquet, .csv.gz or .csv", show_default=False)],
     since: Since = None,
     until: Until = None,
@@ -50,9 +49,9 @@ def capture(
     check_out(out, [], force=force)
     sink = table_sink(out)
     since_s, until_s = epoch_s(since, -math.inf), epoch_s(until, math.inf)
-    found = asyncio.run(fetched(pack, since_s, until_s, (server, creds, ca)))
+    found = asyncio.run(fetch_blocks(pack, since_s, until_s, (server, creds, ca)))
     if not found.blocks:
-        raise UserError(nothing(pack, found))
+        raise UserError(no_samples_reason(pack, found))
     rows = 0
     with sink:
         for block in found.samples():
@@ -64,14 +63,12 @@ def capture(
         typer.echo(f"warning: {pack}: {line}", err=True)
 
 
-def epoch_s(time: datetime | None, otherwise_s: float) -> float:
+def epoch_s(time: datetime | None, default_s: float) -> float:
     """Convert a UTC time to seconds since 1970."""
-    return otherwise_s if time is None else time.replace(tzinfo=UTC).timestamp()
+    return default_s if time is None else time.replace(tzinfo=UTC).timestamp()
 
 
-async def fetched(
-    pack: str, since_s: float, until_s: float, where: tuple[str, Path | None, Path | None]
-) -> "BlockCapture":
+async def fetch_blocks(pack: str, since_s: float, until_s: float, address: ServerAddress) -> "BlockCapture":
     """Return the blocks of a pack that the server still has.
 
     Raises:
@@ -80,28 +77,28 @@ async def fetched(
     from bms_estimator.fleet.identification.block_capture import fetch  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
 
-    async with connected(*where) as nc:
+    async with connected(*address) as nc:
         return await fetch(nc, pack, since_s=since_s, until_s=until_s)
 
 
-def nothing(pack: str, found: "BlockCapture") -> str:
-    """Why there is no sample of a pack."""
-    damaged = f"; {found.damaged} messages of it were no blocks" if found.damaged else ""
+def no_samples_reason(pack: str, found: "BlockCapture") -> str:
+    """Return the error text for a pack without samples."""
+    damaged = f"; {found.damaged} of its messages are not blocks" if found.damaged else ""
     return (
-        f"{pack}: the server keeps no sample of it in this span{damaged}; is its name right, does its edge send "
-        "(`fleet packs list` has the table, the streams keep blocks as long as `fleet serve` was told)?"
+        f"{pack}: the server has no samples of it in this period{damaged}; is the name right, and does its edge send? "
+        "(`fleet packs list` prints the names; server.raw_days limits the age of blocks)"
     )
 
 
 def _warnings(found: "BlockCapture", since_s: float) -> list[str]:
     first_s, _ = found.span_s
     lines = []
-    if since_s > -math.inf and first_s > since_s + BLOCK_S:
-        lines.append(f"from {iso_utc(since_s)} was asked for; what is kept begins at {iso_utc(first_s)}")
+    if since_s > -math.inf and first_s > since_s + MAX_START_DELAY_S:
+        lines.append(f"the stored samples begin at {iso_utc(first_s)}, after the requested {iso_utc(since_s)}")
     if found.missing:
-        holes = ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in found.missing[:FEW])
-        more = f" and {len(found.missing) - FEW} more holes" if len(found.missing) > FEW else ""
-        lines.append(f"blocks {holes}{more} are not there: they were lost, or the edge sends them again")
+        gaps = ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in found.missing[:MAX_SHOWN_GAPS])
+        more = f" and {len(found.missing) - MAX_SHOWN_GAPS} more gaps" if len(found.missing) > MAX_SHOWN_GAPS else ""
+        lines.append(f"blocks {gaps}{more} are missing: lost, or yet to be sent again by the edge")
     if found.damaged:
-        lines.append(f"{found.damaged} messages were no blocks")
+        lines.append(f"{found.damaged} messages are not blocks")
     return lines

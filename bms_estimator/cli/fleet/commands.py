@@ -1,21 +1,23 @@
-"""``bms-estimator fleet``: the table of its commands."""
+"""``bms-estimator fleet``: table of its commands."""
 
 import typer
 
 from bms_estimator.cli.lazy_group import Entry, LazyGroup
 
 COMMANDS = {
-    "demo": Entry("bms_estimator.cli.fleet.demo:demo", "Server, simulated packs, workers and page in one terminal."),
+    "demo": Entry(
+        "bms_estimator.cli.fleet.demo:demo", "Run server, simulated packs, workers and page in one terminal."
+    ),
     "serve": Entry("bms_estimator.cli.fleet.serve:serve", "Run a node of the server, with its streams."),
     "user": Entry("bms_estimator.cli.fleet.serve:user", "Print the token with which a tenant's pack connects."),
     "worker": Entry("bms_estimator.cli.fleet.worker:worker", "Estimate the packs of some partitions."),
-    "packs": Entry("bms_estimator.cli.fleet.packs:app", "Which cells each pack has: load, list, show, remove."),
-    "capture": Entry("bms_estimator.cli.fleet.capture:capture", "What a pack has sent, as a capture for replay."),
-    "identify": Entry("bms_estimator.cli.fleet.identify:identify", "Identify packs anew from what they have sent."),
-    "collect": Entry("bms_estimator.cli.fleet.queries:collect", "Write the summaries of hours to Parquet."),
-    "ask": Entry("bms_estimator.cli.fleet.queries:ask", "Questions to the summaries of all packs."),
-    "page": Entry("bms_estimator.cli.fleet.page:page", "The page of all packs."),
-    "simulate": Entry("bms_estimator.cli.fleet.simulate:simulate", "Edges of many simulated packs."),
+    "packs": Entry("bms_estimator.cli.fleet.packs:app", "Load, list, show or remove packs and their cells."),
+    "capture": Entry("bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a table."),
+    "identify": Entry("bms_estimator.cli.fleet.identify:identify", "Re-identify packs from their stored samples."),
+    "collect": Entry("bms_estimator.cli.fleet.queries:collect", "Write hourly summaries to Parquet."),
+    "ask": Entry("bms_estimator.cli.fleet.queries:ask", "Query the hourly summaries of all packs."),
+    "page": Entry("bms_estimator.cli.fleet.page:page", "Serve the page of all packs."),
+    "simulate": Entry("bms_estimator.cli.fleet.simulate:simulate", "Simulate the edges of many packs."),
 }
 
 
@@ -28,4 +30,4 @@ app = typer.Typer(cls=_Commands, no_args_is_help=True, add_completion=False, hel
 
 @app.callback()
 def _group() -> None:
-    """Keep it a group."""
+    """Make typer keep this group, although its commands are added lazily."""

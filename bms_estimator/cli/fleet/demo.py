@@ -32,7 +32,7 @@ def demo(
     with show_compile_progress():
         load_fleet_kernels()
     with tempfile.TemporaryDirectory(prefix="fleet-demo-") as folder:
-        opened = open_browser if browser else _leave
+        opened = open_browser if browser else _ignore_url
         asyncio.run(_run(Demo(packs, seconds, page_port or free_port(), Path(folder), typer.echo, opened)))
 
 
@@ -40,5 +40,5 @@ async def _run(demo: Demo) -> None:
     await run_demo(demo, stop_on_signal())
 
 
-def _leave(_url: str) -> None:
-    """Open nothing."""
+def _ignore_url(_url: str) -> None:
+    """Do not open a browser."""

@@ -35,7 +35,7 @@ RESULTS = "results.csv"
 
 
 def identify(
-    packs: Annotated[list[str] | None, typer.Argument(help="their names", show_default=False)] = None,
+    packs: Annotated[list[str] | None, typer.Argument(help="names of packs", show_default=False)] = None,
     from_file: Annotated[
         Path | None, typer.Option(help="file with names, one a line, or a CSV with the column pack", show_default=False)
     ] = None,
@@ -55,8 +55,8 @@ def identify(
 ) -> None:
     """Re-identify packs from the blocks on the server.
 
-    Two thirds of the samples identify; the last third judges the old cell and the new one by the voltage that each
-    predicts. A cell file is written only if the new one is better; the reason is given for each other pack.
+    A new cell is identified from two thirds of the samples. The last third decides whether the new or the old cell
+    predicts the voltage better. A cell file is written only if the new one is better; otherwise the reason is given.
     """
     where = (server, creds, ca)
     names = _names(packs or [], from_file)
@@ -71,15 +71,15 @@ def identify(
         if sys.stderr.isatty():
             typer.echo(f"{len(found)} of {len(names)}: {outcome.pack}", err=True)
     _write_results(out / RESULTS, found)
-    unput = asyncio.run(_put(found, known, where)) if put else []
+    changed = asyncio.run(_put(found, known, where)) if put else []
     if as_json:
         typer.echo(json.dumps([_row(one) for one in found]))
     else:
         better = sum(bool(one.cell_file) for one in found)
         typer.echo(f"{out}: {better} of {len(found)} packs have a better cell")
         Console().print(_table(found))
-    for pack in unput:
-        typer.echo(f"warning: {pack}: its row was changed meanwhile; its new cell was not put", err=True)
+    for pack in changed:
+        typer.echo(f"warning: {pack}: its row was changed meanwhile; its new cell was not uploaded", err=True)
 
 
 def _outcomes(
@@ -103,7 +103,11 @@ def _outcomes(
 
 
 def _names(packs: Sequence[str], from_file: Path | None) -> list[str]:
-    """Each once, in their order."""
+    """Return the names of the command line and the file, in order, without duplicates.
+
+    Raises:
+        UserError: There is no name, or the file cannot be read.
+    """
     names = [*packs, *(_listed(from_file) if from_file is not None else [])]
     if not names:
         raise UserError("name at least one pack, or give --from-file LIST")
@@ -122,19 +126,19 @@ def _listed(path: Path) -> list[str]:
 
 
 async def _put(found: Sequence["ReidentificationResult"], known: PackRegistry, where: ServerAddress) -> list[str]:
-    """Put new cells, and let their packs' rows name them; returns the packs whose row another client has changed."""
+    """Upload new cells and the rows that name them. Return the packs whose rows another client has changed."""
     from bms_estimator.fleet.identification.reidentify import cell_name  # noqa: PLC0415
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.packs.pack_bucket import put, read_bucket  # noqa: PLC0415
 
     cells, rows, changed = dict[str, bytes](), dict[str, bytes](), list[str]()
     async with connected(*where) as nc:
-        held = await read_bucket(nc, PACKS_BUCKET)
+        stored_rows = await read_bucket(nc, PACKS_BUCKET)
         for one in found:
             kind = known.kind(one.pack)
             if not one.cell_file or not isinstance(kind, PackSpec):
                 continue
-            if held.get(one.pack) != stored(kind):
+            if stored_rows.get(one.pack) != stored(kind):
                 changed.append(one.pack)
                 continue
             name = cell_name(one.pack)
@@ -165,8 +169,8 @@ def _write_results(path: Path, found: Sequence["ReidentificationResult"]) -> Non
 def _table(found: Sequence["ReidentificationResult"]) -> Table:
     """Return a table of the values before and after."""
     table = Table(box=box.SIMPLE_HEAD)
-    for column in ("pack", "hours", "Ah", "R_s [mohm]", "RMS [mV]", "", "why not"):
-        table.add_column(column, justify="left" if column in ("pack", "", "why not") else "right")
+    for column in ("pack", "hours", "Ah", "R_s [mohm]", "RMS [mV]", "method", "reason"):
+        table.add_column(column, justify="left" if column in ("pack", "method", "reason") else "right")
     for one in found:
         table.add_row(
             one.pack,
@@ -183,8 +187,8 @@ def _table(found: Sequence["ReidentificationResult"]) -> Table:
 def _change(before: float, after: float, std: float, factor: float) -> str:
     if not math.isfinite(after):
         return _number(factor * before, 3) if math.isfinite(before) else "-"
-    sure = f" ± {factor * std:.2g}" if math.isfinite(std) else ""
-    return f"{factor * before:.4g} to {factor * after:.4g}{sure}"
+    uncertainty = f" ± {factor * std:.2g}" if math.isfinite(std) else ""
+    return f"{factor * before:.4g} to {factor * after:.4g}{uncertainty}"
 
 
 def _number(value: float, digits: int) -> str:

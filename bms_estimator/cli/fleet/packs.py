@@ -1,4 +1,4 @@
-"""``bms-estimator fleet packs``: which cells each pack has."""
+"""``bms-estimator fleet packs``: table of packs and their cells."""
 
 import asyncio
 import sys
@@ -17,7 +17,7 @@ from bms_estimator.fleet.packs.pack_row import PackSpec, model_key, settings_of
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Which cells each pack has.")
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Table of packs and their cells.")
 
 
 @app.command()
@@ -32,9 +32,9 @@ def load(
 
     Workers use changes within seconds. A cell that ends in .toml is a cell file beside the table.
     """
-    read = read_table(table)
-    files = {name: _text(path) for name, path in read.cell_files.items()}
-    typer.echo(asyncio.run(_load(table, read, files, (server, creds, ca), remove=remove)))
+    packs = read_table(table)
+    files = {name: _text(path) for name, path in packs.cell_files.items()}
+    typer.echo(asyncio.run(_load(table, packs, files, (server, creds, ca), remove=remove)))
 
 
 @app.command("list")
@@ -42,10 +42,9 @@ def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> N
     """Print the server's table as CSV that `load` reads; errors in rows go to stderr."""
     known = asyncio.run(known_packs((server, creds, ca)))
     kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackSpec)}
-    of_each = {
-        model_key(kind): pack for pack, kind in reversed(kinds.items())
-    }  # one pack, whose cell represents the others
-    for pack in (*(pack for pack in sorted(known) if pack not in kinds), *of_each.values()):
+    # packs with equal models have equal errors, so that one pack of each model is checked
+    representatives = {model_key(kind): pack for pack, kind in reversed(kinds.items())}
+    for pack in (*(pack for pack in sorted(known) if pack not in kinds), *representatives.values()):
         if reason := known.reason(pack):
             typer.echo(f"warning: {pack}: {reason}", err=True)
     sys.stdout.writelines(table_lines(kinds))
@@ -53,19 +52,19 @@ def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> N
 
 @app.command()
 def remove(
-    packs: Annotated[list[str], typer.Argument(help="their names", show_default=False)],
+    packs: Annotated[list[str], typer.Argument(help="names of packs", show_default=False)],
     server: Server = SERVER,
     creds: Creds = None,
     ca: Ca = None,
 ) -> None:
-    """Remove packs from the server's table; their later blocks wait as unknown."""
+    """Remove packs from the server's table; later blocks of them are stored but not estimated."""
     asyncio.run(_remove(set(packs), (server, creds, ca)))
     typer.echo(f"{len(set(packs))} removed")
 
 
 @app.command()
 def show(
-    pack: Annotated[str, typer.Argument(help="its name", show_default=False)],
+    pack: Annotated[str, typer.Argument(help="name of the pack", show_default=False)],
     server: Server = SERVER,
     creds: Creds = None,
     ca: Ca = None,
@@ -84,7 +83,7 @@ def show(
 
 
 def pack_files(pack: str, known: PackRegistry) -> dict[str, str]:
-    """Texts by file name: the pack's file, and its cell's unless the package brings it.
+    """Return contents by file name: the pack file, and the cell file unless the cell is shipped.
 
     Raises:
         UserError: The row or its cell is invalid.
@@ -102,7 +101,7 @@ def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:
     """Check that each pack is in the table.
 
     Raises:
-        UserError: Some are not.
+        UserError: A pack is unknown.
     """
     unknown = [pack for pack in packs if pack not in known]
     if unknown:
@@ -110,7 +109,7 @@ def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:
 
 
 async def known_packs(where: ServerAddress) -> PackRegistry:
-    """All that the server has of packs."""
+    """Return the server's table of packs and cells."""
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.packs.pack_bucket import PackBucket  # noqa: PLC0415
 
@@ -120,27 +119,27 @@ async def known_packs(where: ServerAddress) -> PackRegistry:
     return bucket.packs
 
 
-async def _load(path: Path, read: PackTable, files: dict[str, str], where: ServerAddress, *, remove: bool) -> str:
+async def _load(path: Path, table: PackTable, files: dict[str, str], where: ServerAddress, *, remove: bool) -> str:
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket  # noqa: PLC0415
 
     async with connected(*where) as nc:
-        held = {name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()}
-        check_models(path, read, held | files)
+        stored = {name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()}
+        check_models(path, table, stored | files)
         cells = await write_bucket(nc, CELLS_BUCKET, {name: text.encode() for name, text in files.items()})
-        rows = {name: line.data for name, line in read.packs.items()}
+        rows = {name: line.data for name, line in table.packs.items()}
         packs = await write_bucket(nc, PACKS_BUCKET, rows, remove=remove)
     kinds = len(set(rows.values()))
     counts = {
         "new": packs.new,
         "changed": packs.changed,
-        "as before": packs.same,
+        "unchanged": packs.same,
         "removed": packs.removed,
-        "not in the table, kept (--remove lets them go)": packs.left,
+        "not in the table (--remove removes them)": packs.left,
         "cell files written": cells.new + cells.changed,
     }
-    said = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-    return f"{path}: {len(rows)} packs of {kinds} kinds: {said}"
+    changes = ", ".join(f"{count} {change}" for change, count in counts.items() if count)
+    return f"{path}: {len(rows)} packs of {kinds} kinds: {changes}"
 
 
 async def _remove(packs: set[str], where: ServerAddress) -> None:

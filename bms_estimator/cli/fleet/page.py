@@ -1,4 +1,4 @@
-"""``bms-estimator fleet page``: the page of all packs of a fleet."""
+"""``bms-estimator fleet page``: web page of all packs of a fleet."""
 
 import asyncio
 from pathlib import Path

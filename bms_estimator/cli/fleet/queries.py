@@ -1,4 +1,4 @@
-"""``bms-estimator fleet collect`` and ``fleet ask``."""
+"""``bms-estimator fleet collect`` and ``fleet ask``: storing and querying of hourly summaries."""
 
 import asyncio
 import sys
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from bms_estimator.fleet.queries.duckdb_queries import Answer, Query
 
 FOLDER = Path("hours")
+"""Default folder of the Parquet files."""
 
 
 def collect(
@@ -62,9 +63,9 @@ async def _collect(where: ServerAddress, folder: Path, period_s: float) -> None:
 
 def ask(
     name: Annotated[
-        str | None, typer.Argument(help="of the question, or sql; all are listed without", show_default=False)
+        str | None, typer.Argument(help="name of a query, or sql; default: list the queries", show_default=False)
     ] = None,
-    query: Annotated[str | None, typer.Argument(help="of sql: SELECT ... FROM hours", show_default=False)] = None,
+    query: Annotated[str | None, typer.Argument(help="SELECT ... FROM hours, after sql", show_default=False)] = None,
     folder: Annotated[Path, typer.Option(help="folder that `fleet collect` writes")] = FOLDER,
     days: Annotated[
         int | None, typer.Option(min=1, help="number of most recent days; default: all", show_default=False)
@@ -80,7 +81,7 @@ def ask(
         _list(questions.QUESTIONS)
         return
     if (query is not None) != (name == "sql"):
-        raise UserError("a query belongs to sql, and to nothing else: fleet ask sql 'SELECT count(*) FROM hours'")
+        raise UserError("give an SQL query after sql, and only there: fleet ask sql 'SELECT count(*) FROM hours'")
     if json and csv:
         raise UserError("--json and --csv: choose one")
     if query is not None:
@@ -107,7 +108,7 @@ def _print_csv(answer: "Answer") -> None:
 
 
 def _print_table(answer: "Answer") -> None:
-    """Print a table as wide as necessary, because a truncated name is useless."""
+    """Print a table without truncating its columns to the terminal's width."""
     table = Table(*answer.columns, box=box.SIMPLE)
     for row in answer.rows:
         table.add_row(

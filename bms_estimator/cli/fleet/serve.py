@@ -1,4 +1,4 @@
-"""``bms-estimator fleet serve`` and ``fleet user``: the server, and tokens for edges."""
+"""``bms-estimator fleet serve`` and ``fleet user``: server node, and tokens for edges."""
 
 import asyncio
 import os
@@ -21,7 +21,7 @@ from bms_estimator.settings.pack import DeviceName
 from bms_estimator.settings.page import parse_listen
 
 SettingsFile = Annotated[
-    Path | None, typer.Argument(help="settings of the fleet, fleet.toml; without, all as it comes", show_default=False)
+    Path | None, typer.Argument(help="settings of the fleet, fleet.toml; default: all defaults", show_default=False)
 ]
 Folder = Annotated[Path | None, typer.Option(help="folder for streams and keys; default: that of the settings")]
 
@@ -34,7 +34,7 @@ def serve(
     node: Annotated[int, typer.Option(min=1, max=5, help="number of this node in --of")] = 1,
     of: Annotated[
         str | None,
-        typer.Option(help=f"three nodes: where each is heard by the others, host:port,host,... ({CLUSTER_PORT})"),
+        typer.Option(help=f"addresses of all 3 or 5 nodes for each other, host:port,host,...; port {CLUSTER_PORT}"),
     ] = None,
 ) -> None:
     """Run a node of the fleet's server, with its streams, until SIGINT or SIGTERM.
@@ -70,29 +70,29 @@ def user(
     try:
         TypeAdapter(DeviceName).validate_python(pack)
     except ValidationError:
-        raise UserError(f"{pack!r}: no name of a pack: letters, digits, _ and -, 64 at most") from None
+        raise UserError(f"{pack!r}: not a pack name: at most 64 letters, digits, _ and -") from None
     keys = NodeLocation(_folder(_settings(settings_file), folder)).keys
     now = datetime.now(UTC)
     typer.echo(credentials.edge_token(keys, tenant, pack, now, None if days is None else now + timedelta(days=days)))
 
 
-def _settings(path: Path | None, **given: str | None) -> FleetSettings:
-    """Return the settings with the server's options of the command line.
+def _settings(path: Path | None, **options: str | None) -> FleetSettings:
+    """Return the settings with the options of the command line.
 
     Raises:
-        UserError: It cannot be.
+        UserError: An option is invalid.
     """
     settings = read_toml(path, FleetSettings) if path else FleetSettings()
-    told = {name: value for name, value in given.items() if value is not None}
-    if not told:
+    given = {name: value for name, value in options.items() if value is not None}
+    if not given:
         return settings
     table: dict[str, Any] = settings.model_dump()
     try:
-        return FleetSettings.model_validate(table | {"server": table["server"] | told})
+        return FleetSettings.model_validate(table | {"server": table["server"] | given})
     except ValidationError as error:
         reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-        options = ", ".join(f"--{name} {value}" for name, value in told.items())
-        raise UserError(f"{options}: {reason}") from None
+        options_text = ", ".join(f"--{name} {value}" for name, value in given.items())
+        raise UserError(f"{options_text}: {reason}") from None
 
 
 def _folder(settings: FleetSettings, given: Path | None) -> Path:
@@ -109,11 +109,11 @@ def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, .
     """
     if of is None:
         if number != 1:
-            raise UserError(f"--node {number}: of which nodes? --of host,host,host names them all")
+            raise UserError(f"--node {number}: name all nodes with --of host,host,host")
         return ()
     nodes = tuple(host if _has_port(host) else f"{host}:{CLUSTER_PORT}" for host in of.split(","))
     if len(set(nodes)) != len(nodes) or len(nodes) not in (3, 5):
-        raise UserError(f"--of {of}: must name 3 or 5 nodes, each once: with two, none goes on without the other")
+        raise UserError(f"--of {of}: must name 3 or 5 distinct nodes; two nodes have no majority without one of them")
     if number > len(nodes):
         raise UserError(f"--node {number}: --of names {len(nodes)}")
     try:
@@ -129,10 +129,10 @@ def _has_port(host: str) -> bool:
 
 
 def _accounts(settings: FleetSettings, place: NodeLocation) -> Accounts | None:
-    """Return the accounts; keys are made on the first node only.
+    """Return the accounts of the tenants; only the first node creates keys.
 
     Raises:
-        UserError: Another node has no claims yet.
+        UserError: This is another node, and the keys were not copied to it.
     """
     if not settings.tenants:
         return None

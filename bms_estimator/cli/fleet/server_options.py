@@ -1,4 +1,4 @@
-"""Options that all commands of a fleet have in common: where its server is, and what opens its door."""
+"""Options of all fleet commands: address of the server, and credentials."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,4 +16,4 @@ Ca = Annotated[
     typer.Option(help="certificate authority of the server; default: the system's", show_default=False),
 ]
 ServerAddress = tuple[str, Path | None, Path | None]
-"""Server, credentials, authority."""
+"""URLs of the server, credentials file, and certificate authority."""

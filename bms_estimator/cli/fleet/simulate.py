@@ -1,4 +1,4 @@
-"""``bms-estimator fleet simulate``: many edges with their packs, without any."""
+"""``bms-estimator fleet simulate``: simulated edges of many packs."""
 
 import asyncio
 import math
@@ -22,7 +22,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
 
 MAX_PACKS = 999_999
-"""Their names have six digits."""
+"""Maximum number of packs, whose names have six digits."""
 
 
 def simulate(
@@ -75,7 +75,7 @@ async def _run(
 
 
 def _begin_ns(begin: datetime | None) -> int:
-    """Nanoseconds since 1970; a time without a zone is local."""
+    """Return the start in nanoseconds since 1970; a time without a zone is local."""
     if begin is None:
         return time.time_ns() - BLOCK_S * 10**9
     if not math.isfinite(begin.timestamp()) or begin.timestamp() <= 0:
@@ -84,21 +84,21 @@ def _begin_ns(begin: datetime | None) -> int:
 
 
 def _prefix(prefix: str) -> str:
-    """One that makes names of packs."""
+    """Return a prefix after checking that it gives valid pack names."""
     try:
         return TypeAdapter(DeviceName).validate_python(prefix)
     except ValidationError:
         raise UserError(f"--prefix {prefix}: only letters, digits, _ and -") from None
 
 
-def _broker(url: str, **given: str | Path | None) -> MqttSettings:
-    """Whom to connect to.
+def _broker(url: str, **options: str | Path | None) -> MqttSettings:
+    """Return the connection settings from the options of the command line.
 
     Raises:
-        UserError: It cannot be.
+        UserError: An option is invalid.
     """
     try:
-        settings = MqttSettings.model_validate({"url": tuple(url.split(",")), **given})
+        settings = MqttSettings.model_validate({"url": tuple(url.split(",")), **options})
         check(settings)
     except ValidationError as error:
         raise UserError(f"--mqtt {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
@@ -107,8 +107,8 @@ def _broker(url: str, **given: str | Path | None) -> MqttSettings:
     return settings
 
 
-def _with_options(said: str) -> str:
+def _with_options(message: str) -> str:
     """Replace names of settings in an error by the options that set them."""
     for setting, option in (("url", "--mqtt"), ("password_file", "--password-file"), ("ca_file", "--ca")):
-        said = said.replace(f"mqtt.{setting} = ", f"{option} ")
-    return said
+        message = message.replace(f"mqtt.{setting} = ", f"{option} ")
+    return message

@@ -1,4 +1,4 @@
-"""``bms-estimator fleet worker``: estimates of the packs of some partitions, for as long as it runs."""
+"""``bms-estimator fleet worker``: estimates of the packs of some partitions."""
 
 import asyncio
 import os
@@ -35,7 +35,7 @@ def worker(
 
     All workers of a tenant share its partitions.
     """
-    options = Options(server, _named(name), creds, ca, checkpoint_s)
+    options = Options(server, _worker_name(name), creds, ca, checkpoint_s)
     configure_logs()
     with startup_signals(), flush_logs():
         with show_compile_progress(structlog.get_logger(__name__).info):
@@ -47,9 +47,9 @@ async def _work(options: Options) -> None:
     await work(options, stop_on_signal())
 
 
-def _named(name: str | None) -> str:
+def _worker_name(name: str | None) -> str:
     if name is None:
         return re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}")[-64:]
     if not _NAME.fullmatch(name):
-        raise UserError(f"--name {name}: letters, digits, - and _ only, 64 at most")
+        raise UserError(f"--name {name}: must be at most 64 letters, digits, - and _")
     return name

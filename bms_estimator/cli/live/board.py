@@ -1,4 +1,4 @@
-"""``bms-estimator board``: show a board's properties, and calibrate it."""
+"""``bms-estimator board``: display and calibration of a board."""
 
 from pathlib import Path
 from typing import Annotated
@@ -31,7 +31,7 @@ from bms_estimator.sources.serial.port_list import NoPortError, resolve_port
 
 
 def board(
-    port: Annotated[str, typer.Argument(help="serial port; auto: the only one that is there")] = "auto",
+    port: Annotated[str, typer.Argument(help="serial port; auto: the only one")] = "auto",
     aref_v: Annotated[
         float | None,
         typer.Option(
@@ -90,57 +90,57 @@ def board(
         _accept_next(settings, folder or state_folder(settings))
         return
     if folder is not None:
-        raise UserError(f"--folder {folder}: goes with --accept")
+        raise UserError(f"--folder {folder}: requires --accept")
     try:
-        with BoardClient(resolve_port(port), baud) as asked:
-            hello = asked.hello()
+        with BoardClient(resolve_port(port), baud) as client:
+            hello = client.hello()
             typer.echo(_described(hello))
             if aref_v is not None:
-                told = asked.send(set_bandgap_command(_bandgap_v(asked, hello, aref_v)))
-                typer.echo(f"bandgap: was {_volts(hello)}, now {_volts(told)}")
+                changed = client.send(set_bandgap_command(_bandgap_v(client, hello, aref_v)))
+                typer.echo(f"bandgap: was {_volts(hello)}, now {_volts(changed)}")
             if divider is not None:
-                told = asked.send(set_divider_command(divider))
-                typer.echo(f"divider: was {_divider(hello)}, now {_divider(told)}")
+                changed = client.send(set_divider_command(divider))
+                typer.echo(f"divider: was {_divider(hello)}, now {_divider(changed)}")
             if volts_per_ampere is not None or ratiometric is not None:
-                told = _set_current(asked, volts_per_ampere, ratiometric)
-                typer.echo(f"current: was {_slope(hello)}, now {_slope(told)}")
+                changed = _set_current(client, volts_per_ampere, ratiometric)
+                typer.echo(f"current: was {_slope(hello)}, now {_slope(changed)}")
             if serial is not None:
-                told = asked.send(set_serial_command(serial))
-                typer.echo(f"serial: was {hello.serial:08x}, now {told.serial:08x}")
+                changed = client.send(set_serial_command(serial))
+                typer.echo(f"serial: was {hello.serial:08x}, now {changed.serial:08x}")
     except NoPortError as error:
         raise UserError(str(error)) from None
 
 
 def _accept_next(settings: Settings, folder: Path) -> None:
-    """Make the pack's service, whose state is in ``folder``, accept the next board.
+    """Forget the board of the pack's service, whose state is in ``folder``, so that it accepts the next board.
 
     Raises:
         UserError: The settings name the board, none is stored in the folder, or the file cannot be written.
     """
     if settings.sensor.serial:
         raise UserError(f"sensor.serial = {settings.sensor.serial}: the settings name the board; change it there")
-    memory = KnownBoardFile(folder, settings.pack.name)
-    known = memory.load()
+    file = KnownBoardFile(folder, settings.pack.name)
+    known = file.load()
     if not known:
         raise UserError(
-            f"{memory.path}: no board is known there; if the service keeps its state elsewhere, name that with --folder "
-            "(the installed unit's is /var/lib/bms-estimator, for root alone)"
+            f"{file.path}: no board is stored there; give the state folder of the service with --folder "
+            "(that of the installed unit is /var/lib/bms-estimator, readable by root)"
         )
     try:
-        memory.save(NO_BOARD)
+        file.save(NO_BOARD)
     except OSError as error:
-        raise UserError(f"{memory.path}: cannot be written: {error.strerror}") from error
-    forgotten = f"board {known['serial']} is forgotten" if known["serial"] else "no board was known"
-    typer.echo(f"{memory.path}: {forgotten}: the next that comes is the pack's")
+        raise UserError(f"{file.path}: cannot be written: {error.strerror}") from error
+    removed = f"board {known['serial']} removed" if known["serial"] else "no board was stored"
+    typer.echo(f"{file.path}: {removed}; the service accepts the next board that connects")
 
 
-def _bandgap_v(asked: BoardClient, hello: Hello, aref_v: float) -> float:
+def _bandgap_v(client: BoardClient, hello: Hello, aref_v: float) -> float:
     """Return the bandgap voltage at which the board's reference is ``aref_v``.
 
     Raises:
-        UserError: No board has such a bandgap.
+        UserError: The bandgap would be implausible.
     """
-    reference_v = asked.reference_v()
+    reference_v = client.reference_v()
     bandgap_v = hello.bandgap_uv * 1e-6 * aref_v / reference_v
     if not MIN_BANDGAP_V <= bandgap_v <= MAX_BANDGAP_V:
         raise UserError(
@@ -150,12 +150,12 @@ def _bandgap_v(asked: BoardClient, hello: Hello, aref_v: float) -> float:
     return bandgap_v
 
 
-def _set_current(asked: BoardClient, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
+def _set_current(client: BoardClient, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
     if ratiometric is not None:
-        told = asked.send(set_ratiometric_command(ratiometric))
+        changed = client.send(set_ratiometric_command(ratiometric))
     if volts_per_ampere is not None:
-        told = asked.send(set_current_slope_command(volts_per_ampere))
-    return told
+        changed = client.send(set_current_slope_command(volts_per_ampere))
+    return changed
 
 
 def _described(hello: Hello) -> str:

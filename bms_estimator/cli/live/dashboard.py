@@ -1,4 +1,4 @@
-"""``bms-estimator dashboard``: the live page of all packs of a broker."""
+"""``bms-estimator dashboard``: live page of all packs of a broker."""
 
 import asyncio
 from pathlib import Path
@@ -20,13 +20,13 @@ from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
 def dashboard(
     pack: Annotated[
         Path | None,
-        typer.Argument(help="settings of a pack, whose \\[mqtt] and \\[page] are taken", show_default=False),
+        typer.Argument(help="settings of a pack, for its \\[mqtt] and \\[page]", show_default=False),
     ] = None,
     mqtt: Annotated[
         str | None, typer.Option(help="broker, mqtt://host:port; default: that of PACK, or mqtt://localhost:1883")
     ] = None,
     listen: Annotated[
-        str | None, typer.Option(help=f"host:port of the page; else that of PACK, or {DEFAULT_LISTEN}")
+        str | None, typer.Option(help=f"host:port of the page; default: that of PACK, or {DEFAULT_LISTEN}")
     ] = None,
     token_file: Annotated[Path | None, typer.Option(help="file with the access token", show_default=False)] = None,
     folder: Annotated[

@@ -1,4 +1,4 @@
-"""``bms-estimator demo``: broker, board and the real service in one terminal."""
+"""``bms-estimator demo``: broker, simulated board and service in one terminal."""
 
 import asyncio
 import sys
@@ -57,11 +57,11 @@ def demo(
                 page_port=page_port,
                 seconds=seconds,
                 log=log,
-                opened=open_browser if browser else _leave,
+                opened=open_browser if browser else _ignore_url,
             )
         )
     typer.echo(totals)
 
 
-def _leave(_url: str) -> None:
-    """Open nothing."""
+def _ignore_url(_url: str) -> None:
+    """Do not open a browser."""

@@ -1,4 +1,7 @@
-"""``bms-estimator edge``: a pack's raw samples to a fleet's server. Loads no kernel, unless the board's frames need it."""
+"""``bms-estimator edge``: sender of a pack's raw samples to a fleet's server.
+
+It imports no kernels, unless decoding the board's frames needs them.
+"""
 
 import asyncio
 from pathlib import Path

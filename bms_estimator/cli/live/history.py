@@ -1,4 +1,4 @@
-"""``bms-estimator history``: the stored history of a pack, minute by minute."""
+"""``bms-estimator history``: CSV export of a pack's stored history."""
 
 import csv
 import sys
@@ -55,10 +55,10 @@ def history(
     until_s = until.replace(tzinfo=UTC).timestamp() if until else time.time() + MINUTE_S
     header: Sequence[str] = PastEvent._fields if events else Minute._fields
     file = HistoryFile(path)
-    found = file.events(since_s, until_s) if events else file.rows(since_s, until_s, step)
+    rows = file.events(since_s, until_s) if events else file.rows(since_s, until_s, step)
     try:
         with out.open("w", encoding="utf-8", newline="") if out else nullcontext(sys.stdout) as table:
-            _write(table, header, found)
+            _write(table, header, rows)
     except OSError as error:
         if out is None:
             raise
@@ -66,7 +66,7 @@ def history(
 
 
 def _write(file: IO[str], header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """CSV with the time as text in place of seconds."""
+    """Write rows as CSV, with times as ISO 8601 text."""
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(["time", *header[1:]])
     for time_s, *values in rows:

@@ -1,4 +1,4 @@
-"""``bms-estimator record``: a board's raw bytes with their arrival times."""
+"""``bms-estimator record``: capture of a board's raw bytes with their arrival times."""
 
 import asyncio
 import contextlib
@@ -26,6 +26,7 @@ from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import Source
 
 REDRAW_S = 0.25
+"""Interval between two updates of the progress line [s]."""
 
 
 def record(
@@ -62,7 +63,7 @@ def record(
 
 
 async def _record(settings: Settings, recording: CaptureRecorder, seconds: float | None) -> "Progress":
-    """Source -> file, until a signal, the time's end or the disk's."""
+    """Record a source until a signal, the end of the duration, or a disk error."""
     stop = stop_on_signal()
     console, log = Console(stderr=True), deque[str]()
     configure_logs(log if console.is_terminal else None)
@@ -116,16 +117,16 @@ class Progress:
         self._rate_hz = 0.0
 
     def line(self) -> Text:
-        """Progress as one line that is redrawn."""
-        why = f"  {self._source.message}" if self._source.message else ""
+        """Return the progress as one line."""
+        message = f"  {self._source.message}" if self._source.message else ""
         now_s, frames = time.monotonic(), self._source.counters["frames_received"]
         if now_s - self._last[0] >= 1.0:
             self._rate_hz = (frames - self._last[1]) / (now_s - self._last[0])
             self._last = now_s, frames
-        return Text(f"{self.summary()}, {self._rate_hz:.0f} Hz{why}", no_wrap=True, overflow="ellipsis")
+        return Text(f"{self.summary()}, {self._rate_hz:.0f} Hz{message}", no_wrap=True, overflow="ellipsis")
 
     def summary(self) -> str:
-        """Summary of the whole recording."""
+        """Return a summary of the whole recording."""
         counters = self._source.counters
         faults = sum(
             counters.get(name, 0) for name in ("cobs_errors", "length_errors", "version_errors", "text_errors")

@@ -1,4 +1,4 @@
-"""``bms-estimator run``: the service of one pack, or of several."""
+"""``bms-estimator run``: service of one or several packs."""
 
 import asyncio
 import contextlib
@@ -47,8 +47,8 @@ def run(
     One process may serve several packs, each with its own source and broker connection.
     """
     paths = packs or [Path("pack.toml")]
-    told = partial(_with_options, port=port, mqtt=mqtt)
-    loaded = [(told(settings), cell) for settings, cell in map(load_pack, paths)]
+    apply_options = partial(_with_options, port=port, mqtt=mqtt)
+    loaded = [(apply_options(settings), cell) for settings, cell in map(load_pack, paths)]
     with startup_signals():
         if len(loaded) == 1:
             _run_one(*loaded[0], record, view=sys.stdout.isatty() if view is None else view)

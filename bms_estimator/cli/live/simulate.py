@@ -1,4 +1,4 @@
-"""``bms-estimator simulate``: a board without hardware, on a pseudo-terminal."""
+"""``bms-estimator simulate``: simulated board or BMS on a pseudo-terminal."""
 
 import asyncio
 import math
@@ -25,7 +25,7 @@ from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoar
 
 DEVICES = (*METERS, *BMS_ANSWERS)
 DEFAULT_LOAD_C = 3.0
-"""Default load as a multiple of the capacity per hour: SOC moves visibly."""
+"""Default load current as a multiple of the capacity [1/h], at which the SOC changes visibly."""
 
 
 def simulate(
@@ -47,7 +47,7 @@ def simulate(
     protocol: Annotated[
         str | None,
         typer.Option(
-            help=f"be another device, as sensor.protocol names it: {', '.join(DEVICES)}; jk-pb is a jk with the newer frames",
+            help=f"simulate another device of sensor.protocol: {', '.join(DEVICES)}; jk-pb: a jk with newer frames",
             show_default=False,
         ),
     ] = None,
@@ -93,10 +93,10 @@ def simulate(
 
 
 def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int) -> SimulatedBms:
-    """Make a simulated BMS with one cell for each in series.
+    """Return a simulated BMS with one cell voltage for each cell in series.
 
     Raises:
-        UserError: Not enough room for them.
+        UserError: The protocol supports fewer cells.
     """
     try:
         return SimulatedBms(

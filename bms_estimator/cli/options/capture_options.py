@@ -1,4 +1,4 @@
-"""Options and checks of the commands that work on recordings; nothing is overwritten unasked."""
+"""Options and checks of the commands that read captures and write files."""
 
 import filecmp
 from collections.abc import Sequence
@@ -44,22 +44,22 @@ SignOfCurrent = Annotated[
 
 
 def check_out(out: Path, read: Sequence[Path], *, force: bool) -> None:
-    """Refuse to overwrite a file without --force, and to overwrite the input in any case.
+    """Reject an output file that exists, unless ``force`` is set, and any output file that is also an input.
 
     Raises:
-        UserError: ``out`` is one of ``read``, or it is a file already and ``force`` is not given.
+        UserError: ``out`` is one of ``read``, or exists and ``force`` is not set.
     """
     if any(out.exists() and path.exists() and out.samefile(path) for path in read):
-        raise UserError(f"--out {out}: is what is read; name another file")
+        raise UserError(f"--out {out}: is also an input; name another file")
     if out.is_file() and not force:
         raise UserError(f"--out {out}: exists already; --force replaces it")
 
 
 def check_once(captures: Sequence[Path]) -> None:
-    """Refuse a capture that is given twice, under one name or two.
+    """Reject duplicate captures, also under different names.
 
     Raises:
-        UserError: The name of the duplicate.
+        UserError: Two captures are equal.
     """
     for i, path in enumerate(captures):
         for other in captures[:i]:
@@ -68,13 +68,13 @@ def check_once(captures: Sequence[Path]) -> None:
                 raise UserError(f"{path}: {same}; it would count twice")
 
 
-def unlike(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
-    """Names of files, and the path in place of one that another has too."""
+def unique_names(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
+    """Return the names, each replaced by its path if it occurs twice."""
     return [name if names.count(name) == 1 else str(path) for name, path in zip(names, paths, strict=True)]
 
 
 def name_of(path: Path) -> str:
-    """Name of a capture or cell: its file's name without the endings."""
+    """Return the name of a capture or cell: its file name without extensions."""
     return path.name.split(".")[0]
 
 

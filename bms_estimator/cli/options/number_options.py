@@ -1,4 +1,4 @@
-"""Numbers among the options: what the settings take as a number, and nothing else. Python's own takes ``3_9`` for 39."""
+"""Parsers of numeric options, as strict as those of the settings; Python would parse ``3_9`` as 39."""
 
 import math
 import re
@@ -12,42 +12,37 @@ from bms_estimator.model.decimal_text import number
 Number = TypeVar("Number", int, float)
 
 
-def decimal(least: float = -math.inf, most: float = math.inf) -> Callable[[str | float], float]:
-    """Parser of an option.
-
-    Args:
-        least: The option must not be less.
-        most: Nor more.
-    """
-    return _within(number, least, most)
+def decimal(minimum: float = -math.inf, maximum: float = math.inf) -> Callable[[str | float], float]:
+    """Return a parser of a decimal number within limits."""
+    return _within(number, minimum, maximum)
 
 
-def whole(least: float = -math.inf, most: float = math.inf) -> Callable[[str | int], int]:
+def whole(minimum: float = -math.inf, maximum: float = math.inf) -> Callable[[str | int], int]:
     """Return a parser of an integer within limits."""
-    return _within(_whole, least, most)
+    return _within(_whole, minimum, maximum)
 
 
 def _whole(text: str) -> int:
     """Parse an integer.
 
     Raises:
-        ValueError: It is not a number.
+        ValueError: The text is not an integer.
     """
     if not re.fullmatch("[-+]?[0-9]+", text):
-        raise ValueError(f"{text[:40]!r}: no whole number")
+        raise ValueError(f"{text[:40]!r}: not an integer")
     return int(text)
 
 
-def _within(parse: Callable[[str], Number], least: float, most: float) -> Callable[[str | Number], Number]:
+def _within(parse: Callable[[str], Number], minimum: float, maximum: float) -> Callable[[str | Number], Number]:
     def parse_and_check(text: str | Number) -> Number:
-        if not isinstance(text, str):  # a default
+        if not isinstance(text, str):  # a default value
             return text
         try:
             value = parse(text)
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
-        if not least <= value <= most:
-            bounds = {"at least": least, "at most": most}
+        if not minimum <= value <= maximum:
+            bounds = {"at least": minimum, "at most": maximum}
             limits = [f"{name} {bound:.12g}" for name, bound in bounds.items() if math.isfinite(bound)]
             raise typer.BadParameter(f"{text}: must be {' and '.join(limits)}")
         return value

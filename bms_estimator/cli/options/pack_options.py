@@ -1,4 +1,4 @@
-"""Settings and cell from a pack's file and the command line."""
+"""Settings and cell from the pack file and the command line."""
 
 from pathlib import Path
 
@@ -13,51 +13,51 @@ from bms_estimator.settings.pack import PackSettings, Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings
 
 TABLE_RESOLUTION_V = 1e-3
-"""Resolution of a capture without a pack file [V]: a millivolt, as of laboratory equipment."""
+"""Voltage resolution of a capture without a pack file [V]: that of laboratory equipment."""
 
 
 def load_pack(path: Path) -> tuple[Settings, PackModel]:
-    """Load a pack's settings and its cell as one object.
+    """Load a pack's settings and the model of the whole pack.
 
-    A cell file is looked for beside the pack file first, then in the working directory.
+    A cell file is searched in the folder of the pack file first, then in the working directory.
 
     Raises:
-        UserError: As ``read_toml``; or there is no such cell.
+        UserError: The file cannot be read, a setting is invalid, or the cell is unknown.
     """
     settings = load_settings(path)
-    return settings, _model(settings, _found(path, settings.pack.cell), settings.pack.capacity_ah)
+    return settings, _model(settings, _locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
 def unpacked_cell(path: Path, settings: Settings) -> CellModel:
-    """Return the cell of a pack file before series and parallel are applied, found as in ``load_pack``."""
-    return load_cell(_found(path, settings.pack.cell), settings.pack.capacity_ah)
+    """Return the cell of a pack file before series and parallel are applied, searched as in ``load_pack``."""
+    return load_cell(_locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
 def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None) -> tuple[Settings, PackModel]:
-    """Load the settings of ``pack``; ``cell`` and ``capacity_ah`` [Ah] replace its own if given.
+    """Load the settings of ``pack``; ``cell`` and ``capacity_ah`` [Ah] replace those of the settings.
 
     Raises:
-        UserError: Neither ``pack`` nor ``cell`` is given, or as ``load_pack``.
+        UserError: Neither ``pack`` nor ``cell`` is given, or ``load_pack`` fails.
     """
     if pack is None and cell is None:
         raise UserError("give --cell NAME|CELL.toml or --pack pack.toml")
     settings = load_settings(pack) if pack else Settings(sensor=SensorSettings(voltage_resolution_v=TABLE_RESOLUTION_V))
     if cell is None and pack is not None:
-        cell = _found(pack, settings.pack.cell)
+        cell = _locate_cell(pack, settings.pack.cell)
     if capacity_ah is None:
         capacity_ah = settings.pack.capacity_ah
     model = _model(settings, str(cell), capacity_ah)
     return with_pack(settings, cell=cell, capacity_ah=capacity_ah), model
 
 
-def _found(pack: Path, cell: str) -> str:
-    """Return the cell file beside a pack file if it exists, otherwise ``cell``, a name or another path."""
+def _locate_cell(pack: Path, cell: str) -> str:
+    """Return the cell file in the folder of a pack file if it exists, otherwise ``cell``, a name or another path."""
     beside = pack.parent / cell
     return str(beside) if beside.is_file() else cell
 
 
 def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
-    """Return the pack as one object built from ``cell``."""
+    """Return the model of the whole pack, built from ``cell``."""
     model = load_any(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
     if settings.pack.initial_soc is not None:
         reject_soc_for_fuel_cell(model, "pack.initial_soc")
@@ -68,14 +68,14 @@ def reject_soc_for_fuel_cell(model: PackModel, key: str) -> None:
     """Reject an SOC for a fuel cell.
 
     Args:
-        model: The pack as one object.
-        key: Setting or option that gives an SOC.
+        model: Model of the whole pack.
+        key: Setting or option of the SOC, for the error.
 
     Raises:
-        UserError: It is a fuel cell.
+        UserError: The model is a fuel cell.
     """
     if isinstance(model, FuelCellModel):
-        raise UserError(f"{key}: {model.cell.name} is a fuel cell, which has no state of charge: leave it out")
+        raise UserError(f"{key}: {model.cell.name} is a fuel cell, which has no state of charge; remove it")
 
 
 def with_pack(settings: Settings, **changes: object) -> Settings:
@@ -88,12 +88,12 @@ def with_sensor(settings: Settings, **changes: object) -> Settings:
     """Return settings with changed values of ``[sensor]``; None leaves a value unchanged.
 
     Raises:
-        UserError: It is about a serial port, and the source is another one.
+        UserError: The source is not a serial port.
     """
     given = {name: value for name, value in changes.items() if value is not None}
     if given and settings.source is not None:
         raise UserError(
-            f"{', '.join(given)}: the settings have a [source] that is no serial line; take it away, or this"
+            f"{', '.join(given)}: applies to a serial port, but the settings have another [source]; remove one of them"
         )
     sensor = SensorSettings.model_validate(settings.sensor.model_dump(exclude_unset=True) | given)
     return settings.model_copy(update={"sensor": sensor})
@@ -103,12 +103,12 @@ def with_broker(settings: Settings, url: str) -> Settings:
     """Return settings with another broker.
 
     Raises:
-        UserError: ``url`` is not a broker's address.
+        UserError: ``url`` is not a valid broker URL.
     """
     others = settings.mqtt.model_dump() if settings.mqtt else {}
     try:
         mqtt = MqttSettings.model_validate(others | {"url": url})
     except ValidationError:
-        meant = MqttSettings.model_fields["url"].description
-        raise UserError(f"--mqtt {without_secrets(url)}: must be {meant}") from None
+        expected = MqttSettings.model_fields["url"].description
+        raise UserError(f"--mqtt {without_secrets(url)}: must be {expected}") from None
     return settings.model_copy(update={"mqtt": mqtt})

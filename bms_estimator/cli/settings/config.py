@@ -1,4 +1,4 @@
-"""``bms-estimator config``: write, check and show a pack's settings."""
+"""``bms-estimator config``: commands that write, check and show a pack's settings."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated, TypeVar
 import tomlkit
 import typer
 
-from bms_estimator.cli.live.ports import asking
+from bms_estimator.cli.live.ports import show_probing
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.cli.settings.settings_template import Given, settings_file
 from bms_estimator.estimator.settings_plausibility import implausible_settings
@@ -31,14 +31,14 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.exports.influx import target
 from bms_estimator.sources.factory import make_line_producer
 from bms_estimator.sources.serial.device_detection import DetectedDevice
-from bms_estimator.sources.serial.device_detection import probe as who_is_there
+from bms_estimator.sources.serial.device_detection import probe as probe_port
 from bms_estimator.sources.serial.port_list import board_ports
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 
-ONLY_IN_SERVICE = "not there now, so not checked: a credential of systemd is there only while the service runs"
+ONLY_IN_SERVICE = "not checked: a systemd credential exists only while the service runs"
 
-Doors = TypeVar("Doors", MqttSettings, EdgeSettings)
+BrokerSettings = TypeVar("BrokerSettings", MqttSettings, EdgeSettings)
 
 PackFile = Annotated[Path, typer.Argument(help="settings of the pack")]
 
@@ -53,39 +53,39 @@ def init(
 ) -> None:
     """Write a settings file with every setting, its unit, default and meaning."""
     if port is not None and not probe:
-        raise UserError(f"--port {port}: is for --probe")
+        raise UserError(f"--port {port}: requires --probe")
     if file.exists():
-        raise UserError(f"{file}: exists already and is left as it is; give another name")
-    given = _probed([port] if port else board_ports()) if probe else {}
+        raise UserError(f"{file}: exists already and is not changed; give another name")
+    given = _probe_settings([port] if port else board_ports()) if probe else {}
     try:
         with file.open("x", encoding="utf-8") as new:
             new.write(settings_file(Settings, given))
     except FileExistsError:
-        raise UserError(f"{file}: exists already and is left as it is; give another name") from None
+        raise UserError(f"{file}: exists already and is not changed; give another name") from None
     except OSError as error:
         raise UserError(f"{file}: cannot be written: {error.strerror}") from None
     typer.echo(f"{file}: written; edit it, then: bms-estimator config check {file}")
 
 
-def _probed(ports: Sequence[str]) -> Given:
+def _probe_settings(ports: Sequence[str]) -> Given:
     """Return the settings for the detected device, and print its name.
 
     Raises:
         UserError: No device, or more than one.
     """
     if not ports:
-        raise UserError("--probe: no serial port is there that may be a board's or a BMS's; name it with --port")
-    answers = dict[str, DetectedDevice | str]()
+        raise UserError("--probe: no serial port of a board or BMS was found; name it with --port")
+    results = dict[str, DetectedDevice | str]()
     for port in ports:
-        with asking(port):
-            answers[port] = who_is_there(port)
-    said = "; ".join(f"{port}: {answer}" for port, answer in answers.items())
-    found = {port: answer for port, answer in answers.items() if isinstance(answer, DetectedDevice)}
-    if not found:
-        raise UserError(f"--probe: nobody is known to be there: {said}")
-    if len(found) > 1:
-        raise UserError(f"--probe: {len(found)} devices are there; choose one with --port: {said}")
-    ((port, device),) = found.items()
+        with show_probing(port):
+            results[port] = probe_port(port)
+    summary = "; ".join(f"{port}: {result}" for port, result in results.items())
+    devices = {port: result for port, result in results.items() if isinstance(result, DetectedDevice)}
+    if not devices:
+        raise UserError(f"--probe: no known device was found: {summary}")
+    if len(devices) > 1:
+        raise UserError(f"--probe: {len(devices)} devices were found; choose one with --port: {summary}")
+    ((port, device),) = devices.items()
     typer.echo(f"{port}: {device}")
     sensor: dict[str, object] = {"port": port, "protocol": device.protocol}
     if device.baud != SensorSettings.model_validate(sensor).baud:
@@ -104,41 +104,43 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         *_lemma(cell),
     ]
     if settings.mqtt is not None:
-        mqtt, unseen = _here("mqtt", settings.mqtt)
-        warnings += unseen + check_brokers(mqtt)
+        mqtt, unchecked = _without_credentials("mqtt", settings.mqtt)
+        warnings += unchecked + check_brokers(mqtt)
         settings = settings.model_copy(update={"mqtt": mqtt})
     if settings.edge is not None:
-        edge, unseen = _here("edge", settings.edge)
-        warnings += unseen + check_brokers(edge)
+        edge, unchecked = _without_credentials("edge", settings.edge)
+        warnings += unchecked + check_brokers(edge)
     if settings.page is not None:
-        unread, unseen = _unread("page", settings.page, "token_file")
-        warnings += unseen
-        if not unread:
+        unreadable, unchecked = _unreadable("page", settings.page, "token_file")
+        warnings += unchecked
+        if not unreadable:
             guard_of(settings.page)
     if settings.influx is not None:
-        unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
-        warnings += unseen
-        target(settings.influx.model_copy(update=dict.fromkeys(unread)))
+        unreadable, unchecked = _unreadable("influx", settings.influx, "password_file", "token_file")
+        warnings += unchecked
+        target(settings.influx.model_copy(update=dict.fromkeys(unreadable)))
     make_line_producer(settings)  # reports parts of [source] that are invalid or not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
-    typer.echo(f"{file}: good: {_in_short(settings, cell)}")
+    typer.echo(f"{file}: good: {_summary(settings, cell)}")
 
 
 @app.command()
-def show(file: Annotated[Path | None, typer.Argument(help="settings of the pack; else the defaults")] = None) -> None:
+def show(
+    file: Annotated[Path | None, typer.Argument(help="settings of the pack; default: all defaults")] = None,
+) -> None:
     """Print the settings in effect and derived values as TOML."""
     settings, cell = load_pack(file) if file else (Settings(), load_cell(Settings().pack.cell))
     shown = settings.model_dump(mode="json", by_alias=True, exclude_none=True)
-    shown["observer"].setdefault("rearm_gain", "never")  # the one None that is not the default
+    shown["observer"].setdefault("rearm_gain", "never")  # TOML has no null
     typer.echo(tomlkit.dumps(shown))
-    typer.echo("# What follows from them:")
+    typer.echo("# Derived values:")
     for name, value in derived(settings, cell).items():
         typer.echo(f"# {name} = {value:.6g}")
 
 
 def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
-    """Return values that follow from the settings: of the pack, of the observer, limits of Lemma 4.1.3."""
+    """Return values derived from the settings: of the pack, the observer and the alarms."""
     record = estimator_settings(
         cell,
         settings.observer,
@@ -148,7 +150,7 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         initial_soc=settings.pack.initial_soc,
         sampling=settings.sampling,
     )[0]["observer"]
-    follows = {
+    values = {
         "pack.nominal_voltage_v": cell.cell.nominal_voltage_v,
         "pack.series_count": cell.cell.series_count,
         "observer.dead_zone_v": record["dead_zone_v"],
@@ -158,52 +160,54 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
     }
     if isinstance(cell, CellModel):
         a = {i: cell.bounds(i).limit for i in range(7, 13)}
-        follows["pack.capacity_ah"] = cell.cell.capacity_ah
-        follows["observer.delta_1"] = delta(a[8], a[9], a[7])  # (2.11)
-        follows["observer.delta_2"] = delta(a[11], a[12], a[10])  # (2.12)
+        values["pack.capacity_ah"] = cell.cell.capacity_ah
+        values["observer.delta_1"] = delta(a[8], a[9], a[7])  # (2.11)
+        values["observer.delta_2"] = delta(a[11], a[12], a[10])  # (2.12)
     for alarm in watched(settings, cell):
-        follows[f"alarms.{alarm.name}.limit"], follows[f"alarms.{alarm.name}.clear"] = alarm.limit, alarm.clear
-    return follows
+        values[f"alarms.{alarm.name}.limit"], values[f"alarms.{alarm.name}.clear"] = alarm.limit, alarm.clear
+    return values
 
 
-def _here(section: str, doors: Doors) -> tuple[Doors, list[str]]:
+def _without_credentials(section: str, settings: BrokerSettings) -> tuple[BrokerSettings, list[str]]:
     """Return the settings without files that only the running service can read, and a warning for each such file."""
-    without, warnings = _unread(section, doors, "password_file", "cert_file", "key_file")
-    if without & {"cert_file", "key_file"}:  # one is of no use without the other
-        without |= {"cert_file", "key_file"}
-    return doors.model_copy(update=dict.fromkeys(without)), warnings
+    removed, warnings = _unreadable(section, settings, "password_file", "cert_file", "key_file")
+    if removed & {"cert_file", "key_file"}:  # a certificate and its key can only be checked together
+        removed |= {"cert_file", "key_file"}
+    return settings.model_copy(update=dict.fromkeys(removed)), warnings
 
 
-def _unread(
+def _unreadable(
     section: str, settings: MqttSettings | EdgeSettings | InfluxSettings | PageSettings, *keys: str
 ) -> tuple[set[str], list[str]]:
     """Return the keys of files that only the running service can read, and a warning for each."""
     files = {key: getattr(settings, key) for key in keys}
-    unread = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
-    return set(unread), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unread.items()]
+    unreadable = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
+    return set(unreadable), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unreadable.items()]
 
 
 def _lemma(cell: PackModel) -> list[str]:
     """Return the conditions of Lemma 4.1.1 that the bounds fail; empty for a fuel cell."""
-    return [f"{cell.cell.name}: {_unmet(c)}" for c in failed_conditions(cell)] if isinstance(cell, CellModel) else []
+    return (
+        [f"{cell.cell.name}: {_violation(c)}" for c in failed_conditions(cell)] if isinstance(cell, CellModel) else []
+    )
 
 
-def _unmet(condition: Condition) -> str:
+def _violation(condition: Condition) -> str:
     return (
         f"condition {condition.name} of Lemma 4.1.1 fails: {condition.left:g} is not below {condition.right:g}; "
         "a capacitance of the observer may turn negative above its SOC limit"
     )
 
 
-def _in_short(settings: Settings, cell: PackModel) -> str:
+def _summary(settings: Settings, cell: PackModel) -> str:
     c = cell.cell
     broker = ", ".join(settings.mqtt.urls) if settings.mqtt else "no broker"
     if settings.edge:
         url = settings.edge.url
         broker += f"; samples to {url if isinstance(url, str) else ', '.join(url)}"
-    holds = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
+    capacity = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
     board = f"{settings.sensor.protocol} board on {settings.sensor.port}"
     return (
-        f"{settings.pack.name}: {c.name}, {c.series_count} in series, {c.nominal_voltage_v:g} V, {holds}; "
+        f"{settings.pack.name}: {c.name}, {c.series_count} in series, {c.nominal_voltage_v:g} V, {capacity}; "
         f"{settings.source.described if settings.source else board}; {broker}"
     )

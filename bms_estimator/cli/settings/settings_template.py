@@ -1,4 +1,4 @@
-"""A commented settings file, made from the settings' models so that it cannot fall behind them."""
+"""Generator of a commented settings file from the settings' models."""
 
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -11,8 +11,9 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": "ohm", "c": "°C"}
-"""Last part of a key -> its unit."""
+"""Units by the last part of a key."""
 WIDTH = 110
+"""Maximum line length of comments."""
 HEAD = """\
 # Settings of one pack. A setting in a comment has the value shown; remove the # to change it.
 # Values are in SI units, which the keys contain. Current is positive on discharge.
@@ -25,18 +26,18 @@ Given = Mapping[str, Mapping[str, object]]
 
 
 def settings_file(model: type[BaseModel], given: Given = MappingProxyType({})) -> str:
-    """TOML text with each section and setting of ``model``: meaning, unit, constraint, default.
+    """Return TOML text with the description, unit, constraints and default of each setting of ``model``.
 
     Args:
         model: Model of the sections.
-        given: Settings that are not left at their defaults.
+        given: Settings with other values than their defaults.
     """
     lines = [HEAD]
     for name, field in model.model_fields.items():
         optional = field.default is None
-        why = f" {_sentence(field.description)}" if optional and field.description else ""
-        for section in _models(field.annotation):  # one of them, where there are several
-            lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{why}")
+        omission = f" {_sentence(field.description)}" if optional and field.description else ""
+        for section in _models(field.annotation):  # a section for each alternative
+            lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{omission}")
             lines += [f"{'#' if optional else ''}[{name}]", *_settings(section, given.get(name, {})), ""]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -60,17 +61,17 @@ def _value(field: FieldInfo) -> str:
 
 
 def _allowed(key: str, field: FieldInfo) -> str:
-    """``[V, at least 0]``; empty without constraints."""
+    """Return unit and constraints, such as ``[V, at least 0]``; empty without either."""
     choices, limits = _constraints(field.annotation)
     limits += [_limit(item) for item in field.metadata if type(item) in _SIGNS]
     unit = [UNITS[key.rsplit("_", 1)[-1]]] if "_" in key and key.rsplit("_", 1)[-1] in UNITS else []
     one_of = [f"one of {', '.join(choices)}"] if choices else []
-    said = ", ".join(unit + one_of + limits)
-    return f"[{said}]" if said else ""
+    parts = ", ".join(unit + one_of + limits)
+    return f"[{parts}]" if parts else ""
 
 
 def _constraints(annotation: Any) -> tuple[list[str], list[str]]:
-    """Choices and limits anywhere within an annotation."""
+    """Return all choices and limits within an annotation."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return [str(choice) for choice in arguments], []
@@ -99,7 +100,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _sentence(text: str | None) -> str:
-    """Append a full stop."""
+    """Return the text with a full stop."""
     return f"{(text or '').rstrip('.')}."
 
 

@@ -192,7 +192,7 @@ def test_the_capture_is_never_written_over(capture, tmp_path, capsys):
     for out in (capture, link):
         code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--force")
         assert code == 2
-        assert "is what is read" in err
+        assert "is also an input" in err
     assert capture.read_bytes() == before
 
 
@@ -241,7 +241,7 @@ def test_what_is_in_another_unit_is_guessed(capture, tmp_path, capsys):
 
 def test_a_temperature_that_is_none_or_was_not_measured_is_said(tmp_path, capsys):
     for cell_c, words in (
-        (297.0, "10 values that no cell has: the band is wider"),
+        (297.0, "10 implausible values: the band is wider"),
         (math.nan, "not measured: the band is wider"),
     ):
         table = tmp_path / "warm.csv"

@@ -56,7 +56,7 @@ def test_milliamperes_are_no_capacity(capsys, capture, tmp_path):
     np.savetxt(wrong, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
     code, _, err = run(capsys, "capacity", wrong, "--cell", "ncr18650")
     assert code == 2
-    assert "Ah where 3 Ah is declared: is the current in amperes" in " ".join(err.split())
+    assert "Ah, but 3 Ah is declared: is the current in amperes" in " ".join(err.split())
 
 
 def test_a_real_cell_holds_what_a_slow_discharge_gave(capsys, shared_data):

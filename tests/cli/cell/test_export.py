@@ -144,5 +144,5 @@ def test_it_does_not_write_over_what_it_reads(capsys, pack):
         before = out.read_bytes()
         code, _, err = run(capsys, "cell", "export", pack, "--checkpoint", checkpoint, "--out", out, "--force")
         assert code == 2
-        assert "is what is read" in err
+        assert "is also an input" in err
         assert out.read_bytes() == before

@@ -255,7 +255,7 @@ def test_files_that_cannot_be_used_are_named(capsys, curve: Path, steps: Path, t
         (short, "2 usable points"),
         (hole, "a value is missing"),
         (tmp_path / "none.csv", "none.csv"),
-        (one_cell, "0 usable points: give at least 3 of 2 to 18 V and up to 15 A, as pem_30w has them"),
+        (one_cell, "0 usable points: give at least 3 within 2 to 18 V and up to 15 A of pem_30w"),
         (reversed_curve, "the current is negative, but a fuel cell takes no charge: is --current-sign right?"),
         (reversed_steps, "the current is negative, but a fuel cell takes no charge: is --current-sign right?"),
     ):

@@ -86,7 +86,7 @@ def test_what_a_person_can_mend_ends_with_code_2_and_its_numbers(tables, tmp_pat
     assert "error: flipped.csv: SOC runs from 0.98" in err
     code, _, err = run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", flipped, "--force")
     assert code == 2
-    assert "is what is read" in err
+    assert "is also an input" in err
 
 
 def test_the_sign_of_a_tables_current_can_be_given(tables, tmp_path, capsys):

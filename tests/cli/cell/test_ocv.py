@@ -82,7 +82,7 @@ def test_for_people(captures, tmp_path, capsys):
     out = tmp_path / "c.toml"
     code, text, _ = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", out)
     assert code == 0
-    for words in ("points", "SOC 0.050 to 1.000", "left to relax at a rest's end", "mV RMS", "error of the curve"):
+    for words in ("points", "SOC 0.050 to 1.000", "relaxation after a rest", "mV RMS", "error of the curve"):
         assert words in text
     _, text, _ = run(
         capsys, "ocv", captures[0], "--capacity-ah", "3", "--form", "chen-mora", "--out", tmp_path / "d.toml"
@@ -125,7 +125,7 @@ def test_bad_input_ends_with_code_2_and_the_numbers_that_show_it(tmp_path, capsy
     ("volt", "options", "why"),
     [
         (lambda v: 0.0 * v + 3.7, (), "bad.csv: the voltage is 3.7 V throughout: is the sensor connected?"),
-        (lambda v: 1e3 * v, (), "cells in series: are these millivolts? else give --series"),
+        (lambda v: 1e3 * v, (), "cells in series: are these millivolts? If not, give --series"),
         (lambda v: v, ("--series", 4), "V per cell"),
     ],
     ids=["dead", "millivolts", "too many cells"],
@@ -144,7 +144,7 @@ def test_a_capture_is_not_overwritten(captures, capsys):
     before = captures[0].read_bytes()
     code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0], "--force")
     assert code == 2
-    assert "is what is read" in err
+    assert "is also an input" in err
     assert captures[0].read_bytes() == before
 
 
@@ -208,7 +208,7 @@ def test_what_each_capture_is_is_found_out(tmp_path, capsys, data):
     for words in (
         "C/10 discharge, 4.945 Ah",
         "given curve, 101 points",
-        "found to be",
+        "recognized as",
         "Elements: those of the generic nca",
     ):
         assert words in text + out.read_text()

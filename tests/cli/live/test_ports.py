@@ -46,7 +46,7 @@ def test_it_names_the_ports_that_are_there_and_no_others(capsys):
         assert len(re.findall(r"^ *(/dev/\S+)", out, re.MULTILINE)) == len(there)
         assert "board" not in out.splitlines()[1]
     else:
-        assert out == "no serial port is there; is the board plugged in?\n"
+        assert out == "there is no serial port; is the board plugged in?\n"
 
 
 @pytest.mark.parametrize(

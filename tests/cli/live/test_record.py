@@ -116,7 +116,7 @@ def test_a_recorder_that_is_killed_leaves_all_to_the_last_whole_record(board, tm
         assert reads(cut) == whole[:-1]
         code, result, err = replayed(capsys, cut)
         assert code == 0
-        assert err.endswith(" bytes are no whole record: cut off there, or a length is damaged\n")
+        assert err.endswith(" bytes are no complete record: truncated, or a length is damaged\n")
         assert result["samples"] == samples(cut) > 50
 
 
@@ -175,7 +175,7 @@ def test_a_damaged_length_does_not_lose_the_rest_in_silence(recorded, tmp_path, 
     damaged.write_bytes(data)
     code, _, err = replayed(capsys, damaged)
     assert code == 0
-    assert f"its last {unread:,} bytes are no whole record" in err
+    assert f"the last {unread:,} bytes are no complete record" in err
 
 
 def test_an_existing_file_is_left_as_it_is(tmp_path):
@@ -202,7 +202,7 @@ def test_a_disk_that_is_full_ends_it_and_what_is_there_can_be_replayed(board, tm
     assert result["samples"] == samples(out) > 10
     head = len(MAGIC) + 4 + int.from_bytes(out.read_bytes()[len(MAGIC) :][:4], "little") + 2
     unread = size(out) - head - sum(RECORD_OVERHEAD_BYTES + len(data) for _, data in reads(out))
-    said = f"warning: {out}: its last {unread:,} bytes are no whole record"
+    said = f"warning: {out}: the last {unread:,} bytes are no complete record"
     assert (said in err) == (unread > 0)  # the limit may lie between two records
 
 

@@ -41,7 +41,7 @@ def test_a_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys)
 def test_a_port_is_refused_where_there_is_none(command, options, pack, capsys):
     code, _, err = run(capsys, command, *options, linux(pack), "--port", "/dev/ttyACM0")
     assert code == 2
-    assert "port: the settings have a [source] that is no serial line" in err
+    assert "port: applies to a serial port, but the settings have another [source]" in err
 
 
 @pytest.mark.parametrize(

@@ -85,12 +85,12 @@ def test_init_finds_out_what_is_there_and_sets_it(pack, capsys, long_probe):
 def test_init_says_that_nobody_is_there_and_writes_nothing(pack, capsys, tmp_path):
     code, out, err = run(capsys, "config", "init", pack, "--probe", "--port", tmp_path / "none")
     assert (code, out) == (2, "")
-    assert "nobody is known to be there" in err
+    assert "no known device was found" in err
     assert "cannot be opened" in err
     assert not pack.exists()
     code, _, err = run(capsys, "config", "init", pack, "--port", "/dev/ttyUSB0")
     assert code == 2
-    assert "is for --probe" in err
+    assert "requires --probe" in err
 
 
 def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
@@ -133,7 +133,7 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ("[source]\nchip = 5\n", ["source.kind", "missing"]),
         (
             '[sensor]\nport = "/dev/ttyUSB0"\nprotocol = "jbd"\n[source]\nkind = "linux"\n',
-            ["sensor.port, sensor.protocol: ", "take that away, or [source]"],
+            ["sensor.port, sensor.protocol: ", "which [source] replaces"],
         ),
         (
             '[source]\nkind = "linux"\nshunt_ohm = 0\n',
@@ -260,7 +260,7 @@ def test_check_warns_of_a_credential_that_only_the_running_service_sees(name, pa
     code, out, err = run(capsys, "config", "check", pack)
     assert code == 0
     assert f"{pack}: good: " in out
-    assert f"warning: {pack}: mqtt.password_file = {name}: not there now" in err
+    assert f"warning: {pack}: mqtt.password_file = {name}: not checked" in err
 
 
 def test_check_finds_a_credential_by_its_name_alone(pack, tmp_path, capsys, monkeypatch):
@@ -297,4 +297,4 @@ def test_check_tries_the_files_of_influxdb_and_warns_of_those_of_the_service_alo
     pack.write_text('[influx]\nbucket = "bms"\ntoken_file = "influx-token"\n')
     code, out, err = run(capsys, "config", "check", pack)
     assert (code, "good" in out) == (0, True)
-    assert "influx.token_file = influx-token: not there now" in err
+    assert "influx.token_file = influx-token: not checked" in err

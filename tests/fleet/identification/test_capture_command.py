@@ -43,7 +43,7 @@ def test_a_capture_holds_each_block_once_in_order(engine, tmp_path, capsys, name
     )
     assert err.splitlines() == [
         "warning: house: blocks 5 are not there: they were lost, or the edge sends them again",
-        "warning: house: 1 messages were no blocks",
+        "warning: house: 1 messages are not blocks",
     ]
     expected = np.concatenate([samples(60.0, 240), samples(360.0)])
     read = load_capture(out)
@@ -59,7 +59,7 @@ def test_a_span_is_cut_and_what_is_not_kept_is_said(engine, tmp_path, capsys):
     asked = ["fleet", "capture", "house", out, "--from", first, "--to", last, "--server", engine.url]
     code, said, err = run(capsys, *asked)
     assert (code, said.startswith(f"{out}: 40 samples in 1 blocks of house")) == (0, True)
-    assert "was asked for; what is kept begins at 2023-11-14T22:14:20.000Z" in err
+    assert "the stored samples begin at 2023-11-14T22:14:20.000Z" in err
     code, _, err = run(capsys, "fleet", "capture", "nobody", tmp_path / "no.csv", "--server", engine.url)
-    assert (code, "nobody: the server keeps no sample of it in this span" in err) == (2, True)
+    assert (code, "nobody: the server has no samples of it in this period" in err) == (2, True)
     assert "must end in" in run(capsys, "fleet", "capture", "house", tmp_path / "no.xls", "--server", engine.url)[2]

@@ -49,7 +49,7 @@ def test_a_table_is_loaded_listed_and_loaded_again(url, table, capsys):
     again.write_text(out)
     assert (
         run(capsys, "fleet", "packs", "load", again, "--server", url)[1]
-        == f"{again}: 2 packs of 2 kinds: 2 as before\n"
+        == f"{again}: 2 packs of 2 kinds: 2 unchanged\n"
     )
 
 
@@ -58,9 +58,9 @@ def test_rows_go_when_asked_and_by_name(url, table, capsys):
     less = table.with_name("less.csv")
     less.write_text("pack,cell\nshed,ncr18650\n")
     said = run(capsys, "fleet", "packs", "load", less, "--server", url)[1]
-    assert said == f"{less}: 1 packs of 1 kinds: 1 new, 2 not in the table, kept (--remove lets them go)\n"
+    assert said == f"{less}: 1 packs of 1 kinds: 1 new, 2 not in the table (--remove removes them)\n"
     assert run(capsys, "fleet", "packs", "load", less, "--remove", "--server", url)[1].endswith(
-        "1 as before, 2 removed\n"
+        "1 unchanged, 2 removed\n"
     )
     code, _, err = run(capsys, "fleet", "packs", "remove", "shed", "boat", "--server", url)
     assert (code, err) == (2, "error: boat: not in the table of packs; `fleet packs list` prints it\n")

@@ -274,7 +274,7 @@ async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authorit
             "is open to other machines: add [tls] and [tenants.NAME], or listen on 127.0.0.1",
         ),
         (["--mqtt", "here"], "--mqtt here: must be host:port"),
-        (["--node", "2"], "--node 2: of which nodes?"),
+        (["--node", "2"], "--node 2: name all nodes"),
         (["--of", "a,b"], "must name 3 or 5 nodes"),
         (["--of", "a,b,c"], "--of a,b,c is open to other machines"),
         (["--of", "127.0.0.1:1,127.0.0.1:2,127.0.0.1:3", "--node", "4"], "--of names 3"),
@@ -318,7 +318,7 @@ def test_every_setting_is_in_the_document() -> None:
 
 def test_a_token_is_only_for_what_may_be_a_pack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, "fleet", "user", "acme", "p1.>", "--folder", tmp_path)
-    assert (code, err) == (2, "error: 'p1.>': no name of a pack: letters, digits, _ and -, 64 at most\n")
+    assert (code, err) == (2, "error: 'p1.>': not a pack name: at most 64 letters, digits, _ and -\n")
     code, _, err = run(capsys, "fleet", "user", "acme", "p1", "--folder", tmp_path)
     assert code == 2
     assert "no keys of a tenant acme" in err

@@ -217,7 +217,7 @@ def test_a_file_that_cannot_be_used_is_said_at_start(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"influx\.token_file = .*none: cannot be read: No such file"):
         InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "none"))
     (tmp_path / "token").write_text("t\N{EURO SIGN}ken", encoding="utf-8")
-    with pytest.raises(UserError, match=r"influx\.token_file = .*token: must hold ASCII"):
+    with pytest.raises(UserError, match=r"influx\.token_file = .*token: must be ASCII"):
         InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "token"))
     (tmp_path / "ca").write_text("nonsense")
     with pytest.raises(UserError, match=r"influx\.ca_file = .*: no certificates"):

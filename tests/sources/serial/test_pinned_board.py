@@ -261,7 +261,7 @@ async def test_a_service_that_runs_takes_another_board_once_it_is_accepted(
             await until(lambda: taken.message and "refused" in taken.message)
             code, text, _ = run(capsys, "board", "--accept", pack)
             assert code == 0
-            assert f"{memory.path}: board 00000001 is forgotten: the next that comes is the pack's\n" in text
+            assert f"{memory.path}: board 00000001 removed; the service accepts the next board that connects\n" in text
             await remembered(memory, "00000002")
             assert taken.voltage_v == pytest.approx(OTHERS_V, abs=0.1)
 
@@ -413,12 +413,12 @@ def test_a_board_is_accepted_in_the_folder_that_is_named_and_only_where_one_is_k
     memory.save({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
     code, _, err = run(capsys, "board", "--accept", pack)
     assert code == 2
-    assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is known there" in err
+    assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is stored there" in err
     assert run(capsys, "board", "--folder", memory.path.parent, "--accept", pack)[0] == 0
     assert memory.load() == NO_BOARD
     code, _, err = run(capsys, "board", "--folder", tmp_path)
     assert code == 2
-    assert "goes with --accept" in err
+    assert "requires --accept" in err
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for others")
