@@ -18,7 +18,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import EdgeHealth
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.edge import EdgeSettings
-from tests.fleet.engine import Engine, running
+from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
@@ -29,13 +29,13 @@ SETTINGS = {"block_s": 60.0, "store_mib": 1.0}
 
 
 @pytest.fixture(scope="module")
-def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
+def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsCluster]:
     with running(tmp_path_factory.mktemp("engine"), partitions=4) as engine:
         yield engine
 
 
 @pytest.fixture
-async def receiver(engine: Engine, request: pytest.FixtureRequest) -> AsyncIterator[Receiver]:
+async def receiver(engine: NatsCluster, request: pytest.FixtureRequest) -> AsyncIterator[Receiver]:
     """Return the receiver of a pack for each test."""
     async with Receiver(engine.url, request.node.name.replace("[", "_").rstrip("]")[:64]) as receiver:
         yield receiver
@@ -84,7 +84,7 @@ def same(some: SampleBlock, others: SampleBlock) -> bool:
     return all(some[name].tobytes() == others[name].tobytes() for name in SAMPLE.names or ())
 
 
-def url(engine: Engine) -> str:
+def url(engine: NatsCluster) -> str:
     return f"mqtt://127.0.0.1:{engine.mqtt_port}"
 
 
@@ -95,7 +95,7 @@ async def until(condition) -> None:
 
 
 async def test_samples_come_in_blocks_and_the_last_one_at_a_clean_stop(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
@@ -109,7 +109,7 @@ async def test_samples_come_in_blocks_and_the_last_one_at_a_clean_stop(
     assert (receiver.resends, receiver.gaps, feed.edge.store.dropped) == (0, 0, 0)
 
 
-async def test_a_link_that_is_cut_costs_nothing(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+async def test_a_link_that_is_cut_costs_nothing(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
     async with Proxy(engine.mqtt_port) as network:
         feed = Feed(receiver, tmp_path, network.url)
         async with feed.edge:
@@ -126,7 +126,7 @@ async def test_a_link_that_is_cut_costs_nothing(receiver: Receiver, engine: Engi
 
 
 async def test_a_store_that_must_be_later_than_the_clock_goes_on_at_the_same_pace(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:9")  # nobody is there
     async with feed.edge:
@@ -160,7 +160,7 @@ async def test_a_server_that_is_killed_in_mid_send_costs_nothing(tmp_path: Path)
 
 
 async def test_an_edge_that_begins_anew_sends_what_is_not_safe_and_goes_on(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:1")
     async with feed.edge:
@@ -175,7 +175,7 @@ async def test_an_edge_that_begins_anew_sends_what_is_not_safe_and_goes_on(
     assert [block.number for block in receiver.blocks] == list(range(1, 61))
 
 
-async def test_what_the_stream_has_lost_is_sent_again(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+async def test_what_the_stream_has_lost_is_sent_again(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
     """As when a leader is killed after acknowledging messages that no other node has."""
     receiver.lose = {5, 6, 14, 30}
     feed = Feed(receiver, tmp_path, url(engine))
@@ -187,7 +187,7 @@ async def test_what_the_stream_has_lost_is_sent_again(receiver: Receiver, engine
 
 
 async def test_an_edge_without_room_says_from_where_on_it_has_blocks(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     async with Proxy(engine.mqtt_port) as network:
         network.away = True
@@ -207,7 +207,7 @@ async def test_an_edge_without_room_says_from_where_on_it_has_blocks(
 
 
 async def test_garbage_from_who_is_no_worker_changes_nothing(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
@@ -217,9 +217,9 @@ async def test_garbage_from_who_is_no_worker_changes_nothing(
         garbage = [b"", b"\xff\x00", b"{}", b'{"store": -1, "number": 1, "resend": false}', b"9" * 10_000, b"[" * 9_000]
         garbage += [f'{{"store": {n}, "number": {n}, "resend": true}}'.encode() for n in (10**30, 10**400)]
         for payload in garbage:
-            await receiver.say(payload)
-        await receiver.say(BlockRequest(store=1, number=1, resend=True))
-        await receiver.say(BlockRequest(store=store, number=1, resend=False))
+            await receiver.reply(payload)
+        await receiver.reply(BlockRequest(store=1, number=1, resend=True))
+        await receiver.reply(BlockRequest(store=store, number=1, resend=False))
         await until(lambda: feed.edge.unread == len(garbage))
         feed.give(3)
         await feed.all_came()
@@ -246,7 +246,7 @@ async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
 
 
 async def test_a_source_that_is_silent_holds_no_samples_back(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, url(engine), block_s=1.0)
     async with feed.edge:
@@ -254,13 +254,13 @@ async def test_a_source_that_is_silent_holds_no_samples_back(
         await receiver.until(1)
 
 
-async def test_a_server_that_lets_nobody_in_is_named(engine: Engine, tmp_path: Path) -> None:
+async def test_a_server_that_lets_nobody_in_is_named(engine: NatsCluster, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^edge.password_file = /none: cannot be read"):
         BlockSender(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
 
 
 async def test_the_server_keeps_what_came_from_an_edge_by_its_pack(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
