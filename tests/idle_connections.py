@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import aiohttp
 
-from tests.fleet.engine import Engine
+from tests.fleet.nats_cluster import NatsCluster
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
 from tests.page.house import Service, starting
@@ -102,7 +102,7 @@ async def attack_dashboard(folder: Path, broker: Broker) -> Outcome:
     return await _attack_page(folder, port, ("dashboard", *arguments), broker.stop, broker.start)
 
 
-async def attack_fleet_page(folder: Path, engine: Engine) -> Outcome:
+async def attack_fleet_page(folder: Path, engine: NatsCluster) -> Outcome:
     """Attack the real ``fleet page``; return once it has found the NATS server again."""
     port = free_port()
     arguments = ("--server", engine.url, "--listen", f"127.0.0.1:{port}", "--no-browser")

@@ -1,4 +1,4 @@
-"""Heartbeat of a worker, each second on ``subjects.worker``."""
+"""Heartbeat that each worker publishes once a second on ``subjects.worker``."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -9,15 +9,15 @@ DEAD_S = 3.0
 
 
 class Heartbeat(BaseModel):
-    """State of a live worker: its partitions, and counters since its start."""
+    """State of a worker: its partitions, and counters since its start."""
 
     model_config = ConfigDict(frozen=True)
 
     id: str
     started_s: float
-    """Wall clock [s since 1970]."""
+    """Wall clock at its start [s since 1970]."""
     leaving: bool = False
-    """True while it releases its partitions and ends."""
+    """True while it releases its partitions before it ends."""
     partitions: tuple[int, ...] = ()
     """Claimed partitions."""
     packs: int = 0
@@ -25,23 +25,22 @@ class Heartbeat(BaseModel):
     blocks: int = 0
     samples: int = 0
     faults: int = 0
-    """Blocks skipped because of an internal error, in addition to the failed ones in ``counters``: the log has its
-    traceback."""
+    """Blocks skipped because of an internal error since the worker's start; the log has the tracebacks."""
     lag_s: float | None = None
     """Largest time from the arrival of a block's last sample at the edge to its processing since the last heartbeat
     [s]; None without a block."""
     counters: dict[str, int] = Field(default_factory=dict)
     """Counters of the partitions by name: resends, gaps, lost blocks, damaged blocks and others."""
     unknown_count: int = 0
-    """Packs that are missing in the table."""
+    """Number of packs with deferred blocks that are missing in the table of packs."""
     unknown: tuple[str, ...] = ()
-    """The first few of them."""
+    """Names of some unknown packs."""
     waiting: int = 0
-    """Messages given by the server and not taken yet."""
+    """Messages received from the server and not processed yet."""
     hours_waiting: int = 0
     """Summaries that the server has not acknowledged yet."""
     checkpoint_age_s: float | None = None
-    """Age of the oldest of the partitions' last checkpoints [s]; None without one."""
+    """Largest age of the last checkpoints of its partitions [s]; None without one."""
     cpu_s: float = 0.0
     """CPU time of the process since its start [s]."""
     rss_mib: float = 0.0

@@ -1,4 +1,4 @@
-"""One hour of a pack in one row: measurements, and estimates at its end. The rows that fleet queries use."""
+"""Row of the fleet queries: measurements of one hour of a pack, and estimates at the end of the hour."""
 
 from typing import Annotated
 
@@ -11,24 +11,28 @@ Correlation = Annotated[float, Field(ge=-1.001, le=1.001)]
 
 
 class Hour(Payload):
-    """One row. Charge and energy out are of discharge; std are of one standard deviation; unknown values are null."""
+    """Row of one hour. ``out`` means discharge, ``std`` one standard deviation; unknown values are null."""
 
     model_config = ConfigDict(extra="ignore")  # the collector may be older than the worker
 
     pack: str
-    hour: int = Field(description="its begin, hours since 1970 UTC")
-    cell: str = Field(description="cell file or chemistry, as set; with series, parallel and capacity_ah: the type")
+    hour: int = Field(description="beginning of the hour, in hours since 1970 UTC")
+    cell: str = Field(
+        description="configured cell file or chemistry; together with series, parallel and capacity_ah the type of the pack"
+    )
     series: int
     parallel: int
-    capacity_ah: float | None = Field(description="declared, of the pack [Ah]; null of a fuel cell")
-    samples: int = Field(description="accepted")
-    dropped: int = Field(description="samples that could not be used")
-    outliers: int = Field(description="samples that the filter did not believe")
-    searches: int = Field(description="times the SOC became unknown, and was searched anew")
-    gaps: int = Field(description="times when samples were missing")
-    lost_blocks: int = Field(description="blocks that never came")
-    seen_s: float = Field(description="so much of the hour was measured [s]")
-    rest_s: float = Field(description="at its end next to no current had flowed for so long [s]")
+    capacity_ah: float | None = Field(description="rated capacity of the pack [Ah]; null for a fuel cell")
+    samples: int = Field(description="number of accepted samples")
+    dropped: int = Field(description="number of rejected samples")
+    outliers: int = Field(description="number of voltages that failed the filter's innovation gate")
+    searches: int = Field(
+        description="how often the filter was re-initialized because its SOC was inconsistent with the voltage"
+    )
+    gaps: int = Field(description="number of gaps between samples")
+    lost_blocks: int = Field(description="number of blocks that were never received")
+    seen_s: float = Field(description="measured part of the hour [s]")
+    rest_s: float = Field(description="how long the pack had rested at the end of the hour [s]")
     charge_out_ah: float
     charge_in_ah: float
     energy_out_wh: float
@@ -43,22 +47,28 @@ class Hour(Payload):
     temperature_min_c: float | None
     temperature_max_c: float | None
     innovation_rms_v: float | None = Field(description="measured less predicted voltage [V]")
-    stability_margin_min: float | None = Field(description="least soc - max(delta_1, delta_2) in the hour")
-    soc: float | None = Field(description="state of charge at the end, 0..1, as are all that follow")
-    soc_std: float | None = Field(description="as published: of the emptiest of cells in series")
-    soc_mean_std: float | None = Field(description="of the mean of the cells in series alone, as the filter has it")
-    capacity_ratio: float | None = Field(description="true over declared capacity")
+    stability_margin_min: float | None = Field(description="minimum of soc - max(delta_1, delta_2) in the hour")
+    soc: float | None = Field(description="state of charge 0..1 at the end of the hour, as are all following values")
+    soc_std: float | None = Field(description="standard deviation of the emptiest series cell's SOC, as published")
+    soc_mean_std: float | None = Field(
+        description="standard deviation of the mean SOC of the series cells, without the spread between cells"
+    )
+    capacity_ratio: float | None = Field(description="estimated divided by rated capacity")
     capacity_ratio_std: float | None
-    capacity_first_std: float | None = Field(description="of capacity_ratio, before any sample")
-    current_offset_a: float | None = Field(description="what the current sensor shows at no current [A]")
+    capacity_first_std: float | None = Field(description="standard deviation of capacity_ratio before the first sample")
+    current_offset_a: float | None = Field(description="estimated reading of the current sensor at zero current [A]")
     current_offset_std_a: float | None
-    soc_capacity_correlation: Correlation | None = Field(description="of the errors of soc and ln(capacity_ratio)")
-    soc_offset_correlation: Correlation | None = Field(description="of the errors of soc and current_offset_a")
+    soc_capacity_correlation: Correlation | None = Field(
+        description="correlation of the errors of soc and ln(capacity_ratio)"
+    )
+    soc_offset_correlation: Correlation | None = Field(
+        description="correlation of the errors of soc and current_offset_a"
+    )
     capacity_offset_correlation: Correlation | None
-    r_s_ratio: float | None = Field(description="R_s over that of the cell file at the same SOC and temperature")
+    r_s_ratio: float | None = Field(description="R_s divided by the cell file's at equal SOC and temperature")
     r_s_ratio_std: float | None
-    r_s_unlearned_s: float | None = Field(description="since data last told of R_s [s]; null: never")
-    r_s_ohm: float | None = Field(description="elements at the SOC of the end")
+    r_s_unlearned_s: float | None = Field(description="time since R_s was last identified [s]; null: never")
+    r_s_ohm: float | None = Field(description="circuit elements at the SOC at the end of the hour")
     r_s_std_ohm: float | None
     r_ts_ohm: float | None
     r_ts_std_ohm: float | None

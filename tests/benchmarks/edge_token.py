@@ -65,7 +65,7 @@ async def _attack(port: int, token: str, data: bytes) -> None:
 @contextlib.contextmanager
 def attacked(tenant: Tenant, name: str) -> Iterator[None]:
     """Run an attack meanwhile."""
-    arguments = tenant.engine.mqtt_port, tenant.token(ATTACKER), name
+    arguments = tenant.cluster.mqtt_port, tenant.token(ATTACKER), name
     process = mp.get_context("spawn").Process(target=attack, args=arguments, daemon=True)
     process.start()
     try:
@@ -152,7 +152,7 @@ async def measure(folder: Path, seconds: float) -> list[Row]:
         await tenant.make_streams(PARTITIONS, RAW_BYTES)
         admin, reader = await tenant.program(Role.ADMIN), await tenant.program(Role.READER)
         await write_bucket(admin, subjects.PACKS_BUCKET, dict.fromkeys([*PACKS, ATTACKER], KIND))
-        worker = Process(folder, tenant.engine.url, "w", "--creds", tenant.file(Role.WORKER))
+        worker = Process(folder, tenant.cluster.url, "w", "--creds", tenant.file(Role.WORKER))
         try:
             async with Heartbeats(reader) as heard, honest(tenant, reader) as packs:
                 await heard.until_held(PARTITIONS, "w")

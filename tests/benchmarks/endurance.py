@@ -32,7 +32,7 @@ from tests.benchmarks import edge_token, lost_sensor
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
 from tests.benchmarks.table import Row, show
 from tests.benchmarks.wire import hello, sample_frames
-from tests.fleet.engine import running
+from tests.fleet.nats_cluster import running
 from tests.idle_connections import (
     DESCRIPTORS,
     IDLE,
@@ -257,8 +257,8 @@ def idle_rows() -> Iterator[Row]:
             yield _idle_row("dashboard", attack_dashboard(folder, broker))
         finally:
             broker.stop()
-        with running(folder, partitions=1) as engine:
-            yield _idle_row("fleet page", attack_fleet_page(folder, engine))
+        with running(folder, partitions=1) as cluster:
+            yield _idle_row("fleet page", attack_fleet_page(folder, cluster))
 
 
 def _idle_row(program: str, attack: Coroutine[None, None, Outcome]) -> Row:

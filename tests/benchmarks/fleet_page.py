@@ -18,8 +18,8 @@ import psutil
 from nats.aio.client import Client
 
 from bms_estimator.fleet.nats.streams import make_streams
-from tests.fleet.engine import running
-from tests.fleet.many_packs import beat, load, many, publish
+from tests.fleet.nats_cluster import running
+from tests.fleet.published_states import load, make_packs, publish, publish_heartbeat
 from tests.free_port import free_port
 from tests.page.house import starting
 
@@ -34,7 +34,7 @@ def say(text: str) -> None:
 
 async def send(nc: Client, packs: int) -> None:
     """All packs once a minute, evenly, and two workers, for ever."""
-    fleet, sent, begin_s, beaten_s = many(packs), 0, time.monotonic(), 0.0
+    fleet, sent, begin_s, beaten_s = make_packs(packs), 0, time.monotonic(), 0.0
     while True:
         now_s = time.monotonic()
         while sent < packs * (now_s - begin_s) / MINUTE_S:
@@ -44,7 +44,9 @@ async def send(nc: Client, packs: int) -> None:
         if now_s > beaten_s + 1.0:
             beaten_s = now_s
             for name, partitions in (("alpha", range(32)), ("beta", range(32, 64))):
-                await beat(nc, name, partitions, packs=packs // 2, blocks=sent // 2, samples=30 * sent, lag_s=0.4)
+                await publish_heartbeat(
+                    nc, name, partitions, packs=packs // 2, blocks=sent // 2, samples=30 * sent, lag_s=0.4
+                )
         await asyncio.sleep(TICK_S)
 
 
@@ -65,12 +67,12 @@ async def read(url: str, got: dict[str, float]) -> None:
 
 async def measure(packs: int, minutes: float) -> None:
     """Load the table, send for two minutes, then look at the process for some."""
-    with tempfile.TemporaryDirectory() as temporary, running(Path(temporary)) as engine:
-        nc = await nats.connect(engine.url)
+    with tempfile.TemporaryDirectory() as temporary, running(Path(temporary)) as cluster:
+        nc = await nats.connect(cluster.url)
         await make_streams(nc)
-        await load(nc, many(packs))
+        await load(nc, make_packs(packs))
         port = free_port()
-        arguments = ("--server", engine.url, "--listen", f"127.0.0.1:{port}", "--no-browser")
+        arguments = ("--server", cluster.url, "--listen", f"127.0.0.1:{port}", "--no-browser")
         page = await starting(Path(temporary), "fleet", "page", *arguments, port=port)
         process, got = psutil.Process(page.pid), dict[str, float]()
         tasks = [asyncio.create_task(send(nc, packs)), asyncio.create_task(read(f"http://127.0.0.1:{port}", got))]

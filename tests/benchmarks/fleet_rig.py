@@ -12,7 +12,7 @@ from nats.aio.client import Client
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from tests.command_line import PROGRAM
-from tests.fleet.engine import Engine, connected, running
+from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.patience import LONG_S
 
 
@@ -24,7 +24,7 @@ class Rig:
         engine: The server, whose nodes run.
     """
 
-    def __init__(self, folder: Path, engine: Engine) -> None:
+    def __init__(self, folder: Path, engine: NatsCluster) -> None:
         self.folder, self.engine = folder, engine
         self.server = ",".join(engine.urls)
         self._mqtt = ",".join(f"mqtt://127.0.0.1:{port}" for port in engine.mqtt_ports)

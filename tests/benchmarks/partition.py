@@ -71,7 +71,7 @@ def _whole(partition: Partition, blocks: list[bytes]) -> float:
 
 def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
     """Each part on the state that the last block found."""
-    bench, of_type = partition._bench, partition._known["pack0"]
+    bench, of_type = partition._work, partition._type_by_pack["pack0"]
     estimator, wall_s = of_type.estimator, STORE / 1e9 + samples.size
     packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
     bench.put(packed)

@@ -18,7 +18,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import EdgeHealth
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.edge import EdgeSettings
-from tests.fleet.engine import Engine, running
+from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
@@ -30,13 +30,13 @@ SETTINGS = {"block_s": 60.0, "store_mib": 1.0}
 
 
 @pytest.fixture(scope="module")
-def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
+def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsCluster]:
     with running(tmp_path_factory.mktemp("engine"), partitions=4) as engine:
         yield engine
 
 
 @pytest.fixture
-async def receiver(engine: Engine, request: pytest.FixtureRequest) -> AsyncIterator[Receiver]:
+async def receiver(engine: NatsCluster, request: pytest.FixtureRequest) -> AsyncIterator[Receiver]:
     """Return the receiver of a pack for each test."""
     async with Receiver(engine.url, request.node.name.replace("[", "_").rstrip("]")[:64]) as receiver:
         yield receiver
@@ -85,7 +85,7 @@ def equal(some: SampleBlock, others: SampleBlock) -> bool:
     return all(some[name].tobytes() == others[name].tobytes() for name in SAMPLE.names or ())
 
 
-def url(engine: Engine) -> str:
+def url(engine: NatsCluster) -> str:
     return f"mqtt://127.0.0.1:{engine.mqtt_port}"
 
 
@@ -96,7 +96,7 @@ async def until(condition) -> None:
 
 
 async def test_samples_arrive_in_blocks_and_the_open_one_at_shutdown(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
@@ -110,7 +110,7 @@ async def test_samples_arrive_in_blocks_and_the_open_one_at_shutdown(
     assert (receiver.resends, receiver.gaps, feed.edge.store.dropped) == (0, 0, 0)
 
 
-async def test_no_sample_is_lost_by_a_cut_connection(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+async def test_no_sample_is_lost_by_a_cut_connection(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
     async with Proxy(engine.mqtt_port) as network:
         feed = Feed(receiver, tmp_path, network.url)
         async with feed.edge:
@@ -127,7 +127,7 @@ async def test_no_sample_is_lost_by_a_cut_connection(receiver: Receiver, engine:
 
 
 async def test_samples_keep_their_period_in_a_store_later_than_the_clock(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:9")  # no server listens there
     async with feed.edge:
@@ -161,7 +161,7 @@ async def test_no_sample_is_lost_by_a_killed_server(tmp_path: Path) -> None:
 
 
 async def test_restarted_edge_sends_unconfirmed_blocks_first(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:1")
     async with feed.edge:
@@ -176,7 +176,9 @@ async def test_restarted_edge_sends_unconfirmed_blocks_first(
     assert [block.number for block in receiver.blocks] == list(range(1, 61))
 
 
-async def test_blocks_lost_by_the_stream_are_sent_again(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+async def test_blocks_lost_by_the_stream_are_sent_again(
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
+) -> None:
     """A leader may be killed after acknowledging messages that no other node has."""
     receiver.lose = {5, 6, 14, 30}
     feed = Feed(receiver, tmp_path, url(engine))
@@ -187,7 +189,7 @@ async def test_blocks_lost_by_the_stream_are_sent_again(receiver: Receiver, engi
     assert receiver.gaps > 0
 
 
-async def test_full_edge_announces_its_oldest_block(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+async def test_full_edge_announces_its_oldest_block(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
     async with Proxy(engine.mqtt_port) as network:
         network.away = True
         feed = Feed(receiver, tmp_path, network.url, store_mib=0.1)
@@ -205,7 +207,7 @@ async def test_full_edge_announces_its_oldest_block(receiver: Receiver, engine: 
     assert equal(receiver.samples, np.concatenate(feed._reads[60 * dropped :]))
 
 
-async def test_invalid_requests_are_ignored(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+async def test_invalid_requests_are_ignored(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
         feed.add(3)
@@ -214,9 +216,9 @@ async def test_invalid_requests_are_ignored(receiver: Receiver, engine: Engine, 
         garbage = [b"", b"\xff\x00", b"{}", b'{"store": -1, "number": 1, "resend": false}', b"9" * 10_000, b"[" * 9_000]
         garbage += [f'{{"store": {n}, "number": {n}, "resend": true}}'.encode() for n in (10**30, 10**400)]
         for payload in garbage:
-            await receiver.say(payload)
-        await receiver.say(BlockRequest(store=1, number=1, resend=True))
-        await receiver.say(BlockRequest(store=store, number=1, resend=False))
+            await receiver.reply(payload)
+        await receiver.reply(BlockRequest(store=1, number=1, resend=True))
+        await receiver.reply(BlockRequest(store=store, number=1, resend=False))
         await until(lambda: feed.edge.unread == len(garbage))
         feed.add(3)
         await feed.assert_all_received()
@@ -243,7 +245,7 @@ async def test_blocks_are_sent_to_any_mqtt_broker(broker: Broker, tmp_path: Path
 
 
 async def test_open_block_is_sent_if_the_source_falls_silent(
-    receiver: Receiver, engine: Engine, tmp_path: Path
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     feed = Feed(receiver, tmp_path, url(engine), block_s=1.0)
     async with feed.edge:
@@ -251,12 +253,12 @@ async def test_open_block_is_sent_if_the_source_falls_silent(
         await receiver.until(1)
 
 
-async def test_unreadable_password_file_raises_an_error(engine: Engine, tmp_path: Path) -> None:
+async def test_unreadable_password_file_raises_an_error(engine: NatsCluster, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^edge.password_file = /none: cannot be read"):
         BlockSender(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
 
 
-async def test_stream_stores_blocks_by_pack(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+async def test_stream_stores_blocks_by_pack(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
     feed = Feed(receiver, tmp_path, url(engine))
     async with feed.edge:
         feed.add(2)

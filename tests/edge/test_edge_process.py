@@ -20,14 +20,14 @@ from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.health import sample_counters
 from tests.command_line import PROGRAM, run
-from tests.fleet.engine import Engine, running
+from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
 
 @pytest.fixture(scope="module")
-def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
+def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsCluster]:
     with running(tmp_path_factory.mktemp("engine"), partitions=4) as engine:
         yield engine
 
@@ -76,7 +76,7 @@ async def program(*command: object, stderr: IO[bytes]) -> AsyncIterator[Process]
 
 
 async def test_killed_edge_sends_completed_blocks_once_and_sigterm_sends_all(
-    tmp_path: Path, line: Line, engine: Engine
+    tmp_path: Path, line: Line, engine: NatsCluster
 ) -> None:
     line.plug()
     pack, log_file = pack_file(tmp_path, line, engine.mqtt_port), tmp_path / "log"
@@ -107,7 +107,7 @@ async def test_killed_edge_sends_completed_blocks_once_and_sigterm_sends_all(
     assert not [name for name in imported if name.split(".")[0] in ("numba", "scipy") or ".kernels" in name]
 
 
-async def test_run_sends_the_samples_of_its_estimates(tmp_path: Path, line: Line, engine: Engine) -> None:
+async def test_run_sends_the_samples_of_its_estimates(tmp_path: Path, line: Line, engine: NatsCluster) -> None:
     line.plug()
     board, stop = asyncio.create_task(Board(line).print_lines()), asyncio.Event()
     edge = {"url": f"mqtt://127.0.0.1:{engine.mqtt_port}", "block_s": 1.0}

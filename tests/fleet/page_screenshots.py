@@ -1,4 +1,4 @@
-"""The pictures of docs/fleet/page.md: a made-up fleet on the real nats-server, in a real Chromium; ``make screenshots``."""
+"""Screenshots of docs/fleet/page.md: a simulated fleet on the real nats-server, in a real Chromium (``make screenshots``)."""
 
 import asyncio
 import json
@@ -16,14 +16,14 @@ from bms_estimator.fleet.page.fleet_page import fleet_page
 from bms_estimator.fleet.page.nats_feed import Server
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.page import PageSettings
-from tests.fleet.engine import running
-from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
-from tests.fleet.many_packs import Pack, beat, load, many, publish
+from tests.fleet.hour_rows import BEGIN, FIRST_STD, capacities, write_fleet
+from tests.fleet.nats_cluster import running
+from tests.fleet.published_states import Pack, load, make_packs, publish, publish_heartbeat
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.sinks.snapshots import ONE
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
-PACKS, AWAY, DAYS = 5000, 12, 90
+PACKS, SILENT, DAYS = 5000, 12, 90
 SUSPECTED = {
     7: InputFault.CAPACITY,
     40: InputFault.OFFSET,
@@ -31,12 +31,12 @@ SUSPECTED = {
     161: InputFault.OUTLIERS | InputFault.OCV,
 }
 STEP_S = 0.2
-TOP = 420
-"""Of the page: so much shows how it looks in the dark, or stale [px]."""
+TOP_PX = 420
+"""Height of the screenshots in dark mode and stale [px]."""
 
 
 def write_hours(folder: Path, names: list[str]) -> None:
-    """Packs that lose some of their capacity; a few of them much."""
+    """Write hours of packs that lose capacity, two of them much."""
     rng = np.random.default_rng(3)
     begin = rng.normal(-0.03, 0.015, (len(names), 1))
     begin[:2] -= 0.4
@@ -50,26 +50,26 @@ def write_hours(folder: Path, names: list[str]) -> None:
 
 
 async def work(nc: Client, packs: list[Pack]) -> None:
-    """Two workers, for ever; some packs are silent, one is not known."""
+    """Publish as two workers until cancelled; some packs are silent, one is unknown."""
     rounds = 0
     while True:
         rounds += 1
         more = {"packs": PACKS // 2, "blocks": rounds * PACKS // 120, "samples": rounds * PACKS // 2}
-        await beat(nc, "cellar", range(32), lag_s=0.6, unknown_count=1, **more)
-        await beat(nc, "loft", range(32, 64), lag_s=0.9, **more)
-        for pack in packs[:-AWAY] if rounds % 5 == 1 else ():
+        await publish_heartbeat(nc, "cellar", range(32), lag_s=0.6, unknown_count=1, **more)
+        await publish_heartbeat(nc, "loft", range(32, 64), lag_s=0.9, **more)
+        for pack in packs[:-SILENT] if rounds % 5 == 1 else ():
             await publish(nc, pack.name, pack.state)
-        for place, suspects in SUSPECTED.items():
-            await nc.publish(subjects.hours(packs[place].name), json.dumps({"suspects": int(suspects)}).encode())
+        for index, suspects in SUSPECTED.items():
+            await nc.publish(subjects.hours(packs[index].name), json.dumps({"suspects": int(suspects)}).encode())
         await nc.publish(subjects.unknown("home-900001"), b"not in the table of packs")
         for pack in packs[:100] if rounds % 5 == 1 else ():
             await nc.publish(f"bms.{pack.name}.parameters", ONE.parameters.model_dump_json().encode())
         await asyncio.sleep(1.0)
 
 
-async def shoot(opened: Tab, name: str, part: str = "", height: int = 0) -> None:
-    """A part of the page, or its top."""
-    path, page = DOCS / f"fleet-page-{name}.png", opened.page
+async def shoot(browser_tab: Tab, name: str, part: str = "", height: int = 0) -> None:
+    """Save a screenshot of a part of the page, or of its top."""
+    path, page = DOCS / f"fleet-page-{name}.png", browser_tab.page
     if part:
         await page.locator(part).screenshot(path=path)
     else:
@@ -81,43 +81,43 @@ async def shoot(opened: Tab, name: str, part: str = "", height: int = 0) -> None
 
 async def shoot_all(url: str, kill: asyncio.Event) -> None:
     async with chromium() as browser:
-        async with tab(browser, url, size={"width": 1280, "height": 990}) as opened:
-            await ready(opened)
-            await shoot(opened, "desktop", height=990)
-            await shoot(opened, "time", ".time")
-            await opened.page.locator("#concerns button", has_text="home-000007").click()
-            await opened.page.locator("#parameters tr").nth(5).wait_for()
-            await shoot(opened, "pack", "dialog")
-        async with tab(browser, url, size={**PHONE, "height": 1220}) as opened:
-            await ready(opened)
-            await shoot(opened, "phone", height=1220)
-        async with tab(browser, url, color_scheme="dark") as opened:
-            await ready(opened)
-            await shoot(opened, "dark", height=TOP)
+        async with tab(browser, url, size={"width": 1280, "height": 990}) as browser_tab:
+            await ready(browser_tab)
+            await shoot(browser_tab, "desktop", height=990)
+            await shoot(browser_tab, "time", ".time")
+            await browser_tab.page.locator("#concerns button", has_text="home-000007").click()
+            await browser_tab.page.locator("#parameters tr").nth(5).wait_for()
+            await shoot(browser_tab, "pack", "dialog")
+        async with tab(browser, url, size={**PHONE, "height": 1220}) as browser_tab:
+            await ready(browser_tab)
+            await shoot(browser_tab, "phone", height=1220)
+        async with tab(browser, url, color_scheme="dark") as browser_tab:
+            await ready(browser_tab)
+            await shoot(browser_tab, "dark", height=TOP_PX)
             kill.set()
-            await opened.until_status("stale since")
-            await shoot(opened, "stale", height=TOP)
+            await browser_tab.until_status("stale since")
+            await shoot(browser_tab, "stale", height=TOP_PX)
 
 
-async def ready(opened: Tab) -> None:
-    await opened.until_text("known", f"of {PACKS:,}")
-    await opened.until_text("alive", f"{PACKS - AWAY:,}")
-    await opened.until("() => document.querySelectorAll('#answers tbody tr').length > 2")
+async def ready(browser_tab: Tab) -> None:
+    await browser_tab.until_text("known", f"of {PACKS:,}")
+    await browser_tab.until_text("alive", f"{PACKS - SILENT:,}")
+    await browser_tab.until("() => document.querySelectorAll('#answers tbody tr').length > 2")
 
 
 async def main() -> None:
-    with tempfile.TemporaryDirectory() as temporary, running(Path(temporary)) as engine:
-        nc, kill, packs = await nats.connect(engine.url), asyncio.Event(), many(PACKS)
+    with tempfile.TemporaryDirectory() as temporary, running(Path(temporary)) as cluster:
+        nc, kill, packs = await nats.connect(cluster.url), asyncio.Event(), make_packs(PACKS)
         await make_streams(nc)
         await load(nc, packs)
         hours = Path(temporary) / "hours"
         write_hours(hours, [pack.name for pack in packs if pack.name.startswith("home")][:300])
-        async with fleet_page(Server(engine.url), PageSettings(listen="127.0.0.1:0"), hours, step_s=STEP_S) as url:
+        async with fleet_page(Server(cluster.url), PageSettings(listen="127.0.0.1:0"), hours, step_s=STEP_S) as url:
             working = asyncio.create_task(work(nc, packs))
             shooting = asyncio.create_task(shoot_all(url, kill))
             await asyncio.wait({shooting, asyncio.create_task(kill.wait())}, return_when=asyncio.FIRST_COMPLETED)
             working.cancel()
-            engine.kill(0)
+            cluster.kill(0)
             await shooting
         await nc.close()
 

@@ -1,4 +1,4 @@
-"""Takes an edge's blocks from the stream as a worker does, and stores the samples."""
+"""Receiver that reads an edge's blocks from the stream as a worker does, and stores the samples."""
 
 import asyncio
 import contextlib
@@ -13,7 +13,7 @@ from bms_estimator.edge.block import Block, decode
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.model.sample import SampleBlock
-from tests.fleet.engine import connected
+from tests.fleet.nats_cluster import connected
 from tests.patience import LONG_S, end
 
 POLL_S = 0.01
@@ -23,14 +23,14 @@ class Receiver:
     """Reads the stream in order; takes blocks in the order of their numbers and requests missing ones.
 
     Args:
-        url: Of the server.
-        pack: Whose blocks.
+        url: URL of the server.
+        pack: Name of the pack.
 
     Attributes:
-        lose: Numbers of blocks of which the first that comes is lost.
-        blocks: Those that were taken.
-        resends, gaps: Blocks that were not, for they had come, or one before them had not.
-        lost: Blocks that will never come.
+        lose: Numbers of blocks whose first arrival is dropped.
+        blocks: Accepted blocks.
+        resends, gaps: Number of repeated blocks, and of blocks that arrived before a missing one.
+        lost: Number of blocks that the edge no longer has.
     """
 
     def __init__(self, url: str, pack: str) -> None:
@@ -69,7 +69,7 @@ class Receiver:
                     self._task.result()
                 await asyncio.sleep(POLL_S)
 
-    async def say(self, awaits: BlockRequest | bytes) -> None:
+    async def reply(self, awaits: BlockRequest | bytes) -> None:
         payload = awaits if isinstance(awaits, bytes) else awaits.model_dump_json().encode()
         await self.nc.publish(subjects.awaits(self.pack), payload)
         await self.nc.flush()
@@ -102,9 +102,9 @@ class Receiver:
             self.gaps += 1
             if self._asked != self._next or self.gaps % 5 == 0:
                 self._asked = self._next
-                await self.say(BlockRequest(store=self._store, number=self._next, resend=True))
+                await self.reply(BlockRequest(store=self._store, number=self._next, resend=True))
         else:
             self._next += 1
             self.blocks.append(block)
             if self._next % 10 == 2:
-                await self.say(BlockRequest(store=self._store, number=self._next, resend=False))
+                await self.reply(BlockRequest(store=self._store, number=self._next, resend=False))

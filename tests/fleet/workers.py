@@ -1,4 +1,4 @@
-"""Workers of a fleet as processes, their blocks, and their final states."""
+"""Worker processes, blocks for them, and their final states."""
 
 import asyncio
 import hashlib
@@ -29,40 +29,40 @@ from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
 PERIOD_S = 10.0
-"""Between two samples."""
+"""Interval between two samples [s]."""
 KIND = stored(PackSpec(cell="ncr18650", period_s=PERIOD_S))
 STORE = 1_790_000_000 * 10**9
-"""When the edges' stores were made [ns since 1970]."""
+"""Creation time of the edges' stores [ns since 1970]."""
 SAMPLES = 60
-"""Duration of a block, ten minutes."""
+"""Samples of a block, ten minutes."""
 
 
 def samples(pack: str, number: int) -> np.ndarray:
     """Return the samples of a pack's block, computed from its number: a load with steps at the pack's own rate."""
     time_s = PERIOD_S * (SAMPLES * (number - 1.0) + np.arange(SAMPLES))
-    made = np.zeros(SAMPLES, SAMPLE)
-    made["time_s"] = time_s
-    made["current_a"] = np.where(np.sin(time_s / (200.0 + int(pack[1:]))) > 0.0, 1.5, 0.25)
-    made["voltage_v"] = 3.9 - 0.06 * made["current_a"] - 5e-6 * time_s
-    made["temperature_c"] = 25.0
-    return made
+    rows = np.zeros(SAMPLES, SAMPLE)
+    rows["time_s"] = time_s
+    rows["current_a"] = np.where(np.sin(time_s / (200.0 + int(pack[1:]))) > 0.0, 1.5, 0.25)
+    rows["voltage_v"] = 3.9 - 0.06 * rows["current_a"] - 5e-6 * time_s
+    rows["temperature_c"] = 25.0
+    return rows
 
 
 def block(pack: str, number: int, arrival_s: float = 1.79e9) -> bytes:
     return encode(Block(STORE, number, 1, arrival_s, samples(pack, number)))
 
 
-async def know(nc: Client, packs: list[str]) -> PackRegistry:
-    """Load the table, and have it here, too."""
+async def load_packs(nc: Client, packs: list[str]) -> PackRegistry:
+    """Write packs to the table, and return a registry with them."""
     await write_bucket(nc, subjects.PACKS_BUCKET, dict.fromkeys(packs, KIND))
-    known = PackRegistry()
+    registry = PackRegistry()
     for pack in packs:
-        known.set_row(pack, KIND)
-    return known
+        registry.set_row(pack, KIND)
+    return registry
 
 
 async def send(nc: Client, pack: str, data: bytes) -> None:
-    """Publish until the stream has it; the stream drops a repetition after a late response."""
+    """Publish until the stream confirms; the stream drops repetitions after a late response."""
     headers = {"Nats-Msg-Id": f"{pack} {hashlib.sha256(data).hexdigest()}"}
     deadline = time.monotonic() + LONG_S
     while time.monotonic() < deadline:
@@ -70,11 +70,11 @@ async def send(nc: Client, pack: str, data: bytes) -> None:
             await nc.jetstream().publish(subjects.raw(pack), data, timeout=1.0, headers=headers)
             return
         await asyncio.sleep(0.05)
-    raise AssertionError("the stream takes nothing")
+    raise AssertionError("the stream does not store the message")
 
 
 class Process:
-    """One worker."""
+    """Worker process."""
 
     def __init__(self, folder: Path, url: str, name: str, *options: object) -> None:
         self.name, self._log = name, folder / f"{name}.log"
@@ -84,24 +84,24 @@ class Process:
 
     @property
     def lines(self) -> list[dict[str, Any]]:
-        """Return the lines of its log, without other stderr output."""
+        """Lines of its log, without other stderr output."""
         lines = self._log.read_text().splitlines(keepends=True)
         return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]
 
     async def logged(self, text: str) -> dict[str, Any]:
         """Return the first line with this event."""
 
-        def found() -> dict[str, Any] | None:
+        def find_line() -> dict[str, Any] | None:
             assert self._process.poll() is None, f"it has ended: {self._log.read_text()}"
             return next((line for line in self.lines if text in line["event"]), None)
 
-        return await until(found, self._log.read_text)
+        return await until(find_line, self._log.read_text)
 
     def signal(self, number: int) -> None:
         self._process.send_signal(number)
 
     async def end(self) -> int:
-        """Return its exit code after SIGTERM."""
+        """Send SIGTERM and return the exit code."""
         self.signal(signal.SIGTERM)
         return await asyncio.to_thread(self._process.wait, LONG_S)
 
@@ -117,59 +117,59 @@ class Heartbeats:
         self._nc, self._last = nc, dict[str, Heartbeat]()
 
     async def __aenter__(self) -> Self:
-        await self._nc.subscribe(subjects.worker(), cb=self._hear)
+        await self._nc.subscribe(subjects.worker(), cb=self._receive)
         return self
 
     async def __aexit__(self, *_: object) -> None:
         pass
 
-    async def _hear(self, message: Any) -> None:
-        heard = Heartbeat.model_validate_json(message.data)
-        self._last[heard.id] = heard
+    async def _receive(self, message: Any) -> None:
+        heartbeat = Heartbeat.model_validate_json(message.data)
+        self._last[heartbeat.id] = heartbeat
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         self._last.clear()
 
-    async def until(self, wanted: Callable[[Mapping[str, Heartbeat]], object]) -> None:
-        await until(lambda: wanted(self._last), lambda: self._last)
+    async def until(self, condition: Callable[[Mapping[str, Heartbeat]], object]) -> None:
+        await until(lambda: condition(self._last), lambda: self._last)
 
     async def until_held(self, partitions: int, *workers: str) -> None:
-        """Until these workers, and no others, have all partitions, each some."""
+        """Wait until these workers together have all partitions, each at least one."""
 
         def held(last: Mapping[str, Heartbeat]) -> bool:
             parts = [last[worker].partitions if worker in last else () for worker in workers]
             return all(parts) and sorted(number for part in parts for number in part) == list(range(partitions))
 
-        self.forget()
+        self.clear()
         await self.until(held)
 
 
-async def until(found: Callable[[], Any], or_else: Callable[[], object]) -> Any:
+async def until(condition: Callable[[], Any], or_else: Callable[[], object]) -> Any:
     deadline = time.monotonic() + LONG_S
     while time.monotonic() < deadline:
-        if result := found():
+        if result := condition():
             return result
         await asyncio.sleep(0.02)
     raise AssertionError(str(or_else()))
 
 
-async def end_states(nc: Client, known: PackRegistry, partitions: int) -> dict[int, Partition]:
-    """Return the content of the last checkpoints."""
+async def end_states(nc: Client, registry: PackRegistry, partitions: int) -> dict[int, Partition]:
+    """Return the partitions of the last checkpoints."""
     js = nc.jetstream(timeout=LONG_S)
     checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    keeping = CheckpointStore(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))
-    found = {}
+    store = CheckpointStore(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))
+    partitions_by_number = {}
     for number in range(partitions):
-        async with aclosing(keeping.load(await keeping.claim(number))) as kept:
-            async for _, data in kept:
-                found[number] = Partition.restore(number, known, data)
+        async with aclosing(store.load(await store.claim(number))) as stored_checkpoints:
+            async for _, data in stored_checkpoints:
+                partitions_by_number[number] = Partition.restore(number, registry, data)
                 break
-    return found
+    return partitions_by_number
 
 
-def estimated(known: PackRegistry, pack: str, blocks: int) -> bytes:
-    """The record that the estimator leaves of a pack's blocks, all in one run."""
-    settings, cell = known(pack) or (None, None)
+def estimated(registry: PackRegistry, pack: str, blocks: int) -> bytes:
+    """Return the estimator's record after one run over a pack's blocks."""
+    settings, cell = registry(pack) or (None, None)
     assert settings
     assert cell
     estimator = estimator_of(settings, cell)

@@ -9,7 +9,7 @@ from typing import Self
 import aiomqtt
 import pytest
 
-from tests.fleet.engine import Engine, running
+from tests.fleet.nats_cluster import NatsCluster, running
 from tests.sinks.service import STATE, Sink, assert_all_in_order, state, until
 
 COUNT = 400
@@ -21,7 +21,7 @@ MESSAGES = "$MQTT_msgs"
 class Collector:
     """Receives the pack's messages from any live node without loss, because the cluster stores its session."""
 
-    def __init__(self, server: Engine) -> None:
+    def __init__(self, server: NatsCluster) -> None:
         self._ports = server.mqtt_ports
         self.states: list[int] = []
         self.availability: list[bytes] = []
@@ -62,7 +62,7 @@ async def publish(sink: Sink, first: int, after: int) -> None:
         await asyncio.sleep(0.005)
 
 
-def mqtt_url(server: Engine, node: int) -> str:
+def mqtt_url(server: NatsCluster, node: int) -> str:
     return f"mqtt://127.0.0.1:{server.mqtt_ports[node]}"
 
 

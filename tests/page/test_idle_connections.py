@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.fleet.engine import Engine, running
+from tests.fleet.nats_cluster import NatsCluster, running
 from tests.idle_connections import Outcome, attack_dashboard, attack_fleet_page, attack_service, few_descriptors
 from tests.mosquitto import Broker
 
@@ -19,7 +19,7 @@ def _few_descriptors() -> Iterator[None]:
 
 
 @pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
+def engine(tmp_path: Path) -> Iterator[NatsCluster]:
     with running(tmp_path, partitions=1) as started:
         yield started
 
@@ -40,5 +40,5 @@ async def test_the_dashboard_finds_its_broker_again(tmp_path: Path, broker: Brok
 
 
 @pytest.mark.thorough
-async def test_the_page_of_a_fleet_finds_its_server_again(tmp_path: Path, engine: Engine) -> None:
+async def test_the_page_of_a_fleet_finds_its_server_again(tmp_path: Path, engine: NatsCluster) -> None:
     assert_unimpressed(await attack_fleet_page(tmp_path, engine))

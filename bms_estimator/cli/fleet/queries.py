@@ -39,7 +39,7 @@ def collect(
 
 
 async def _collect(where: ServerAddress, folder: Path, period_s: float) -> None:
-    from bms_estimator.fleet.nats.connection import connect, part  # noqa: PLC0415
+    from bms_estimator.fleet.nats.connection import close, connect  # noqa: PLC0415
     from bms_estimator.fleet.queries.collector import Collector  # noqa: PLC0415
     from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
     from bms_estimator.process.tasks import end  # noqa: PLC0415
@@ -58,7 +58,7 @@ async def _collect(where: ServerAddress, folder: Path, period_s: float) -> None:
     try:
         await Collector(nc, folder, period_s=period_s).run(stop)
     finally:
-        await part(nc)
+        await close(nc)
 
 
 def ask(

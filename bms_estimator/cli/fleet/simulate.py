@@ -71,7 +71,7 @@ async def _run(
 ) -> Report:
     start_s = time.time() - BLOCK_S / speed  # the first blocks are complete within the next minute
     edges = SimulatedEdges(fleet, start_s=start_s, speed=speed, last=blocks)
-    return await run_edges(fleet, edges, settings, connections=connections, stop=stop_on_signal(), said=typer.echo)
+    return await run_edges(fleet, edges, settings, connections=connections, stop=stop_on_signal(), report=typer.echo)
 
 
 def _begin_ns(begin: datetime | None) -> int:

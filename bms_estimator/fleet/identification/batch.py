@@ -23,7 +23,7 @@ class Task:
 
     Attributes:
         pack: Name of the pack.
-        kind: Row of the pack in the fleet's table.
+        kind: Row of the pack in the table of packs.
         cell_file: Text of the cell file that ``kind`` names; None for a shipped cell.
         since_s, until_s: Time span of the samples [s since 1970].
         server, creds, ca: Address, credentials file and certificate authority of the NATS server.
@@ -53,22 +53,22 @@ def reidentify_all(tasks: Sequence[Task], processes: int) -> Iterator[Reidentifi
         try:
             yield from pool.map(reidentify_one, tasks)
         except BrokenProcessPool:
-            raise UserError("a worker process was killed: too little memory? --processes takes fewer") from None
+            raise UserError("a worker process was killed, perhaps for lack of memory: reduce --processes") from None
 
 
 def reidentify_one(task: Task) -> ReidentificationResult:
     """Fetch one pack's samples and identify its cell; an error becomes the result's reason."""
     try:
-        found = asyncio.run(_fetched(task))
-        if not found.blocks:
+        capture = asyncio.run(_fetch(task))
+        if not capture.blocks:
             return ReidentificationResult(task.pack, reason="the server keeps no sample of it in this span")
-        return reidentify(task.pack, np.concatenate(list(found.samples())), task.kind, task.cell_file)
+        return reidentify(task.pack, np.concatenate(list(capture.samples())), task.kind, task.cell_file)
     except UserError as error:
         return ReidentificationResult(task.pack, reason=str(error))
     except Exception as error:  # noqa: BLE001 - reported for this pack, so that the others' hours of work are not lost
-        return ReidentificationResult(task.pack, reason=f"a fault of the program: {type(error).__name__}: {error}")
+        return ReidentificationResult(task.pack, reason=f"internal error: {type(error).__name__}: {error}")
 
 
-async def _fetched(task: Task) -> BlockCapture:
+async def _fetch(task: Task) -> BlockCapture:
     async with connected(task.server, task.creds, task.ca) as nc:
         return await fetch(nc, task.pack, since_s=task.since_s, until_s=task.until_s)

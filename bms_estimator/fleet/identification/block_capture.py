@@ -1,4 +1,4 @@
-"""A pack's blocks, as the stream has them, put together: in the order of their numbers, each once."""
+"""Blocks of a pack from the stream, put in order and without repetitions."""
 
 import math
 from collections.abc import Iterator
@@ -15,23 +15,23 @@ from bms_estimator.model.sample import SampleBlock
 AHEAD_S = 3600.0
 """Maximum lead of an edge's clock over the server's [s]: a block may be stored this long before its samples' time."""
 
-ROWS = 65_536
-"""Minimum number of samples handed over at a time, except for the last ones."""
+MIN_YIELDED_ROWS = 65_536
+"""Minimum number of samples that are yielded at a time, except for the last ones."""
 
 
 @dataclass
 class BlockCapture:
-    """Blocks of one pack; ``add`` them in the stream's order.
+    """Blocks of one pack, to be added in the order of the stream.
 
-    As workers do, a store that is older than one already met is left out: its edge has been given another.
+    Blocks of a store that the edge has replaced by a newer one are skipped, as workers do.
 
     Args:
-        since_s: Samples before it are left out [s since 1970].
-        until_s: Samples from it on are.
+        since_s: Beginning of the time span [s since 1970].
+        until_s: End of the time span [s since 1970].
 
     Attributes:
-        damaged: Messages that were no block.
-        again: Blocks that arrived more than once, or belong to a former store.
+        damaged: Number of messages that cannot be decoded.
+        again: Number of blocks that arrived more than once, or belong to a former store.
     """
 
     since_s: float = -np.inf
@@ -42,7 +42,7 @@ class BlockCapture:
     _store: int = 0
 
     def add(self, data: bytes) -> None:
-        """Take the pack's next message."""
+        """Add the next message of the pack."""
         try:
             block = decode(data)
         except BlockError:
@@ -58,12 +58,12 @@ class BlockCapture:
 
     @property
     def blocks(self) -> int:
-        """Number of blocks found."""
+        """Number of blocks in the time span."""
         return len(self._blocks)
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """Wall clock of the first and of the last sample [s since 1970]; of no block NaN."""
+        """Wall clock of the first and the last sample [s since 1970]; NaN without a block."""
         if not self._blocks:
             return np.nan, np.nan
         ordered = sorted(self._blocks)
@@ -72,21 +72,21 @@ class BlockCapture:
 
     @property
     def missing(self) -> list[tuple[int, int]]:
-        """First and last number of the blocks that are not there between two that are, of all stores."""
+        """First and last number of each range of missing blocks within a store."""
         pairs = zip(ordered := sorted(self._blocks), ordered[1:], strict=False)
         return [(a + 1, b - 1) for (store, a), (other, b) in pairs if store == other and b > a + 1]
 
     def samples(self) -> Iterator[SampleBlock]:
-        """All samples.
+        """Yield all samples.
 
-        ``time_s`` is that of the first store; a new store continues by the edge's wall clock, or from the last sample
-        if that clock was set back.
+        ``time_s`` counts from the creation of the first store. A later store continues by the edge's wall clock, or from the last
+        sample if that clock was set back.
         """
         parts, rows = list[SampleBlock](), 0
         for part in self._parts():
             parts.append(part)
             rows += part.size
-            if rows >= ROWS:
+            if rows >= MIN_YIELDED_ROWS:
                 yield np.concatenate(parts)
                 parts, rows = [], 0
         if parts:
@@ -96,7 +96,7 @@ class BlockCapture:
         store, origin, offset_s, last_s = 0, 0, 0.0, 0.0
         for key in sorted(self._blocks):
             block = self._block(key)
-            samples = block.samples[self._wanted(block)]
+            samples = block.samples[self._in_span(block)]
             if not samples.size:
                 continue
             origin = origin or block.store
@@ -107,7 +107,7 @@ class BlockCapture:
             last_s = float(samples["time_s"][-1])
             yield samples
 
-    def _wanted(self, block: Block) -> np.ndarray:
+    def _in_span(self, block: Block) -> np.ndarray:
         wall_s = block.store * 1e-9 + block.samples["time_s"]
         return (wall_s >= self.since_s) & (wall_s < self.until_s)
 
@@ -123,17 +123,17 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
     """Fetch the blocks of a pack that the stream still has.
 
     Args:
-        nc: Connected as the tenant.
+        nc: Connection of the tenant.
         pack: Name of the pack.
-        since_s: Samples from then on, by the edge's clock [s since 1970].
-        until_s: Samples before it.
+        since_s: Beginning of the time span by the edge's clock [s since 1970].
+        until_s: End of the time span [s since 1970].
 
     Raises:
-        StreamError: The server does not answer, or has no such stream.
+        StreamError: The server does not respond, or has no such stream.
     """
-    found = BlockCapture(since_s, until_s)
+    capture = BlockCapture(since_s, until_s)
     first_s = None if since_s <= AHEAD_S else since_s - AHEAD_S
     async for batch in read_stream(nc, RAW_STREAM, f"p.*.raw.{pack}", since_s=first_s):
         for message in batch:
-            found.add(message.data)
-    return found
+            capture.add(message.data)
+    return capture

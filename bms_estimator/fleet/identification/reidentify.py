@@ -1,8 +1,9 @@
-"""Re-identify a pack from its stored samples, and judge the result on samples that had no part in it.
+"""Re-identification of a pack from its stored samples, validated on later samples.
 
-Two thirds of the samples, the earlier ones, go to two ways of finding the cell: what the estimator's filter has learned of
-it by their end, and from there the fit of ``calibration.elements.identify`` to their longest piece without a gap. The last third
-judges: open loop, the voltage that each cell predicts from the current, for hours at a time, against the measured one.
+The first two thirds of the time are the training samples of two methods. The first method takes the cell that the estimator's
+filter has learned at their end. The second one starts from this cell and fits the longest piece without a gap
+(``calibration.elements.identify``). The last third is the holdout: each cell predicts the voltage from the current in open loop
+for some hours at a time, and the prediction is compared with the measured voltage.
 """
 
 import math
@@ -25,33 +26,33 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.sampling import Sampling
 
-TRAINING = 2.0 / 3.0
-"""Fraction of the time whose samples identify; the others judge."""
-MIN_S = 6 * 3600.0
-"""Fewer samples are not enough to do both [s]."""
+TRAINING_FRACTION = 2.0 / 3.0
+"""Fraction of the time used for training; the rest is the holdout."""
+MIN_DURATION_S = 6 * 3600.0
+"""Minimum duration of the samples [s]."""
 MIN_MOVED = 1.0
-"""Nor is it where less charge was moved, out and in, in capacities."""
+"""Minimum charge moved out and in [capacities]."""
 GAP_S = 60.0
-"""Two samples further apart belong to two pieces [s]."""
+"""Interval between two samples above which they belong to different pieces [s]."""
 MIN_PIECE_S = 900.0
-"""A shorter piece neither identifies nor judges [s]."""
+"""Minimum duration of a used piece [s]."""
 WINDOW_S = 3 * 3600.0
-"""Open loop is begun again after it, from the SOC that an estimator with the cell has by then: errors of the counted charge
-do not swamp those of the resistances [s]."""
-UNSURE_SOC = 0.05
-"""An SOC with a larger standard deviation begins no fit."""
+"""Maximum duration of an open-loop prediction [s]. Each one starts at the SOC of an estimator with the same cell, so that errors of
+the counted charge do not hide those of the resistances."""
+MAX_SOC_STD = 0.05
+"""Maximum standard deviation of the SOC at which a fit starts."""
 MIN_GAIN = 0.03
-"""A new cell is taken where the judges' RMS error is smaller by this part at least."""
+"""Minimum relative reduction of the RMS error on the holdout for which a new cell replaces the old one."""
 ROWS = 65_536
-"""Samples that are estimated at a time."""
+"""Number of samples estimated at a time."""
 
 
 @dataclass(frozen=True)
 class HoldoutError:
-    """One cell on the samples that judge.
+    """Error of one cell on the holdout.
 
     Attributes:
-        rms_v: RMS of measured minus predicted voltage of one cell-file object [V]; infinite if its SOC left 0..1.
+        rms_v: RMS of measured minus predicted voltage of one cell-file object [V]; infinite if the SOC left 0..1.
         samples: Number of samples above SOC 0.1.
     """
 
@@ -65,16 +66,16 @@ class ReidentificationResult:
 
     Attributes:
         pack: Name of the pack.
-        reason: Why it has no new cell; empty where it has one.
-        method: ``learned`` or ``fitted``: how the best new cell was found; empty without any.
-        cell_file: The text of the new cell's file; empty without one that is better.
-        hours: Duration from the first to the last sample.
-        capacity_ah, capacity_std_ah: Capacity of the best new cell, one object of its file; NaN without any.
+        reason: Why there is no new cell; empty if there is one.
+        method: Method of the best new cell, ``learned`` or ``fitted``; empty without one.
+        cell_file: Text of the new cell file; empty if no new cell is better than the old one.
+        hours: Duration from the first to the last sample [h].
+        capacity_ah, capacity_std_ah: Capacity of the best new cell, for one cell-file object; NaN without one.
         capacity_before_ah: Capacity of the old cell.
-        r_s_ohm, r_s_before_ohm: Series resistance at SOC 0.5 and 25 C of the same.
-        rms_before_v, rms_v: Judged: of the cell that it had, and of the best new one.
-        judged: Samples that judged.
-        remark: Why the fit is not among the ways, where it is not.
+        r_s_ohm, r_s_before_ohm: Series resistance at SOC 0.5 and 25 C of the new and the old cell.
+        rms_before_v, rms_v: RMS error on the holdout of the old and the best new cell.
+        judged: Number of holdout samples that were compared.
+        remark: Why the method ``fitted`` failed; empty if it did not.
     """
 
     pack: str
@@ -94,7 +95,7 @@ class ReidentificationResult:
 
 
 class _NotEnoughError(ValueError):
-    """Why the samples do not suffice."""
+    """Insufficient samples; the message gives the reason."""
 
 
 def cell_name(pack: str) -> str:
@@ -103,57 +104,61 @@ def cell_name(pack: str) -> str:
 
 
 def reidentify(pack: str, samples: SampleBlock, kind: PackSpec, cell_file: str | None) -> ReidentificationResult:
-    """Identify one pack.
+    """Re-identify one pack.
 
     Args:
         pack: Name of the pack.
-        samples: Dtype ``SAMPLE``, as the pack has sent them.
-        kind: Row of the pack's kind.
-        cell_file: The text of the cell file that it names, if it does.
+        samples: Samples of the pack, dtype ``SAMPLE``.
+        kind: Row of the pack in the table of packs.
+        cell_file: Text of the cell file that the row names; None for a shipped cell.
     """
     seconds = float(np.ptp(samples["time_s"])) if samples.size else 0.0
     outcome = ReidentificationResult(pack, hours=seconds / 3600.0)
     try:
         cell = _battery(kind, cell_file)
         outcome = replace(outcome, capacity_before_ah=cell.cell.capacity_ah, r_s_before_ohm=_r_s(cell))
-        return _Pack(outcome, _of_one(samples, kind), kind, cell).found()
+        return _Pack(outcome, _single_cell_samples(samples, kind), kind, cell).reidentify()
     except (_NotEnoughError, UserError) as error:
         return replace(outcome, reason=_in_a_line(error))
 
 
 class _Pack:
-    """One pack's samples, as those of one object of its cell file."""
+    """Samples of one pack, converted to one cell-file object."""
 
     def __init__(self, outcome: ReidentificationResult, samples: SampleBlock, kind: PackSpec, cell: CellModel) -> None:
         self._outcome, self._kind, self._cell = outcome, kind, cell
         seconds = 3600.0 * outcome.hours
-        if seconds < MIN_S:
-            raise _NotEnoughError(f"{seconds / 3600.0:.1f} h of samples: at least {MIN_S / 3600.0:g} h are needed")
+        if seconds < MIN_DURATION_S:
+            raise _NotEnoughError(
+                f"{seconds / 3600.0:.1f} h of samples: at least {MIN_DURATION_S / 3600.0:g} h are needed"
+            )
         pieces = [piece for piece in _pieces(samples) if np.ptp(piece["time_s"]) >= MIN_PIECE_S]
         moved = sum(map(_moved_ah, pieces)) / cell.cell.capacity_ah
         if moved < MIN_MOVED:
             raise _NotEnoughError(
-                f"{moved:.2f} capacities were moved in {seconds / 3600.0:.1f} h: at least {MIN_MOVED:g} is needed"
+                f"{moved:.2f} capacities were charged and discharged in {seconds / 3600.0:.1f} h: at least {MIN_MOVED:g} is needed"
             )
-        split_s = samples["time_s"][0] + TRAINING * seconds
+        split_s = samples["time_s"][0] + TRAINING_FRACTION * seconds
         self._training = list(_clipped(pieces, -math.inf, split_s))
-        self._judges = list(_clipped(pieces, split_s, math.inf))
-        if not self._training or not self._judges:
-            raise _NotEnoughError(f"no {MIN_PIECE_S / 60.0:g} min without a gap: the edge's link or its board is away")
+        self._holdout = list(_clipped(pieces, split_s, math.inf))
+        if not self._training or not self._holdout:
+            raise _NotEnoughError(
+                f"no {MIN_PIECE_S / 60.0:g} min without a gap: check the edge's connection and its board"
+            )
 
-    def found(self) -> ReidentificationResult:
-        """Return the better method's result if it beats the old cell; else None."""
+    def reidentify(self) -> ReidentificationResult:
+        """Return the result of the better method, with a cell file if it beats the old cell."""
         learned, soc, std = self._learn()
-        ways = {"learned": learned}
+        cells = {"learned": learned}
         remark = ""
         try:
-            ways["fitted"] = self._fit(learned, soc, std)
+            cells["fitted"] = self._fit(learned, soc, std)
         except (UserError, _NotEnoughError) as error:
             remark = _in_a_line(error)
-        before = self._judge(self._cell)
-        judged = {way: self._judge(cell) for way, cell in ways.items()}
-        best = min(judged, key=lambda way: judged[way].rms_v)
-        cell, rms_v = ways[best], judged[best].rms_v
+        before = self._holdout_error(self._cell)
+        judged = {method: self._holdout_error(cell) for method, cell in cells.items()}
+        best = min(judged, key=lambda method: judged[method].rms_v)
+        cell, rms_v = cells[best], judged[best].rms_v
         outcome = replace(
             self._outcome,
             method=best,
@@ -166,53 +171,53 @@ class _Pack:
             remark=remark,
         )
         if not judged[best].samples:
-            return replace(outcome, reason="none of the samples that judge is above SOC 0.1")
+            return replace(outcome, reason="no holdout sample is above SOC 0.1")
         if not rms_v < (1.0 - MIN_GAIN) * before.rms_v:
-            return replace(outcome, reason="not better than the cell that it has")
-        return replace(outcome, cell_file=self._written(cell, best, before.rms_v, rms_v))
+            return replace(outcome, reason="not better than the present cell")
+        return replace(outcome, cell_file=self._cell_file(cell, best, before.rms_v, rms_v))
 
     def _learn(self) -> tuple[CellModel, Floats, Floats]:
-        """Return the cell that the filter has learned at the end of the training, and SOC with its std at the training samples."""
+        """Return the cell that the filter has learned from the training samples, and their SOC with its standard deviation."""
         estimator = self._estimator(self._cell)
-        soc, std = _estimated(estimator, np.concatenate(self._training))
+        soc, std = _estimate(estimator, np.concatenate(self._training))
         if not estimator.state[0]["started"]:
-            raise _NotEnoughError("no sample is one that this cell can have: are series, parallel and cell right?")
+            raise _NotEnoughError("no sample is plausible for this cell: check series, parallel and cell")
         return identified_cell(estimator, self._cell, 1), soc, std
 
     def _fit(self, cell: CellModel, soc: Floats, std: Floats) -> CellModel:
-        """Resistances and OCV fitted to the longest piece of the training, SOC counted from where it is known best."""
+        """Fit resistances and OCV to the longest training piece. SOC is counted from the sample with the smallest uncertainty."""
         moved = list(map(_moved_ah, self._training))
         longest = int(np.argmax(moved))
         piece = self._training[longest]
         first = sum(part.size for part in self._training[:longest])
-        where = first + int(np.argmin(std[first : first + piece.size]))
-        if not std[where] <= UNSURE_SOC:
+        start_sample = first + int(np.argmin(std[first : first + piece.size]))
+        if not std[start_sample] <= MAX_SOC_STD:
             raise _NotEnoughError(
-                f"its SOC is known to {100.0 * std[where]:.0f} % at best: rests, or a charge to the top, are missing"
+                f"its SOC is known to {100.0 * std[start_sample]:.0f} % at best: rests, or a charge to the top, are missing"
             )
-        drawn_ah = _drawn_ah(piece)[where - first]
-        start = float(np.clip(soc[where] + drawn_ah / cell.cell.capacity_ah, 0.0, 1.0))
+        drawn_ah = _drawn_ah(piece)[start_sample - first]
+        start = float(np.clip(soc[start_sample] + drawn_ah / cell.cell.capacity_ah, 0.0, 1.0))
         return identify([Columns(piece, self._outcome.pack)], cell, initial_soc=start).cell
 
-    def _judge(self, cell: CellModel) -> HoldoutError:
-        """Open loop over each window of the judges, its SOC at first as an estimator with that cell has it by then."""
+    def _holdout_error(self, cell: CellModel) -> HoldoutError:
+        """Return the open-loop error of a cell on the holdout. Each window starts at the SOC of an estimator with this cell."""
         estimator = self._estimator(cell)
-        _estimated(estimator, np.concatenate(self._training))
+        _estimate(estimator, np.concatenate(self._training))
         squares, count = 0.0, 0
-        for window in _windows(self._judges):
+        for window in _windows(self._holdout):
             start = float(estimator.state["soc"][0])
             try:
                 errors = validate(Columns(window, self._outcome.pack), cell, initial_soc=start).above
-            except UserError:  # its SOC leaves 0..1, or most samples cannot be its own
+            except UserError:  # the SOC leaves 0..1, or most samples are implausible for this cell
                 return HoldoutError(math.inf, count)
             if errors.samples:
                 squares, count = squares + errors.samples * errors.voltage_rms_v**2, count + errors.samples
-            _estimated(estimator, window)
+            _estimate(estimator, window)
         return HoldoutError(math.sqrt(squares / count) if count else math.inf, count)
 
     def _estimator(self, cell: CellModel) -> Estimator:
         settings = settings_of(self._kind)
-        sensor, told = settings.sensor, settings.sampling
+        sensor, sampling = settings.sensor, settings.sampling
         series, parallel = self._kind.series, self._kind.parallel
         return Estimator(
             cell,
@@ -221,15 +226,20 @@ class _Pack:
             voltage_resolution_v=sensor.voltage_resolution_v / series,
             voltage_noise_v=None if sensor.voltage_noise_v is None else sensor.voltage_noise_v / series,
             initial_soc=settings.pack.initial_soc,
-            sampling=Sampling(told.period_s, told.current_resolution_a / parallel, told.current_dead_band_a / parallel),
+            sampling=Sampling(
+                sampling.period_s, sampling.current_resolution_a / parallel, sampling.current_dead_band_a / parallel
+            ),
         )
 
-    def _written(self, cell: CellModel, way: str, before_v: float, after_v: float) -> str:
+    def _cell_file(self, cell: CellModel, method: str, before_v: float, after_v: float) -> str:
         name = cell_name(self._outcome.pack)
-        described = {"learned": "as an estimator's filter has learned it", "fitted": "as fitted to its longest piece"}
+        origins = {
+            "learned": "as learned by the estimator's filter",
+            "fitted": "fitted to its longest piece without a gap",
+        }
         remarks = [
-            f"{self._kind.cell} of the pack {self._outcome.pack}, {described[way]}, from {self._outcome.hours:.1f} h.",
-            f"RMS error of the voltage where it had no part: {1e3 * before_v:.1f} mV before, {1e3 * after_v:.1f} mV after.",
+            f"{self._kind.cell} of the pack {self._outcome.pack}, {origins[method]}, from {self._outcome.hours:.1f} h.",
+            f"RMS error of the voltage on later samples: {1e3 * before_v:.1f} mV before, {1e3 * after_v:.1f} mV after.",
         ]
         return cell_text(cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name})}), remarks)
 
@@ -237,12 +247,12 @@ class _Pack:
 def _battery(kind: PackSpec, cell_file: str | None) -> CellModel:
     cell = cell_of(kind, cell_file)
     if not isinstance(cell, CellModel):
-        raise _NotEnoughError(f"{kind.cell} is a fuel cell: `identify` finds it from polarisation curves")
+        raise _NotEnoughError(f"{kind.cell} is a fuel cell: its cell file is identified from polarisation curves")
     return cell
 
 
-def _of_one(samples: SampleBlock, kind: PackSpec) -> SampleBlock:
-    """Return voltage and current of one cell-file object; only samples with increasing time."""
+def _single_cell_samples(samples: SampleBlock, kind: PackSpec) -> SampleBlock:
+    """Return the samples with increasing time, converted to one cell-file object."""
     latest_s = np.maximum.accumulate(np.r_[-math.inf, samples["time_s"][:-1]])
     one = samples[samples["time_s"] > latest_s]
     one["voltage_v"] /= kind.series
@@ -251,12 +261,12 @@ def _of_one(samples: SampleBlock, kind: PackSpec) -> SampleBlock:
 
 
 def _pieces(samples: SampleBlock) -> list[SampleBlock]:
-    """Cut at gaps."""
+    """Split samples at gaps."""
     return np.split(samples, np.flatnonzero(np.diff(samples["time_s"]) > GAP_S) + 1)
 
 
 def _clipped(pieces: list[SampleBlock], since_s: float, until_s: float) -> Iterator[SampleBlock]:
-    """Return the pieces within ``since_s`` and ``until_s`` that are long enough."""
+    """Yield the parts of the pieces between ``since_s`` and ``until_s`` that are long enough."""
     for piece in pieces:
         part = piece[(piece["time_s"] >= since_s) & (piece["time_s"] < until_s)]
         if part.size and np.ptp(part["time_s"]) >= MIN_PIECE_S:
@@ -264,13 +274,13 @@ def _clipped(pieces: list[SampleBlock], since_s: float, until_s: float) -> Itera
 
 
 def _windows(pieces: list[SampleBlock]) -> Iterator[SampleBlock]:
-    """Pieces cut so that none is longer than ``WINDOW_S``, equally long."""
+    """Split each piece into windows of equal size, none longer than ``WINDOW_S``."""
     for piece in pieces:
         yield from np.array_split(piece, math.ceil(np.ptp(piece["time_s"]) / WINDOW_S))
 
 
-def _estimated(estimator: Estimator, samples: SampleBlock) -> tuple[Floats, Floats]:
-    """SOC and its standard deviation at each sample; NaN and infinite before the first one that was accepted."""
+def _estimate(estimator: Estimator, samples: SampleBlock) -> tuple[Floats, Floats]:
+    """Return SOC and its standard deviation at each sample; NaN and infinite before the first accepted one."""
     soc, std = np.empty(samples.size), np.empty(samples.size)
     for first in range(0, samples.size, ROWS):
         block = samples[first : first + ROWS]
@@ -283,13 +293,13 @@ def _estimated(estimator: Estimator, samples: SampleBlock) -> tuple[Floats, Floa
 
 
 def _drawn_ah(piece: SampleBlock) -> Floats:
-    """Charge drawn since its first sample [Ah]."""
+    """Return the charge drawn since the first sample [Ah]."""
     drawn_as: Floats = np.r_[0.0, np.cumsum(piece["current_a"][:-1] * np.diff(piece["time_s"]))]
     return drawn_as / 3600.0
 
 
 def _moved_ah(piece: SampleBlock) -> float:
-    """Charge moved either way [Ah]."""
+    """Return the charge moved out and in [Ah]."""
     return float(np.abs(np.diff(_drawn_ah(piece))).sum())
 
 

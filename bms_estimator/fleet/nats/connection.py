@@ -1,4 +1,4 @@
-"""Connection of a fleet service to the server: reconnects without limit and reports each trouble once."""
+"""Connection of a fleet service to the server. It reconnects without limit and does not repeat log lines."""
 
 import asyncio
 import contextlib
@@ -18,61 +18,61 @@ from nats.aio.transport import TcpTransport
 
 from bms_estimator.model.errors import UserError
 
-_REASONS: dict[type[BaseException], str] = {
-    nats.js.errors.NotFoundError: "the server lacks one of the streams: make them with `bms-estimator fleet serve`",
+_TEXT_BY_CLASS: dict[type[BaseException], str] = {
+    nats.js.errors.NotFoundError: "a stream is missing on the server: create it with `bms-estimator fleet serve`",
     nats.js.errors.NoStreamResponseError: "no node leads the stream now, or the server keeps no streams for this account",
     nats.errors.NoRespondersError: "no node leads the stream now, or the server keeps no streams for this account",
     nats.js.errors.ServiceUnavailableError: "the server's streams are not available now",
-    nats.js.errors.APIError: "the server refuses",
-    nats.errors.AuthorizationError: "the server refuses these credentials: look at --creds",
-    TimeoutError: "no answer in time: are most nodes up, and is it the port for workers (4222)?",  # that of NATS is one, too
-    ConnectionRefusedError: "nobody listens there",
+    nats.js.errors.APIError: "the server rejects the request",
+    nats.errors.AuthorizationError: "the server rejects these credentials: check --creds",
+    TimeoutError: "no answer in time: are most nodes up, and is it the port for workers (4222)?",  # nats.errors.TimeoutError is a subclass
+    ConnectionRefusedError: "connection refused: no server listens on this address",
 }
-"""The first that an error is one of."""
+"""Texts by exception class; the first matching class applies."""
 
-_WORDS = {
-    "authorization violation": "the server refuses these credentials, or asks for some: look at --creds",
-    "permissions violation": "these credentials may not do that: look at --creds",
-    "certificate_verify_failed": "its certificate is of nobody whom we trust, or names another server: look at --ca",
+_TEXT_BY_PART = {
+    "authorization violation": "the server requires credentials, or rejects these: check --creds",
+    "permissions violation": "these credentials do not permit this: check --creds",
+    "certificate_verify_failed": "the server's certificate is not trusted, or is for another name: check --ca",
 }
-"""Errors that the library reports as text only."""
+"""Texts by part of the error text, for errors that the library reports as text only."""
 
-LET_IN_S = 10
-"""Timeout of each step of an authentication [s], on a slow line or while many reconnect at once. The server's default
-is 2."""
+AUTH_TIMEOUT_S = 10
+"""Timeout of each authentication step [s], long enough for a slow line or many simultaneous reconnects. The server's default is
+2."""
 
 RETRY_S = 1
 """Delay between two connection attempts [s]."""
 PING_S = 10
 """Ping interval [s]; a connection without two responses is reconnected."""
-FLUSH_S = 5.0
-"""Timeout of a flush to a server that reads nothing [s]."""
-CLOSING_S = 3.0
+FLUSH_TIMEOUT_S = 5.0
+"""Timeout of a flush [s], which a server that does not read would block."""
+CLOSE_TIMEOUT_S = 3.0
 """Timeout of closing a connection [s]."""
-SAID_S = 30.0
-"""Minimum interval between two log lines about an equal error [s]."""
+REPEATED_LOG_S = 30.0
+"""Minimum interval between two log lines with equal error texts [s]."""
 
 log = structlog.get_logger(__name__)
-# The library's end of a TLS connection, which is not usable.
+# nats-py causes this asyncio warning whenever a TLS connection ends; a user cannot act on it.
 logging.getLogger("asyncio").addFilter(lambda record: "eof_received() has no effect" not in str(record.msg))
 
 
 class _Transport(TcpTransport):
-    """Closes within a time limit, because closing may never complete.
+    """Transport whose closing has a timeout.
 
-    This happens after a failed TLS handshake, and with bytes that a silent server does not read.
+    Closing may never complete after a failed TLS handshake, and while a server does not read the bytes sent.
     """
 
     async def wait_closed(self) -> None:
         try:
-            async with asyncio.timeout(CLOSING_S):
+            async with asyncio.timeout(CLOSE_TIMEOUT_S):
                 await super().wait_closed()  # type: ignore[no-untyped-call]
         except TimeoutError:
             if self._io_writer is not None:
                 self._io_writer.transport.abort()
 
 
-nats.aio.client.TcpTransport = _Transport  # type: ignore[attr-defined] # the library has no option for it
+nats.aio.client.TcpTransport = _Transport  # type: ignore[attr-defined] # nats-py has no option for the transport
 
 
 async def connect(
@@ -81,81 +81,85 @@ async def connect(
     *,
     creds: Path | None = None,
     ca: Path | None = None,
-    linked: Callable[[str | None], None] = lambda _: None,
+    on_link_change: Callable[[str | None], None] = lambda _: None,
 ) -> Client:
-    """Connect, however long that takes; later on, connect again whenever the connection breaks.
+    """Connect, retrying without limit; reconnect whenever the connection breaks.
 
     Args:
-        servers: ``nats://`` or ``tls://`` and host:port; several with commas between.
+        servers: Address ``nats://host:port`` or ``tls://host:port``, or several separated by commas.
         name: Name of this connection, in the server's lists.
-        creds: File of the tenant's credentials, as ``fleet serve`` made it; None: none are required.
-        ca: Certificate of the authority that has signed the server's; None: those of the system.
-        linked: Called with why there is no connection, and with None when there is one again.
+        creds: Credentials file of the tenant, made by ``fleet serve``; None: without credentials.
+        ca: Certificate of the authority that signed the server's certificate; None: the system's authorities.
+        on_link_change: Called with the reason when the connection is lost or fails, and with None when it is restored.
 
     Raises:
         UserError: ``creds`` or ``ca`` cannot be read, or an address is not valid.
     """
     nc = Client()
-    said = _Said(nc, servers, linked)
+    events = _ConnectionEvents(nc, servers, on_link_change)
     try:
         await nc.connect(
-            servers=addresses(servers),
+            servers=parse_addresses(servers),
             name=name,
-            user_credentials=str(readable(creds)) if creds else None,
-            tls=context(ca) if ca else None,
+            user_credentials=str(check_credentials_file(creds)) if creds else None,
+            tls=tls_context(ca) if ca else None,
             max_reconnect_attempts=-1,
             reconnect_time_wait=RETRY_S,
             ping_interval=PING_S,
-            connect_timeout=LET_IN_S,
-            flush_timeout=FLUSH_S,
-            error_cb=said.trouble,
-            disconnected_cb=said.gone,
-            reconnected_cb=said.back,
+            connect_timeout=AUTH_TIMEOUT_S,
+            flush_timeout=FLUSH_TIMEOUT_S,
+            error_cb=events.on_error,
+            disconnected_cb=events.on_disconnect,
+            reconnected_cb=events.on_reconnect,
         )
     except ValueError as error:
         raise UserError(f"--server {servers}: {error}") from error
     return nc
 
 
-async def part(nc: Client) -> None:
+async def close(nc: Client) -> None:
     """Close a connection in any state."""
     with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
-        async with asyncio.timeout(2.0 * CLOSING_S):
+        async with asyncio.timeout(2.0 * CLOSE_TIMEOUT_S):
             await nc.close()
 
 
-def addresses(servers: str) -> list[str]:
-    """One or several with commas between.
+def parse_addresses(servers: str) -> list[str]:
+    """Return the server addresses of a comma-separated list.
 
     Raises:
-        UserError: One is of another protocol.
+        UserError: An address is invalid or of another protocol.
     """
     found = [each.strip() for each in servers.split(",")]
     if not all(re.fullmatch(r"((nats|tls)://)?[^/\s]+", each) for each in found):
-        raise UserError(f"--server {servers}: must be nats://host:port or tls://host:port; several with commas")
+        raise UserError(
+            f"--server {servers}: must be nats://host:port or tls://host:port, or several separated by commas"
+        )
     return found
 
 
-def readable(creds: Path) -> Path:
-    """Return the path of a credentials file after checking its content.
+def check_credentials_file(creds: Path) -> Path:
+    """Check the content of a credentials file and return its path.
 
     Raises:
-        UserError: It cannot be read, or holds none.
+        UserError: The file cannot be read or is not a credentials file.
     """
     try:
         data = creds.read_bytes()
     except OSError as error:
         raise UserError(f"--creds {creds}: cannot be read: {error.strerror}") from None
     if b"BEGIN NATS USER JWT" not in data or b"BEGIN USER NKEY SEED" not in data:
-        raise UserError(f"--creds {creds}: no credentials: `fleet serve` makes some, such as keys/TENANT/worker.creds")
+        raise UserError(
+            f"--creds {creds}: not a credentials file; `fleet serve` creates them, such as keys/TENANT/worker.creds"
+        )
     return creds
 
 
-def context(ca: Path) -> ssl.SSLContext:
-    """Trust in the authority of a certificate.
+def tls_context(ca: Path) -> ssl.SSLContext:
+    """Return a TLS context that trusts one certificate authority.
 
     Raises:
-        UserError: It cannot be read.
+        UserError: The file cannot be read.
     """
     try:
         return ssl.create_default_context(cafile=ca)
@@ -163,40 +167,40 @@ def context(ca: Path) -> ssl.SSLContext:
         raise UserError(f"--ca {ca}: {error.strerror or error}") from error
 
 
-class _Said:
-    """Logs what becomes of a connection."""
+class _ConnectionEvents:
+    """Callbacks of a connection: log its errors and changes, and report them."""
 
-    def __init__(self, nc: Client, servers: str, linked: Callable[[str | None], None]) -> None:
-        self._nc, self._servers, self._linked = nc, servers, linked
+    def __init__(self, nc: Client, servers: str, on_link_change: Callable[[str | None], None]) -> None:
+        self._nc, self._servers, self._on_link_change = nc, servers, on_link_change
         self._last: tuple[str, float] = ("", 0.0)
 
-    async def trouble(self, error: Exception) -> None:
+    async def on_error(self, error: Exception) -> None:
         text, now_s = error_text(error), time.monotonic()
         if not self._nc.is_connected:
-            self._linked(text)
-        if (text, True) != (self._last[0], now_s < self._last[1] + SAID_S):
+            self._on_link_change(text)
+        if (text, True) != (self._last[0], now_s < self._last[1] + REPEATED_LOG_S):
             self._last = text, now_s
-            log.warning("trouble with the server", server=self._servers, reason=text)
+            log.warning("error of the connection to the server", server=self._servers, reason=text)
 
-    async def gone(self) -> None:
-        if self._nc.is_closed:  # by us
+    async def on_disconnect(self) -> None:
+        if self._nc.is_closed:  # by this process
             return
-        self._linked("the server is lost")
-        log.warning("the connection to the server is gone; trying again", server=self._servers)
+        self._on_link_change("the connection is lost")
+        log.warning("the connection to the server is lost; reconnecting", server=self._servers)
 
-    async def back(self) -> None:
+    async def on_reconnect(self) -> None:
         self._last = ("", 0.0)
-        self._linked(None)
-        log.info("the server is back", server=self._servers)
+        self._on_link_change(None)
+        log.info("reconnected to the server", server=self._servers)
 
 
 def error_text(error: BaseException) -> str:
-    """Return an error of NATS, or of the connection to it, as text."""
-    said = str(getattr(error, "description", None) or error).removeprefix("nats: ") or type(error).__name__
-    for kind, text in _REASONS.items():
+    """Return an error of NATS or of the connection as text, with a remedy if one is known."""
+    text = str(getattr(error, "description", None) or error).removeprefix("nats: ") or type(error).__name__
+    for kind, reason in _TEXT_BY_CLASS.items():
         if isinstance(error, kind):
-            return f"{text} ({said})" if isinstance(error, nats.js.errors.APIError) else text
-    for words, text in _WORDS.items():
-        if words in said.lower():
-            return f"{text} ({said})"
-    return said
+            return f"{reason} ({text})" if isinstance(error, nats.js.errors.APIError) else reason
+    for part_of_text, reason in _TEXT_BY_PART.items():
+        if part_of_text in text.lower():
+            return f"{reason} ({text})"
+    return text

@@ -5,30 +5,29 @@ from collections.abc import AsyncGenerator
 
 from nats.aio.client import Client
 
-from bms_estimator.fleet.nats.stream_reader import ANSWER_S, Stored, StreamError, read_stream
+from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, Stored, StreamError, read_stream
 
-BEHIND_S = 0.1
+POLL_S = 0.1
 """Poll interval while a node lacks data that another one has [s]."""
 
 
 async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -> AsyncGenerator[Stored, None]:
-    """All messages from one sequence to another, in their order.
+    """Yield all messages between two sequence numbers, in order.
 
-    The node that responds may lag behind the stream's leader, so they end with the message ``last``, not where that
-    node has no more.
+    The node that responds may lag behind the stream's leader. Therefore it is polled until it has the message ``last``.
 
     Args:
-        nc: Connected.
+        nc: Connection of the tenant.
         stream: Name of the stream; it must allow direct gets.
         subject: May have wildcards.
-        first: Sequence in the stream.
-        last: Sequence of the last message of the subject.
+        first: First stream sequence number.
+        last: Stream sequence number of the subject's last message.
 
     Raises:
-        StreamError: The server does not answer, or refuses.
-        nats.errors.Error: As above.
+        StreamError: The server does not respond or rejects the request.
+        nats.errors.Error: An error of the connection.
     """
-    for _ in range(round(ANSWER_S / BEHIND_S)):
+    for _ in range(round(RESPONSE_TIMEOUT_S / POLL_S)):
         async for batch in read_stream(nc, stream, subject, first=first):
             for message in batch:
                 if message.sequence <= last:
@@ -37,6 +36,6 @@ async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -
             if first > last:
                 return
         if (await nc.jetstream().stream_info(stream)).state.first_seq > last:
-            return  # it has grown too old meanwhile
-        await asyncio.sleep(BEHIND_S)
-    raise StreamError(f"the server has lost message {last} of {stream}, or the node that answers is far behind")
+            return  # the stream has meanwhile dropped the messages
+        await asyncio.sleep(POLL_S)
+    raise StreamError(f"the server has lost message {last} of {stream}, or the responding node lags far behind")

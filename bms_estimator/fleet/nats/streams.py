@@ -1,8 +1,8 @@
-"""Streams, buckets and consumers of one tenant, made once; a repeated call changes nothing.
+"""Streams, buckets and consumers of one tenant.
 
-``RAW`` keeps what edges have sent, in partitions; each is read through a durable consumer of its own, which the server
-pins to one worker at a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object
-buckets are streams of the shape that all clients give them (ADR-8, ADR-20).
+``RAW`` stores the blocks of edges in partitions. Each partition has a durable consumer, which the server pins to one worker at
+a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object buckets are streams with the
+configuration that all clients give them (ADR-8, ADR-20).
 """
 
 import asyncio
@@ -22,34 +22,34 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 RAW_BYTES, RAW_AGE_S = 8 << 30, 7 * 86_400.0
-"""Maximum size and age of the stream ``RAW``."""
-HOURS_PART, HOURS_AGE_S = 1 / 16, 30 * 86_400.0
-"""Maximum size of ``HOURS`` as a fraction of that of ``RAW``, and time that summaries wait for their collector [s]."""
+"""Default limits of the stream ``RAW``: size [bytes] and age [s]."""
+HOURS_FRACTION, HOURS_AGE_S = 1 / 16, 30 * 86_400.0
+"""Limits of the stream ``HOURS``: size as a fraction of that of ``RAW``, and age [s]."""
 MAX_BLOCK_BYTES = 256 << 10
-"""Maximum size of a block in ``RAW`` [bytes]: 7,000 samples that do not compress fit."""
+"""Maximum size of a block in ``RAW`` [bytes]: 7,000 incompressible samples."""
 PACK_FRACTION = 1 / 3
-"""Fraction of ``RAW`` that one pack can fill with blocks of the maximum size: by default seven days of minute blocks. Beyond it, the
-pack's oldest block is removed."""
+"""Fraction of ``RAW`` that one pack can fill with blocks of the maximum size; then its oldest block is removed. By default this is
+seven days of minute blocks."""
 MIN_PACK_BLOCKS = 60
-"""Blocks of a pack that even a small ``RAW`` keeps: an hour of minute blocks."""
+"""Minimum number of stored blocks of a pack, even in a small ``RAW``: an hour of minute blocks."""
 DUPLICATES_S = 3600.0
-"""A repeated summary with its number within this time is dropped."""
+"""Time within which the server drops a summary with a repeated message id [s]."""
 GROUP = "w"
-"""Priority group of a consumer for workers."""
+"""Priority group of the consumers."""
 PIN_S = 2.0
 """Time without a request after which a worker loses a partition [s]."""
 PARTITIONS_KEY = "bms.partitions"
-"""Key in the metadata of ``RAW``."""
-ANSWER_S, ATTEMPTS = 5.0, 12
-"""Timeout of a request [s] and number of attempts: a cluster drops requests while it elects a leader."""
+"""Metadata key of ``RAW`` with the number of partitions."""
+RESPONSE_TIMEOUT_S, MAX_ATTEMPTS = 5.0, 12
+"""Timeout of a request [s], and number of attempts: a cluster drops requests while it elects a leader."""
 NO_SUCH_STREAM = 10059
-"""The server's number for it."""
-AT_ONCE = 16
+"""Error code of the server for a missing stream."""
+CONSUMER_BATCH = 16
 """Number of consumers created at a time."""
 
 
 class NoAnswerError(UserError):
-    """The server does not respond; it may later."""
+    """The server does not respond; a later attempt may succeed."""
 
 
 async def make_streams(
@@ -60,59 +60,61 @@ async def make_streams(
     raw_bytes: int = RAW_BYTES,
     raw_age_s: float = RAW_AGE_S,
 ) -> None:
-    """Create missing streams, and set limits and replicas as configured.
+    """Create missing streams and consumers, and set limits and replicas as configured. May be repeated.
 
     Args:
-        nc: Connected as the tenant.
+        nc: Connection of the tenant.
         partitions: Number of partitions of ``RAW``, which cannot change.
-        replicas: 1, or 3 in a cluster of three.
-        raw_bytes: ``RAW`` keeps no more; beyond it the oldest is dropped.
-        raw_age_s: Nor anything older.
+        replicas: Number of replicas: 1, or 3 in a cluster of three.
+        raw_bytes: Maximum size of ``RAW`` [bytes]; beyond it the oldest messages are dropped.
+        raw_age_s: Maximum age of messages in ``RAW`` [s].
 
     Raises:
-        UserError: The streams have another number of partitions, or the server has no room for them.
-        NoAnswerError: None answers.
+        UserError: The streams have another number of partitions, or the server has too little disk space.
+        NoAnswerError: The server does not respond.
     """
     found = await partitions_of(nc)
     if found not in (None, partitions):
         raise UserError(
-            f"the stream {subjects.RAW_STREAM} has {found} partitions, and {partitions} are asked for: "
-            "their number stays as it was made"
+            f"the stream {subjects.RAW_STREAM} has {found} partitions, but {partitions} are configured: "
+            "the number of a stream cannot change"
         )
     for stream in (_raw(partitions, raw_bytes, raw_age_s), _hours(raw_bytes), *_buckets()):
-        await _repeated(_ensure_stream, nc, stream | {"num_replicas": replicas})
+        await _retry(_ensure_stream, nc, stream | {"num_replicas": replicas})
     numbers = range(partitions)
-    for first in range(0, partitions, AT_ONCE):
-        await asyncio.gather(*(_repeated(_ensure_consumer, nc, n, replicas) for n in numbers[first : first + AT_ONCE]))
+    for first in range(0, partitions, CONSUMER_BATCH):
+        await asyncio.gather(
+            *(_retry(_ensure_consumer, nc, n, replicas) for n in numbers[first : first + CONSUMER_BATCH])
+        )
 
 
 async def partitions_of(nc: Client) -> int | None:
     """Return the number of partitions of the stream ``RAW``; None if it does not exist."""
-    answer = await _repeated(_ask, nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
-    if "error" in answer:
-        if answer["error"].get("err_code") == NO_SUCH_STREAM:
+    response = await _retry(_request, nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
+    if "error" in response:
+        if response["error"].get("err_code") == NO_SUCH_STREAM:
             return None
-        raise _refused(subjects.RAW_STREAM, answer)
-    return int(answer["config"].get("metadata", {}).get(PARTITIONS_KEY, subjects.PARTITIONS))
+        raise _rejection(subjects.RAW_STREAM, response)
+    return int(response["config"].get("metadata", {}).get(PARTITIONS_KEY, subjects.PARTITIONS))
 
 
 def consumer(partition: int) -> str:
-    """Name of the durable consumer of a partition."""
+    """Return the name of a partition's durable consumer."""
     return f"p{partition}"
 
 
 def pack_blocks(raw_bytes: int) -> int:
-    """Return the number of blocks of one pack that ``RAW`` keeps."""
+    """Return the maximum number of blocks of one pack in ``RAW``."""
     return max(round(PACK_FRACTION * raw_bytes / MAX_BLOCK_BYTES), MIN_PACK_BLOCKS)
 
 
-def _raw(partitions: int, most_bytes: int, age_s: float) -> dict[str, Any]:
+def _raw(partitions: int, max_bytes: int, age_s: float) -> dict[str, Any]:
     source, destination = subjects.mapping(partitions)
     limits = {
-        "max_bytes": most_bytes,
+        "max_bytes": max_bytes,
         "max_age": _ns(age_s),
         "max_msg_size": MAX_BLOCK_BYTES,
-        "max_msgs_per_subject": pack_blocks(most_bytes),
+        "max_msgs_per_subject": pack_blocks(max_bytes),
         "discard": "old",
         "allow_direct": True,
     }
@@ -127,7 +129,7 @@ def _raw(partitions: int, most_bytes: int, age_s: float) -> dict[str, Any]:
 
 def _hours(raw_bytes: int) -> dict[str, Any]:
     limits = {
-        "max_bytes": round(HOURS_PART * raw_bytes),
+        "max_bytes": round(HOURS_FRACTION * raw_bytes),
         "max_age": _ns(HOURS_AGE_S),
         "discard": "old",
         "allow_direct": True,
@@ -147,16 +149,16 @@ def _buckets() -> list[dict[str, Any]]:
     ]
 
 
-def _stream(name: str, *names: str, **more: Any) -> dict[str, Any]:
-    return {"name": name, "subjects": list(names), "storage": "file", "retention": "limits", **more}
+def _stream(name: str, *subject_names: str, **options: Any) -> dict[str, Any]:
+    return {"name": name, "subjects": list(subject_names), "storage": "file", "retention": "limits", **options}
 
 
 async def _ensure_stream(nc: Client, stream: dict[str, Any]) -> None:
-    answer = await _ask(nc, f"STREAM.UPDATE.{stream['name']}", stream)
-    if answer.get("error", {}).get("err_code") == NO_SUCH_STREAM:
-        answer = await _ask(nc, f"STREAM.CREATE.{stream['name']}", stream)
-    if "error" in answer:
-        raise _refused(stream["name"], answer)
+    response = await _request(nc, f"STREAM.UPDATE.{stream['name']}", stream)
+    if response.get("error", {}).get("err_code") == NO_SUCH_STREAM:
+        response = await _request(nc, f"STREAM.CREATE.{stream['name']}", stream)
+    if "error" in response:
+        raise _rejection(stream["name"], response)
 
 
 async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
@@ -171,41 +173,41 @@ async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
         "num_replicas": replicas,
     }
     request = {"stream_name": subjects.RAW_STREAM, "config": config}
-    answer = await _ask(nc, f"CONSUMER.DURABLE.CREATE.{subjects.RAW_STREAM}.{name}", request)
-    if "error" in answer:
-        raise _refused(f"{subjects.RAW_STREAM}, consumer {name}", answer)
+    response = await _request(nc, f"CONSUMER.DURABLE.CREATE.{subjects.RAW_STREAM}.{name}", request)
+    if "error" in response:
+        raise _rejection(f"{subjects.RAW_STREAM}, consumer {name}", response)
 
 
-async def _repeated(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Ask until there is an answer; every request here may be repeated.
+async def _retry(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Repeat a request until the server responds. Every request of this module is idempotent.
 
     Raises:
-        NoAnswerError: No response.
-        UserError: As ``ask``.
+        NoAnswerError: The server does not respond.
+        UserError: The server rejects the request.
     """
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_ATTEMPTS):
         with contextlib.suppress(NatsTimeoutError):
             return await ask(*args, **kwargs)
-    raise NoAnswerError(f"the server has answered nothing for {ATTEMPTS * ANSWER_S:g} s: are most nodes up?")
+    raise NoAnswerError(f"the server has not responded for {MAX_ATTEMPTS * RESPONSE_TIMEOUT_S:g} s: are most nodes up?")
 
 
-async def _ask(nc: Client, what: str, request: dict[str, Any]) -> dict[str, Any]:
-    """One request to the server's JetStream, because nats-py supports neither metadata nor priority groups.
+async def _request(nc: Client, operation: str, request: dict[str, Any]) -> dict[str, Any]:
+    """Send a request to the JetStream API, because nats-py supports neither metadata nor priority groups.
 
     Raises:
-        UserError: It has no JetStream, or none for this account.
-        NatsTimeoutError: It does not answer.
+        UserError: The server has no JetStream, or none for this account.
+        NatsTimeoutError: The server does not respond.
     """
     try:
-        answer = await nc.request(f"$JS.API.{what}", json.dumps(request).encode(), timeout=ANSWER_S)
+        response = await nc.request(f"$JS.API.{operation}", json.dumps(request).encode(), timeout=RESPONSE_TIMEOUT_S)
     except NoRespondersError:
-        raise UserError("the server keeps no streams for this account: was it started by `fleet serve`?") from None
-    decoded = json.loads(answer.data)
+        raise UserError("the server has no streams for this account: was it started by `fleet serve`?") from None
+    decoded = json.loads(response.data)
     return decoded if isinstance(decoded, dict) else {}
 
 
-def _refused(name: str, answer: dict[str, Any]) -> UserError:
-    return UserError(f"the server refuses the stream {name}: {answer['error'].get('description', answer['error'])}")
+def _rejection(name: str, response: dict[str, Any]) -> UserError:
+    return UserError(f"the server rejects the stream {name}: {response['error'].get('description', response['error'])}")
 
 
 def _ns(seconds: float) -> int:

@@ -1,4 +1,4 @@
-"""The table of a fleet's packs: CSV, one row for each, read with errors that name line, column and what to do."""
+"""Table of a fleet's packs: CSV with one row a pack. Errors name line, column and remedy."""
 
 import csv
 import io
@@ -15,12 +15,12 @@ from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, known_cells, m
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import DEVICE_NAME
 
-MAX_SAID = 20
-"""Maximum number of a table's errors that are shown."""
+MAX_ERRORS = 20
+"""Maximum number of errors that are reported for a table."""
 CELL_FILE = ".toml"
-"""The end of a cell that is a file beside the table."""
-_WHOLE = ("series", "parallel")
-_WORDS = ("pack", "cell", "protocol")
+"""Suffix of a cell that is a file beside the table."""
+_INTEGER_COLUMNS = ("series", "parallel")
+_TEXT_COLUMNS = ("pack", "cell", "protocol")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
@@ -30,16 +30,16 @@ class Line(NamedTuple):
     number: int
     kind: PackSpec
     data: bytes
-    """Encoded kind, as by ``stored``."""
+    """Row as ``stored`` encodes it."""
 
 
 @dataclass(frozen=True)
 class PackTable:
-    """A table that was read.
+    """Content of a table.
 
     Attributes:
         packs: Rows by pack name.
-        cell_files: Files that it names, by the names of their cells.
+        cell_files: Paths of the named cell files, by cell name.
     """
 
     packs: Mapping[str, Line]
@@ -47,30 +47,30 @@ class PackTable:
 
 
 class _RowError(ValueError):
-    """Error in one value: its column, and what to do."""
+    """Error in one value; the message names the column and a remedy."""
 
 
 def read_table(path: Path) -> PackTable:
     """Read a table of packs.
 
-    The first line names the columns, separated by ``,`` or ``;``; ``pack`` and ``cell`` must be there.
+    The first line names the columns, separated by ``,`` or ``;``. The columns ``pack`` and ``cell`` are required.
 
     Raises:
-        UserError: It cannot be read; or one line for each wrong value, ``MAX_SAID`` at most.
+        UserError: The file cannot be read; or a line for each wrong value, at most ``MAX_ERRORS``.
     """
     return _Reader(path).table()
 
 
 def check_models(path: Path, table: PackTable, cell_files: Mapping[str, str]) -> None:
-    """Check that each kind of pack has a cell.
+    """Check that each kind of pack has a valid cell model.
 
     Args:
-        path: What the table is called.
-        table: As ``read_table`` gives it.
-        cell_files: Texts by the names of their cells.
+        path: Path of the table, for error texts.
+        table: Result of ``read_table``.
+        cell_files: Texts of the cell files by cell name.
 
     Raises:
-        UserError: One line for each kind that has none, with its first line in the table.
+        UserError: A line for each kind without a valid model, with its first line in the table.
     """
     alike = dict[tuple[object, ...], list[Line]]()
     for line in table.packs.values():
@@ -81,13 +81,13 @@ def check_models(path: Path, table: PackTable, cell_files: Mapping[str, str]) ->
         try:
             model_of(first.kind, cell_files.get(first.kind.cell))
         except UserError as error:
-            others = f", and {len(lines) - 1} more of its kind" if len(lines) > 1 else ""
+            others = f", and {len(lines) - 1} more like this" if len(lines) > 1 else ""
             errors.append(f"{path}: line {first.number}{others}: {error}")
-    _refuse(path, errors)
+    _raise_errors(path, errors)
 
 
 class _Reader:
-    """One table on its way."""
+    """Reader of one table."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -95,7 +95,7 @@ class _Reader:
         self._files = dict[str, Path]()
 
     def table(self) -> PackTable:
-        """Return the table as ``read_table`` does."""
+        """Read and return the table; errors as in ``read_table``."""
         rows = csv.reader(io.StringIO(text := self._text(), newline=""), delimiter=_separator(text), strict=True)
         packs, errors = dict[str, Line](), list[str]()
         try:
@@ -105,15 +105,15 @@ class _Reader:
                     continue
                 try:
                     name, kind, data = self._row(columns, [value.strip() for value in values])
-                    _refuse_again(name, packs)
+                    _reject_duplicate(name, packs)
                     packs[name] = Line(rows.line_num, kind, data)
                 except _RowError as error:
                     errors.append(f"{self._path}: line {rows.line_num}, {error}")
         except csv.Error as error:
             errors.append(f"{self._path}: line {rows.line_num}: {error}; a quote that is opened must be closed")
-        _refuse(self._path, errors)
+        _raise_errors(self._path, errors)
         if not packs:
-            raise UserError(f"{self._path}: no row below the line of column names; give one for each pack")
+            raise UserError(f"{self._path}: no row below the line of column names; add one for each pack")
         return PackTable(packs, self._files)
 
     def _text(self) -> str:
@@ -128,33 +128,35 @@ class _Reader:
         """Return the columns named in the first line.
 
         Raises:
-            UserError: One is unknown, twice or missing.
+            UserError: A column is unknown, repeated or missing.
         """
         names = [name.strip() for name in header]
-        errors = [f"column {name!r} is unknown; {_meant(name)}" for name in names if name not in COLUMNS]
-        errors += [f"column {name} is there twice" for name in COLUMNS if names.count(name) > 1]
-        errors += [f"no column {name}; there must be one" for name in ("pack", "cell") if name not in names]
-        _refuse(self._path, [f"{self._path}: line 1: {error}" for error in errors])
+        errors = [f"column {name!r} is unknown; {_suggestion(name)}" for name in names if name not in COLUMNS]
+        errors += [f"column {name} is repeated" for name in COLUMNS if names.count(name) > 1]
+        errors += [f"column {name} is missing" for name in ("pack", "cell") if name not in names]
+        _raise_errors(self._path, [f"{self._path}: line 1: {error}" for error in errors])
         return names
 
     def _row(self, columns: list[str], values: list[str]) -> tuple[str, PackSpec, bytes]:
         if len(values) != len(columns):
             raise _RowError(f"{len(values)} values in {len(columns)} columns; give one for each, empty for the default")
-        place = columns.index("pack")
-        name = values[place]
+        index = columns.index("pack")
+        name = values[index]
         if not re.fullmatch(DEVICE_NAME, name):
             raise _RowError(_error_text("pack", name, "must be 1 to 64 letters, digits, _ and -"))
-        key = (*values[:place], *values[place + 1 :])
+        key = (*values[:index], *values[index + 1 :])
         if key not in self._kinds:
-            told = {column: value for column, value in zip(columns, values, strict=True) if value and column != "pack"}
-            kind = self._kind(told)
+            filled = {
+                column: value for column, value in zip(columns, values, strict=True) if value and column != "pack"
+            }
+            kind = self._kind(filled)
             self._kinds[key] = kind, stored(kind)
         return name, *self._kinds[key]
 
-    def _kind(self, told: Mapping[str, str]) -> PackSpec:
-        """Return the values that packs of one kind share."""
-        values: dict[str, object] = {column: _value(column, value) for column, value in told.items()}
-        cell = told.get("cell", "")
+    def _kind(self, filled: Mapping[str, str]) -> PackSpec:
+        """Return the row of the filled columns, without the pack's name."""
+        values: dict[str, object] = {column: _value(column, value) for column, value in filled.items()}
+        cell = filled.get("cell", "")
         if cell.endswith(CELL_FILE):
             values["cell"] = self._cell_file(cell)
         try:
@@ -163,13 +165,13 @@ class _Reader:
             detail = error.errors()[0]
             column = str(detail["loc"][0])
             described = PackSpec.model_fields[column].description
-            if column not in told:
-                raise _RowError(f"column {column}: is empty; give {described}") from None
+            if column not in filled:
+                raise _RowError(f"column {column} is empty; it must be {described}") from None
             message = detail["msg"].removeprefix("Value error, ")
-            raise _RowError(_error_text(column, told[column], f"{message} ({described})")) from None
+            raise _RowError(_error_text(column, filled[column], f"{message} ({described})")) from None
 
     def _cell_file(self, value: str) -> str:
-        """Return the name of the cell in a file."""
+        """Check the file of a cell and return the cell's name."""
         path = self._path.parent / value
         name = path.name.removesuffix(CELL_FILE)
         if not path.is_file():
@@ -185,45 +187,45 @@ class _Reader:
         return name
 
 
-def _refuse_again(name: str, packs: Mapping[str, Line]) -> None:
+def _reject_duplicate(name: str, packs: Mapping[str, Line]) -> None:
     if name in packs:
-        raise _RowError(_error_text("pack", name, f"is on line {packs[name].number} already; take one away"))
+        raise _RowError(_error_text("pack", name, f"is already on line {packs[name].number}; remove one of them"))
 
 
 def _value(column: str, value: str) -> object:
-    if column in _WORDS:
+    if column in _TEXT_COLUMNS:
         return value
     if not _NUMBER.fullmatch(value):
         hint = ", with a point and not a comma" if "," in value else ""
         raise _RowError(_error_text(column, value, f"must be a number{hint}"))
-    return int(value) if column in _WHOLE and value.isdecimal() else float(value)
+    return int(value) if column in _INTEGER_COLUMNS and value.isdecimal() else float(value)
 
 
-def _error_text(column: str, value: str, wrong: str) -> str:
-    return f"column {column} = {value!r}: {wrong}"
+def _error_text(column: str, value: str, error: str) -> str:
+    return f"column {column} = {value!r}: {error}"
 
 
 def _separator(text: str) -> str:
-    """Return the separator that is more frequent in the first line."""
+    """Return the separator: the more frequent candidate in the first line."""
     first = text.partition("\n")[0]
     return max(",;", key=first.count)
 
 
-def _meant(name: str) -> str:
+def _suggestion(name: str) -> str:
     close = get_close_matches(name, COLUMNS, n=1)
     return f"is {close[0]} meant?" if close else f"there are {', '.join(COLUMNS)}"
 
 
-def _refuse(path: Path, errors: Sequence[str]) -> None:
+def _raise_errors(path: Path, errors: Sequence[str]) -> None:
     if errors:
-        left = len(errors) - MAX_SAID
-        raise UserError("\n".join([*errors[:MAX_SAID], *([f"{path}: and {left} more"] if left > 0 else [])]))
+        left = len(errors) - MAX_ERRORS
+        raise UserError("\n".join([*errors[:MAX_ERRORS], *([f"{path}: and {left} more"] if left > 0 else [])]))
 
 
 def table_lines(packs: Mapping[str, PackSpec]) -> Iterator[str]:
-    """Return the table as CSV lines with their line ends; a column without any value is left out."""
-    told = {name: kind.model_dump(exclude_defaults=True) for name, kind in sorted(packs.items())}
-    columns = [column for column in COLUMNS if column == "pack" or any(column in row for row in told.values())]
+    """Yield the table as CSV lines with line ends; empty columns are omitted."""
+    rows = {name: kind.model_dump(exclude_defaults=True) for name, kind in sorted(packs.items())}
+    columns = [column for column in COLUMNS if column == "pack" or any(column in row for row in rows.values())]
     yield ",".join(columns) + "\n"
-    for name, row in told.items():
+    for name, row in rows.items():
         yield ",".join(str(({"pack": name} | row).get(column, "")) for column in columns) + "\n"

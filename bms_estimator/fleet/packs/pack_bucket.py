@@ -1,4 +1,4 @@
-"""The table of packs on the server: one row for each in the bucket ``packs``, cell files in the bucket ``cells``."""
+"""Table of packs on the server: one row a pack in the bucket ``packs``, cell files in the bucket ``cells``."""
 
 import asyncio
 from collections.abc import Callable, Collection, Mapping
@@ -11,38 +11,38 @@ from nats.aio.client import Client
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.stream_reader import ANSWER_S, Stored, StreamError, read_stream
+from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, Stored, StreamError, read_stream
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 
 POLL_S = 1.0
 """Poll interval for changes [s]."""
-AT_ONCE = 2000
-"""Maximum number of written rows waiting for the server's acknowledgment."""
-_GONE = frozenset({"DEL", "PURGE"})
+MAX_PENDING = 2000
+"""Maximum number of written rows that wait for the server's acknowledgment."""
+_REMOVING_OPERATIONS = frozenset({"DEL", "PURGE"})
 
 
 @dataclass(frozen=True)
 class Written:
-    """Result of a table change: numbers of rows."""
+    """Numbers of rows by the effect of a table change."""
 
     new: int
     changed: int
     same: int
     removed: int
     left: int
-    """Number of rows in the bucket that are not among the values."""
+    """Rows that stay in the bucket although they are not among the written values."""
 
 
 class PackBucket:
-    """The table as a worker sees it; never an error for its content.
+    """Copy of the table that follows its changes. Errors in a row make its packs unknown and are not raised.
 
     Args:
-        nc: Connected as the tenant.
+        nc: Connection of the tenant.
 
     Attributes:
-        packs: Known packs, as a function of the name.
-        faults: Number of times that the server could not be read.
-        fault: Why, the last time; empty while it can.
+        packs: Registry of the packs.
+        faults: Number of failed reads.
+        fault: Reason of the last failed read; empty after a successful one.
     """
 
     def __init__(self, nc: Client) -> None:
@@ -53,93 +53,93 @@ class PackBucket:
         self._changed: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
 
     async def refresh(self) -> set[str]:
-        """Read changes, at first everything; returns the affected packs.
+        """Read the changes since the last call, and return the affected packs. The first call reads everything.
 
         Raises:
-            StreamError: The server does not answer, or has no such bucket.
+            StreamError: The server does not respond, or has no such bucket.
         """
-        await self._read(CELLS_BUCKET, self.packs.set_cell)  # a row finds its cell
+        await self._read(CELLS_BUCKET, self.packs.set_cell)  # before the rows that name the cells
         await self._read(PACKS_BUCKET, self.packs.set_row)
-        changed = self._changed[PACKS_BUCKET] | self.packs.made_of(self._changed[CELLS_BUCKET])
+        changed = self._changed[PACKS_BUCKET] | self.packs.packs_using(self._changed[CELLS_BUCKET])
         self._changed = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
         return changed
 
-    async def _read(self, bucket: str, take: Callable[[str, bytes | None], bool]) -> None:
-        """Collect the changed keys of a bucket, also for the next refresh if this one fails."""
+    async def _read(self, bucket: str, set_value: Callable[[str, bytes | None], bool]) -> None:
+        """Read the changed keys of a bucket. They are kept for the next refresh if this one fails."""
         try:
             state = (await self._nc.jetstream().stream_info(_stream(bucket))).state
         except nats.errors.Error as error:
-            raise StreamError(f"the server refuses to read {_stream(bucket)}: {error_text(error)}") from None
+            raise StreamError(f"the server rejects reading {_stream(bucket)}: {error_text(error)}") from None
         if state.last_seq + 1 < self._next[bucket]:
-            self._next[bucket] = 1  # re-created, or its end is lost: sequence numbers restart with other values
+            self._next[bucket] = 1  # recreated, or its end is lost: sequence numbers are used again
         async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next[bucket]):
             for message in batch:
                 key, data = _entry(bucket, message)
-                if take(key, data):
+                if set_value(key, data):
                     self._changed[bucket].add(key)
             self._next[bucket] = batch[-1].sequence + 1
 
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
-        """Follow changes without end; call ``changed`` with the packs whose row or cell has changed.
+        """Poll for changes until cancelled; call ``changed`` with the packs whose row or cell has changed.
 
-        Missing values are requested again.
+        A failed poll is counted, and the next one includes its changes.
         """
         while True:
             await asyncio.sleep(POLL_S)
             try:
-                news = await self.refresh()
+                packs = await self.refresh()
             except (StreamError, nats.errors.Error) as error:
                 self.faults, self.fault = self.faults + 1, str(error)
                 continue
             self.fault = ""
-            if news:
-                changed(news)
+            if packs:
+                changed(packs)
 
 
 async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
-    """All values by their keys.
+    """Return all values of a bucket by key.
 
     Raises:
-        StreamError: The server does not answer, or has no such bucket.
+        StreamError: The server does not respond, or has no such bucket.
     """
-    found = dict[str, bytes]()
+    values = dict[str, bytes]()
     async for batch in read_stream(nc, _stream(bucket), _key(bucket, ">")):
         for message in batch:
             key, data = _entry(bucket, message)
             if data is None:
-                found.pop(key, None)
+                values.pop(key, None)
             else:
-                found[key] = data
-    return found
+                values[key] = data
+    return values
 
 
 async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, remove: bool = False) -> Written:
-    """Let a bucket hold ``values``; unchanged values are not written.
+    """Write values to a bucket; unchanged ones are skipped.
 
     Args:
-        nc: Connected.
+        nc: Connection of the tenant.
         bucket: Name of the bucket.
         values: Values by key.
-        remove: Remove entries that are not in ``values``.
+        remove: Whether to remove entries that are not in ``values``.
 
     Raises:
-        StreamError: The server does not answer, or refuses.
+        StreamError: The server does not respond or rejects the request.
     """
-    held = await read_bucket(nc, bucket)
-    differing = {key: data for key, data in values.items() if held.get(key) != data}
-    others = held.keys() - values.keys()
+    stored = await read_bucket(nc, bucket)
+    differing = {key: data for key, data in values.items() if stored.get(key) != data}
+    others = stored.keys() - values.keys()
     await put(nc, bucket, differing)
     if remove:
         await remove_keys(nc, bucket, others)
-    new, removed = len(differing.keys() - held.keys()), len(others) if remove else 0
+    new, removed = len(differing.keys() - stored.keys()), len(others) if remove else 0
     return Written(new, len(differing) - new, len(values) - len(differing), removed, len(others) - removed)
 
 
 async def remove_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
-    """Take keys out of a bucket.
+    """Remove keys from a bucket.
 
     Raises:
-        StreamError: The server does not answer, or refuses.
+        StreamError: The server does not respond or rejects the request.
     """
     await put(nc, bucket, dict.fromkeys(keys, b""), {"KV-Operation": "DEL"})
 
@@ -150,25 +150,25 @@ async def put(
     """Write values by key, many at a time.
 
     Raises:
-        StreamError: The server does not answer, or refuses.
+        StreamError: The server does not respond or rejects the request.
     """
     js, entries = nc.jetstream(), list(values.items())
     try:
-        for first in range(0, len(entries), AT_ONCE):
+        for first in range(0, len(entries), MAX_PENDING):
             acks = [
                 await js.publish_async(_key(bucket, key), data, headers=dict(headers) or None)
-                for key, data in entries[first : first + AT_ONCE]
+                for key, data in entries[first : first + MAX_PENDING]
             ]
-            async with asyncio.timeout(ANSWER_S):
+            async with asyncio.timeout(RESPONSE_TIMEOUT_S):
                 await asyncio.gather(*acks)
     except (TimeoutError, nats.errors.Error, nats.js.errors.Error) as error:
-        raise StreamError(f"the server does not take what is written to {bucket}: {error}") from None
+        raise StreamError(f"the server does not store rows of {bucket}: {error}") from None
 
 
 def _entry(bucket: str, message: Stored) -> tuple[str, bytes | None]:
-    """Key and value; None: it is there no more."""
-    gone = message.headers.get("KV-Operation") in _GONE or "Nats-Marker-Reason" in message.headers
-    return message.subject.removeprefix(_key(bucket, "")), None if gone else message.data
+    """Return key and value of a message; the value None means that the key was removed."""
+    is_removed = message.headers.get("KV-Operation") in _REMOVING_OPERATIONS or "Nats-Marker-Reason" in message.headers
+    return message.subject.removeprefix(_key(bucket, "")), None if is_removed else message.data
 
 
 def _stream(bucket: str) -> str:

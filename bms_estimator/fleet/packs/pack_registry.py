@@ -1,7 +1,7 @@
 """Registry of packs: rows and cell files, and the settings and model of each pack.
 
-Packs with equal rows share one settings object and one model, which are made on first use. An error in a row makes its packs
-unknown, with the reason.
+Packs with equal rows share one settings object and one model, which are created on first use. A pack whose row has an error is
+unknown; ``PackRegistry.reason`` returns the error.
 """
 
 from collections.abc import Collection, Iterator
@@ -14,19 +14,19 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
 MAX_KINDS = 1024
-"""Maximum number of kinds of packs that are cached."""
+"""Maximum number of cached kinds of packs."""
 UNKNOWN_PACK = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
 
 
 class PackRegistry:
-    """Rows and cell files, from which a pack's settings and model follow."""
+    """Registry of rows and cell files, which returns settings and model of a pack."""
 
     def __init__(self) -> None:
         self._rows = dict[str, bytes]()
-        self._same = dict[bytes, bytes]()
+        self._shared = dict[bytes, bytes]()
         self._cells = dict[str, str]()
-        self._kind = lru_cache(MAX_KINDS)(_kind)
-        self._made = lru_cache(MAX_KINDS)(_made)
+        self._kind = lru_cache(MAX_KINDS)(_parse_row)
+        self._model = lru_cache(MAX_KINDS)(_make_model)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -38,13 +38,13 @@ class PackRegistry:
         return pack in self._rows
 
     def __call__(self, pack: str) -> tuple[Settings, PackModel] | None:
-        """Return settings and model of a pack's kind, one object for all packs of the kind; None if ``reason`` has an error."""
-        found = self._found(pack)
+        """Return settings and model, one object for all packs of a kind; None if the pack is unknown (``reason``)."""
+        found = self._look_up(pack)
         return None if isinstance(found, str) else found
 
     def reason(self, pack: str) -> str:
-        """Why a pack is unknown; empty where it is not."""
-        found = self._found(pack)
+        """Return why a pack is unknown; empty if it is known."""
+        found = self._look_up(pack)
         return found if isinstance(found, str) else ""
 
     def kind(self, pack: str) -> PackSpec | str | None:
@@ -63,7 +63,7 @@ class PackRegistry:
         if data is None:
             del self._rows[pack]
         else:
-            self._rows[pack] = self._same.setdefault(data, data)
+            self._rows[pack] = self._shared.setdefault(data, data)
         return True
 
     def set_cell(self, name: str, file: bytes | None) -> bool:
@@ -77,8 +77,8 @@ class PackRegistry:
             self._cells[name] = text
         return True
 
-    def made_of(self, cells: Collection[str]) -> set[str]:
-        """Return the packs that use one of some cells; searches all packs."""
+    def packs_using(self, cells: Collection[str]) -> set[str]:
+        """Return the packs that use one of ``cells``; searches all packs."""
         found = set[str]()
         for pack, data in self._rows.items() if cells else ():
             kind = self._kind(data)
@@ -86,28 +86,28 @@ class PackRegistry:
                 found.add(pack)
         return found
 
-    def _found(self, pack: str) -> tuple[Settings, PackModel] | str:
+    def _look_up(self, pack: str) -> tuple[Settings, PackModel] | str:
         kind = self.kind(pack)
         if kind is None:
             return UNKNOWN_PACK
         if isinstance(kind, str):
             return f"its row is wrong: {kind}"
-        return self._made(kind, self._cells.get(kind.cell))
+        return self._model(kind, self._cells.get(kind.cell))
 
 
-def _kind(data: bytes) -> PackSpec | str:
+def _parse_row(data: bytes) -> PackSpec | str:
     try:
         return kind_of(data)
     except ValueError as error:
         return str(error)
 
 
-def _made(kind: PackSpec, cell_file: str | None) -> tuple[Settings, PackModel] | str:
+def _make_model(kind: PackSpec, cell_file: str | None) -> tuple[Settings, PackModel] | str:
     try:
         settings, model = settings_of(kind), model_of(kind, cell_file)
-        type_estimator(settings, model)  # cached: a partition requests the same next
+        type_estimator(settings, model)  # cached for the partitions
     except UserError as error:
         return str(error)
     except (ValueError, ArithmeticError) as error:
-        return f"no estimator can be made of its values: {error}"
+        return f"its values allow no estimator: {error}"
     return settings, model

@@ -1,7 +1,7 @@
-"""Row of the table of packs, and the settings and model that follow from it.
+"""Row of the table of packs, and the settings and model computed from it.
 
-On the server the key of a row is its pack's name, and the value is JSON without the name, so that packs of one kind
-have equal bytes.
+On the server the key of a row is the pack's name. The value is JSON without the name, so that packs of one kind have equal
+values.
 """
 
 import tomllib
@@ -25,48 +25,50 @@ from bms_estimator.settings.pack import DeviceName, PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
-"""Pattern of a cell's name; a cell file of one pack has a longer name than the pack."""
+"""Pattern of a cell's name; longer than a pack's name, because ``fleet identify`` names cell files after packs."""
 _COUNT = Field(ge=1, le=10_000)
 
 
 class PackSpec(Strict):
-    """Values that packs of one kind share; as ``[pack]`` and ``[sensor]`` of a pack's file."""
+    """Values that packs of one kind share: those of the sections ``[pack]`` and ``[sensor]`` of a settings file."""
 
     cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
-        description="lfp, nmc, nca, lco, lmo, lto: generic, give capacity_ah; else a shipped cell's name, or a cell "
-        "file's beside the table, which must end in .toml"
+        description="generic chemistry lfp, nmc, nca, lco, lmo or lto (with capacity_ah), shipped cell, or cell file "
+        "beside the table, whose name ends in .toml"
     )
     capacity_ah: Positive | None = Field(
-        default=None, description="what one cell-file object holds; that of the cell file when left out"
+        default=None, description="capacity of one cell-file object; default: that of the cell file"
     )
     series: Annotated[int, _COUNT] = Field(default=1, description="cell-file objects in series")
     parallel: Annotated[int, _COUNT] = Field(default=1, description="cell-file objects in parallel")
-    initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
+    initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; default: from the OCV")
     protocol: Annotated[str, OneOf(DEVICES)] = Field(
-        default="text", description="the BMS or meter that measures: what it resolves, where no column says otherwise"
+        default="text", description="BMS or meter; sets the default resolutions"
     )
-    voltage_resolution_v: Positive | None = Field(default=None, description="one step of the pack's voltage")
+    voltage_resolution_v: Positive | None = Field(default=None, description="resolution of the pack voltage")
     voltage_noise_v: NotNegative | None = Field(
-        default=None, description="standard deviation of one voltage sample; half a step when left out"
+        default=None, description="standard deviation of one voltage sample; default: half a step"
     )
-    current_resolution_a: NotNegative | None = Field(default=None, description="one step of the current")
-    current_dead_band_a: NotNegative | None = Field(default=None, description="smaller currents are shown as 0")
-    period_s: Positive | None = Field(default=None, description="between two samples; 1 s when left out")
+    current_resolution_a: NotNegative | None = Field(default=None, description="resolution of the current")
+    current_dead_band_a: NotNegative | None = Field(
+        default=None, description="limit below which the device reports a current of 0"
+    )
+    period_s: Positive | None = Field(default=None, description="interval between two samples; default: 1 s")
 
 
 class PackRow(PackSpec):
-    """One pack."""
+    """Row of one pack."""
 
-    pack: DeviceName = Field(description="device in topic names: 1 to 64 letters, digits, _ and -")
+    pack: DeviceName = Field(description="name of the pack in topics: 1 to 64 letters, digits, _ and -")
 
     @property
     def kind(self) -> PackSpec:
-        """All but the name."""
+        """Row without the name."""
         return PackSpec.model_validate(self.model_dump(exclude={"pack"}, exclude_unset=True))
 
 
 COLUMNS = ("pack", *PackSpec.model_fields)
-"""Columns of a table, in the order in which they are written."""
+"""Columns of a table in written order."""
 
 
 def stored(kind: PackSpec) -> bytes:
@@ -78,54 +80,54 @@ def kind_of(data: bytes) -> PackSpec:
     """Decode a row encoded by ``stored``.
 
     Raises:
-        ValueError: It did not; the message gives the reason.
+        ValueError: The bytes are not a row; the message gives the reason.
     """
     try:
         return PackSpec.model_validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
+        field = ".".join(map(str, first["loc"]))
         message = first["msg"].removeprefix("Value error, ")
-        raise ValueError(f"{where}: {message}" if where else message) from None
+        raise ValueError(f"{field}: {message}" if field else message) from None
 
 
 def settings_of(row: PackSpec) -> Settings:
-    """Return the settings of a pack; those of a kind have the default name."""
-    told = row.model_dump(exclude_none=True)
+    """Return the settings of a pack; a row without a name has the default name."""
+    values = row.model_dump(exclude_none=True)
     if isinstance(row, PackRow):
-        told["name"] = row.pack
+        values["name"] = row.pack
     pack, sensor = (
-        {name: told[name] for name in section.model_fields if name in told}
+        {name: values[name] for name in section.model_fields if name in values}
         for section in (PackSettings, SensorSettings)
     )
     return Settings(pack=PackSettings.model_validate(pack), sensor=SensorSettings.model_validate(sensor))
 
 
 def known_cells() -> tuple[str, ...]:
-    """Names of all shipped cells."""
+    """Return the names of all shipped cells."""
     return (*shipped_cells(), *generic_cells(), *shipped_fuel_cells())
 
 
 def model_of(kind: PackSpec, cell_file: str | None) -> PackModel:
-    """Return the pack as one object.
+    """Return the model of a whole pack.
 
     Args:
-        kind: Names the cell, its capacity and its number.
+        kind: Row of the pack.
         cell_file: Text of the loaded file of that name; None without one. A shipped cell takes precedence.
 
     Raises:
-        UserError: There is no such cell, or a value in it that is not allowed; a capacity that is missing or cannot be.
+        UserError: The cell is missing or invalid, or the capacity is missing or not allowed.
     """
     return cell_of(kind, cell_file).pack(kind.series, kind.parallel)
 
 
 def model_key(kind: PackSpec) -> tuple[object, ...]:
-    """Kinds with the same one have a model all of them, or none of them has."""
+    """Return the values that decide whether a kind has a valid model. Kinds with equal keys are checked once."""
     return kind.cell, kind.capacity_ah is None, kind.series, kind.parallel
 
 
 def cell_of(kind: PackSpec, cell_file: str | None) -> PackModel:
-    """Return one of the objects that the pack consists of; as ``model_of``."""
+    """Return the model of one cell-file object of a pack; arguments and errors as in ``model_of``."""
     name = kind.cell
     if name in known_cells():
         return load_any(name, kind.capacity_ah)
@@ -145,4 +147,4 @@ def _is_fuel_cell(cell_file: str) -> bool:
     try:
         return "fuel_cell" in tomllib.loads(cell_file)
     except (ValueError, RecursionError):
-        return False  # the reader of the cell file reports errors
+        return False  # parse_toml reports the error

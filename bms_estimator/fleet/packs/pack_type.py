@@ -1,4 +1,4 @@
-"""Packs of one type: they share an estimator's settings, which take longer to make than a day's samples to estimate."""
+"""Type of packs, which share one estimator, because creating an estimator takes longer than estimating a day's samples."""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -16,9 +16,9 @@ from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
 MAX_TYPES = 256
-"""Maximum number of cached types, 40 kB each; others are made again each time, in 50 ms."""
+"""Maximum number of cached types, 40 kB each; creating another one takes 50 ms each time."""
 Digest = tuple[int, int]
-"""The first 128 bits, as two words."""
+"""First 128 bits of a SHA-256 digest as two words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,16 +26,16 @@ class PackType:
     """Settings, estimator and digests that packs of one type share.
 
     Attributes:
-        settings: Settings of the packs, but for the name.
-        made_of: Digest of all that the estimator is made of.
-        state_digest: Digest of all that gives a state its meaning; under another one it restarts.
-        estimator: Works on the record of the partition.
-        meter: Counts for one pack after the other.
-        capacity_ah: Capacity of the pack, rated; None of a fuel cell.
+        settings: Settings of the packs; the name is not used.
+        config_digest: Digest of the configuration of the estimator. A state of another digest is migrated.
+        state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
+        estimator: Estimator bound to the work record of the partition.
+        meter: Charge and energy meter bound to the work record.
+        capacity_ah: Rated capacity of a pack; None for a fuel cell.
     """
 
     settings: PackSettings
-    made_of: Digest
+    config_digest: Digest
     state_digest: Digest
     estimator: Estimator
     meter: ChargeEnergyMeter
@@ -44,13 +44,15 @@ class PackType:
 
 @dataclass(frozen=True)
 class _Recipe:
-    made_of: Digest
+    """Cache key of an estimator; only the digest is compared."""
+
+    config_digest: Digest
     settings: Settings = field(compare=False)
     cell: PackModel = field(compare=False)
 
 
 def config_digest(settings: Settings, cell: PackModel) -> Digest:
-    """Digest of all that a pack's estimator is made of."""
+    """Return the digest of all values that a pack's estimator is created from."""
     sensor = settings.sensor
     parts = (
         *(settings.observer, settings.identifier, settings.sampling, settings.pack.initial_soc, cell),
@@ -60,15 +62,15 @@ def config_digest(settings: Settings, cell: PackModel) -> Digest:
 
 
 class PackTypes:
-    """The types of a partition's packs.
+    """Cache of the types of a partition's packs.
 
     Args:
-        record: What their estimators work on, shape (1,), dtype PACK_STATE.
+        record: Work record of the partition, shape (1,), dtype ``PACK_STATE``.
     """
 
     def __init__(self, record: NDArray[np.void]) -> None:
         self._record = record
-        self._known: dict[tuple[int, int], tuple[Settings, PackModel, PackType]] = {}
+        self._types: dict[tuple[int, int], tuple[Settings, PackModel, PackType]] = {}
 
     def of(self, settings: Settings, cell: PackModel) -> PackType:
         """Return the type of packs with these settings; cached by the identity of both objects.
@@ -78,26 +80,26 @@ class PackTypes:
             cell: A pack as one object (``CellModel.pack``).
         """
         key = id(settings), id(cell)
-        if key not in self._known:
-            if len(self._known) >= MAX_TYPES:
-                self._known.clear()
-            self._known[key] = settings, cell, pack_type(settings, cell, self._record)
-        return self._known[key][2]
+        if key not in self._types:
+            if len(self._types) >= MAX_TYPES:
+                self._types.clear()
+            self._types[key] = settings, cell, pack_type(settings, cell, self._record)
+        return self._types[key][2]
 
 
 def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> PackType:
-    """Make the type of packs with these settings.
+    """Create the type of packs with these settings.
 
     Args:
-        settings: The pack's.
-        cell: The pack as one object (``CellModel.pack``).
-        record: What its estimator and meter work on, shape (1,), dtype PACK_STATE.
+        settings: Settings of the packs.
+        cell: A pack as one object (``CellModel.pack``).
+        record: Work record of the partition, shape (1,), dtype ``PACK_STATE``.
     """
-    made = config_digest(settings, cell)
+    digest = config_digest(settings, cell)
     estimator = type_estimator(settings, cell).bound_to_record(record["estimator"])
     return PackType(
         settings=settings.pack,
-        made_of=made,
+        config_digest=digest,
         state_digest=_digest(bytes.fromhex(pack_identity(settings, cell))),
         estimator=estimator,
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),

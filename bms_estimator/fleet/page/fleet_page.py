@@ -1,4 +1,4 @@
-"""The page of a fleet: latest messages, sent to browsers at a limited rate, and details of one pack on request."""
+"""Web page of a fleet: an overview, sent to browsers at a limited rate, and details of one pack on request."""
 
 import asyncio
 import contextlib
@@ -19,9 +19,9 @@ from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.settings.page import PageSettings
 
 STEP_S = 2.0
-"""Interval between two pictures of the fleet [s]."""
-ASK_S = 600.0
-"""Interval between two queries of the hours [s]."""
+"""Interval between two overviews of the fleet [s]."""
+QUERY_S = 600.0
+"""Interval between two runs of the queries [s]."""
 FLEET, ANSWERS = "fleet", "answers"
 """Keys of the event stream."""
 STATIC = Path(__file__).with_name("static")
@@ -34,20 +34,20 @@ FILES = {
     "/format.js": File(SHARED / "format.js", "text/javascript"),
     "/icon.svg": File(SHARED / "icon.svg", "image/svg+xml"),
 }
-"""All that is served, by its path."""
+"""Served files by path."""
 
 
 @contextlib.asynccontextmanager
 async def fleet_page(
     server: Server, settings: PageSettings, hours: Path | None = None, *, step_s: float = STEP_S
 ) -> AsyncIterator[str]:
-    """Serve while the context lasts.
+    """Serve the page while the context lasts.
 
     Args:
         server: Address of the fleet's server.
         settings: Address and access of the page.
-        hours: Folder of the Parquet files for queries; None: none are.
-        step_s: Interval of the summaries [s].
+        hours: Folder of the Parquet files for queries; None: without queries.
+        step_s: Interval between two overviews [s].
 
     Yields:
         The page's address.
@@ -55,7 +55,7 @@ async def fleet_page(
     Raises:
         UserError: A setting cannot be used, or the address is taken.
     """
-    newest, view = LatestValues(), FleetView(PARTITIONS, time.monotonic())
+    latest, view = LatestValues(), FleetView(PARTITIONS, time.monotonic())
 
     async def packs(request: web.Request) -> web.Response:
         return _json(view.packs.find(request.query.get("prefix", "")))
@@ -64,16 +64,16 @@ async def fleet_page(
         name = request.query.get("name", "")
         found = view.packs.one(name, time.monotonic())
         if found is None:
-            raise web.HTTPNotFound(text="no such pack was heard of\n")
+            raise web.HTTPNotFound(text="unknown pack\n")
         return _json(found)
 
     async with (
-        WebServer(settings, FILES, newest, {"/packs": packs, "/pack": pack}, patient=False) as page,
-        FleetFeed(server, view, newest.set_link_state),
+        WebServer(settings, FILES, latest, {"/packs": packs, "/pack": pack}, patient=False) as page,
+        FleetFeed(server, view, latest.set_link_state),
     ):
-        tasks = [asyncio.create_task(_draw(view, newest, step_s), name="fleet page")]
+        tasks = [asyncio.create_task(_send_overviews(view, latest, step_s), name="fleet page")]
         if hours is not None:
-            tasks.append(asyncio.create_task(_ask(hours, newest), name="fleet questions"))
+            tasks.append(asyncio.create_task(_send_query_results(hours, latest), name="fleet questions"))
         try:
             yield page.url
         finally:
@@ -82,22 +82,22 @@ async def fleet_page(
             await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _draw(view: FleetView, newest: LatestValues, step_s: float) -> None:
-    """Send a picture at intervals; while the server is lost the last one stays."""
+async def _send_overviews(view: FleetView, latest: LatestValues, step_s: float) -> None:
+    """Send an overview at intervals; without a connection to the server the last one stays."""
     while True:
         if view.listening:
-            newest.set_value(FLEET, view.text(time.monotonic(), time.time()))
+            latest.set_value(FLEET, view.text(time.monotonic(), time.time()))
         await asyncio.sleep(step_s)
 
 
-async def _ask(hours: Path, newest: LatestValues) -> None:
-    """Query the hours at intervals, which takes seconds for a large fleet. The process ends after the current query."""
-    from bms_estimator.fleet.page.query_results import ASKED, answer  # noqa: PLC0415 - duckdb is needed for nothing else
+async def _send_query_results(hours: Path, latest: LatestValues) -> None:
+    """Run the queries at intervals. They take seconds for a large fleet; the process ends only after the current one."""
+    from bms_estimator.fleet.page.query_results import PAGE_QUERIES, answer  # noqa: PLC0415 - only queries need duckdb
 
     while True:
-        found = {name: await asyncio.to_thread(answer, hours, name) for name in ASKED}
-        newest.set_value(ANSWERS, json.dumps(found, allow_nan=False, separators=(",", ":")))
-        await asyncio.sleep(ASK_S)
+        found = {name: await asyncio.to_thread(answer, hours, name) for name in PAGE_QUERIES}
+        latest.set_value(ANSWERS, json.dumps(found, allow_nan=False, separators=(",", ":")))
+        await asyncio.sleep(QUERY_S)
 
 
 def _json(value: Any) -> web.Response:

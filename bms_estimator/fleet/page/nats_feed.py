@@ -1,4 +1,4 @@
-"""Messages of a fleet for its page: states, parameters, hours, workers, unknown packs, and the table of packs."""
+"""Feed of the fleet's page: states, parameters, hours, heartbeats, unknown packs, and the table of packs."""
 
 import asyncio
 import time
@@ -13,7 +13,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.connection import connect, context, part, readable
+from bms_estimator.fleet.nats.connection import check_credentials_file, close, connect, tls_context
 from bms_estimator.fleet.nats.stream_reader import StreamError, read_stream
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
@@ -25,11 +25,11 @@ from bms_estimator.process.tasks import end
 TABLE_S = 2.0
 """Poll interval for changes of the table of packs, and retry interval [s]."""
 HOURS_S = 3900.0
-"""Interval of hourly summaries, with a delay [s]."""
+"""Age up to which hourly summaries are read at the start [s]: an hour and a delay."""
 MAX_BYTES = 1 << 16
-"""Maximum length of a message."""
+"""Maximum size of a processed message [bytes]."""
 MAX_REASON = 200
-"""Bytes of why a pack is unknown."""
+"""Maximum length of the reason why a pack is unknown [bytes]."""
 
 log = structlog.get_logger(__name__)
 
@@ -39,9 +39,9 @@ class Server:
     """Address and credentials of the fleet's server.
 
     Attributes:
-        urls: nats://host:port, or tls://; several with commas between.
-        creds: File with what opens its door; None: none is needed.
-        ca: Certificate of the authority that has signed its own; None: those of the system.
+        urls: Address ``nats://host:port`` or ``tls://host:port``, or several separated by commas.
+        creds: Credentials file; None: without credentials.
+        ca: Certificate of the authority that signed the server's certificate; None: the system's authorities.
     """
 
     urls: str
@@ -50,63 +50,65 @@ class Server:
 
 
 class FleetFeed:
-    """Fills a view while the context lasts.
+    """Feed that updates a view while the context lasts.
 
     Args:
         server: Address of the fleet's server.
-        view: Filled.
-        linked: Called with why there is no server, and with None when there is.
+        view: Updated.
+        on_link_change: Called with the reason when there is no connection, and with None when it is (re-)established.
 
     Raises:
         UserError: The credentials or the certificate cannot be read.
     """
 
-    def __init__(self, server: Server, view: FleetView, linked: Callable[[str | None], None]) -> None:
+    def __init__(self, server: Server, view: FleetView, on_link_change: Callable[[str | None], None]) -> None:
         if server.creds is not None:
-            readable(server.creds)
+            check_credentials_file(server.creds)
         if server.ca is not None:
-            context(server.ca)
-        self._server, self._view, self._linked = server, view, linked
+            tls_context(server.ca)
+        self._server, self._view, self._on_link_change = server, view, on_link_change
         self._nc: Client | None = None
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
-        """Start reaching for the server."""
-        self._on_link("not reached yet")
+        """Start to connect in the background."""
+        self._set_link_state("not reached yet")
         self._task = asyncio.create_task(self._run(), name="fleet feed")
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Part from the server."""
+        """Disconnect."""
         if self._task is not None:
             await end(self._task)
         if self._nc is not None:
-            await part(self._nc)
+            await close(self._nc)
 
     async def _run(self) -> None:
-        """Listen for ever; the page shows why it ended."""
+        """Receive messages until cancelled; report an error to the page."""
         try:
-            await self._listen()
+            await self._receive()
         except UserError as error:
-            log.error("nothing more is heard from the fleet's server", reason=str(error))  # noqa: TRY400 - of a person
-            self._on_link(str(error))
+            log.error("the feed from the fleet's server has ended", reason=str(error))  # noqa: TRY400 - a user error needs no traceback
+            self._set_link_state(str(error))
         except Exception:
-            log.exception("nothing more is heard from the fleet's server")
-            self._on_link("a fault of the page, which its log tells: start it again")
+            log.exception("the feed from the fleet's server has ended")
+            self._set_link_state("internal error of the page, see its log; restart the page")
 
-    async def _listen(self) -> None:
-        """Connect, which lasts until there is a server; then the library stays connected, and subscribed.
+    async def _receive(self) -> None:
+        """Connect, subscribe, and follow table and hours. The library then reconnects and renews subscriptions.
 
         Raises:
             UserError: The address cannot be used, or the server has closed the connection permanently.
         """
         server, name = self._server, "bms-estimator fleet page"
-        self._nc = await connect(server.urls, name, creds=server.creds, ca=server.ca, linked=self._on_link)
-        for subject, heard in self._handlers().items():
-            await self._nc.subscribe(subject, cb=heard)
-        self._on_link(None)
-        # no group of tasks: it cancels its own once only, and the library may swallow that
-        await asyncio.gather(self._follow_table(self._nc), self._read_hours(self._nc))
+        self._nc = await connect(
+            server.urls, name, creds=server.creds, ca=server.ca, on_link_change=self._set_link_state
+        )
+        for subject, handler in self._handlers().items():
+            await self._nc.subscribe(subject, cb=handler)
+        self._set_link_state(None)
+        # Not a TaskGroup, which cancels its tasks only once: the library may swallow that.
+        await asyncio.gather(self._follow_table(self._nc), self._read_recent_hours(self._nc))
 
     def _handlers(self) -> dict[str, Callable[[Msg], Coroutine[Any, Any, None]]]:
         view, clock = self._view, time.monotonic
@@ -137,21 +139,21 @@ class FleetFeed:
         }
 
     async def _follow_table(self, nc: Client) -> None:
-        """Register the packs in the table."""
+        """Follow the table of packs, and set the types of its packs."""
         bucket, view = PackBucket(nc), self._view
 
         async def refresh() -> None:
             view.workers.partitions = await partitions_of(nc) or view.workers.partitions
             for pack in await bucket.refresh():
                 kind = bucket.packs.kind(pack)
-                view.know(pack, None if kind is None else type_name(kind))
+                view.set_type(pack, None if kind is None else type_name(kind))
 
         while True:
-            await self._patiently(refresh)
+            await self._retry(refresh)
             await asyncio.sleep(TABLE_S)
 
-    async def _read_hours(self, nc: Client) -> None:
-        """Read the summaries of the last hour from before this page started."""
+    async def _read_recent_hours(self, nc: Client) -> None:
+        """Read the summaries of the last hour before the start of this page."""
         since_s = time.time() - HOURS_S
 
         async def read() -> None:
@@ -159,25 +161,25 @@ class FleetFeed:
                 for message in batch:
                     self._view.packs.receive_hour(message.subject.split(".")[1], message.data)
 
-        await self._patiently(read)
+        await self._retry(read)
 
-    async def _patiently(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Do what a server is needed for; where it does not answer, or has no such stream, again later."""
+    async def _retry(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Repeat ``work`` until the server answers and has the stream."""
         while True:
             try:
                 return await work()
             except (StreamError, UserError, nats.errors.Error) as error:
                 if self._nc is not None and self._nc.is_closed:
-                    raise UserError("the server has closed the connection: look at --creds") from None
-                log.warning("the fleet's server does not tell", reason=str(error))
+                    raise UserError("the server has closed the connection: check --creds") from None
+                log.warning("a request to the fleet's server failed; trying again", reason=str(error))
             await asyncio.sleep(TABLE_S)
 
-    def _on_link(self, trouble: str | None) -> None:
+    def _set_link_state(self, trouble: str | None) -> None:
         if trouble is None:
             self._view.begin(time.monotonic())
         else:
             self._view.end()
-        self._linked(trouble and f"{self._server.urls}: {trouble}")
+        self._on_link_change(trouble and f"{self._server.urls}: {trouble}")
 
 
 def type_name(kind: PackSpec | str) -> str:

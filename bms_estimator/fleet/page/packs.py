@@ -1,6 +1,6 @@
-"""All packs of a fleet as its page shows them: which are alive, their distribution, which need attention. Pure.
+"""Packs of a fleet as its page shows them: which are alive, their distribution, which need attention. No I/O.
 
-The newest state of each pack is stored as bytes, and the ranked values in columns; the rest is decoded on request.
+The newest state of each pack is stored as bytes and decoded on request. The ranked values are stored in columns.
 """
 
 import bisect
@@ -16,29 +16,29 @@ from bms_estimator.model.input_faults import InputFault
 
 ALIVE_S = 180.0
 """Time without a block after which a pack counts as silent [s]; a pack sends a block a minute."""
-LISTED = 20
-"""Packs of a list, at most."""
+MAX_LISTED = 20
+"""Maximum number of packs in a list."""
 MAX_TYPES = 8
-"""Maximum number of types shown; the rarer ones are combined."""
+"""Maximum number of types that are shown; the others are combined."""
 OTHER, UNLISTED = "other types", "not in the table"
 SOC_EDGES = np.linspace(0.0, 1.0, 21)
 STD_EDGES = np.array([0.0, 0.01, 0.02, 0.04, 0.06, 0.08, 0.12, 0.16, 0.20, 0.30, 0.40, 0.60, math.inf]) / 2.0
-"""Edges of the bins. The page shows two standard deviations."""
+"""Histogram edges of the standard deviation of SOC. The page shows twice these values."""
 
 ROW = np.dtype(
     [
         ("heard_s", "f8"),  # time of the newest state on the page's clock; -inf: never
-        ("soc", "f8"),  # 0..1; nan: not known, as in all
+        ("soc", "f8"),  # 0..1; NaN: unknown, as in the other columns
         ("soc_std", "f8"),
         ("margin", "f8"),  # stability_margin
-        ("suspects", "u2"),  # bits of Suspect, of its last hour
-        ("type", "u2"),  # place in the list of types
-        ("listed", "?"),  # in the fleet's table
+        ("suspects", "u2"),  # bits of InputFault in its last hour
+        ("type", "u2"),  # index into the list of types
+        ("listed", "?"),  # whether it is in the table of packs
     ]
 )
 _NEW = np.array([(-math.inf, math.nan, math.nan, math.nan, 0, 0, False)], dtype=ROW)
 FIELDS = {"soc": "soc", "soc_std": "soc_std", "margin": "stability_margin"}
-"""Fields of a state by the columns of a row."""
+"""Field of a state by column of a row."""
 
 Rows = NDArray[np.void]
 Mask = NDArray[np.bool_]
@@ -50,7 +50,7 @@ class Concern(NamedTuple):
     column: str
     """Column of the ranking."""
     falls: bool
-    """The smallest first."""
+    """True if the smallest values are the worst."""
     limit: float
     """Limit beyond which a pack is counted."""
 
@@ -67,7 +67,7 @@ class FleetPacks:
     """State of all packs; times are on one monotonic clock [s]."""
 
     def __init__(self) -> None:
-        self._places: dict[str, int] = {}
+        self._indexes: dict[str, int] = {}
         self._names: list[str] = []
         self._sorted: list[str] = []
         self._rows = np.repeat(_NEW, 1024)
@@ -75,7 +75,7 @@ class FleetPacks:
         self._parameters: dict[str, bytes] = {}
         self._types: dict[str, int] = {UNLISTED: 0}
         self.states, self.damaged = 0, 0
-        """Received so far; those that were no JSON object."""
+        """Number of received states; number of those that are not a JSON object."""
 
     def list_pack(self, name: str, kind: str | None) -> None:
         """Set the type of a pack in the fleet's table, such as ``lfp 16s2p``; None removes it."""
@@ -84,7 +84,7 @@ class FleetPacks:
         row["type"] = self._types.setdefault(kind or UNLISTED, min(len(self._types), 65_535))
 
     def receive_state(self, name: str, state: bytes, now_s: float) -> None:
-        """Take what a pack has published."""
+        """Store a pack's newest state."""
         self.states += 1
         values = _object(state)
         if values is None:
@@ -94,95 +94,94 @@ class FleetPacks:
         row["heard_s"] = now_s
         for column, field in FIELDS.items():
             row[column] = _number(values.get(field))
-        self._states[self._places[name]] = state
+        self._states[self._indexes[name]] = state
 
     def receive_parameters(self, name: str, parameters: bytes) -> None:
-        """Take what a pack has published; it is stored compressed, since it has some kilobytes."""
+        """Store a pack's newest parameters, compressed because they have some kilobytes."""
         self._row(name)
         self._parameters[name] = zlib.compress(parameters, 1)
 
     def receive_hour(self, name: str, hour: bytes) -> None:
-        """Take the summary of a pack's hour."""
+        """Store the input faults of the summary of a pack's hour."""
         values = _object(hour)
         suspects = values.get("suspects") if values else None
         if isinstance(suspects, int) and 0 <= suspects < 65_536:
             self._row(name)["suspects"] = suspects
 
     def find(self, prefix: str) -> list[str]:
-        """Return the first names with this prefix, in order."""
+        """Return the first ``MAX_LISTED`` names with this prefix, sorted."""
         if len(self._sorted) != len(self._names):
             self._sorted = sorted(self._names)
         first = bisect.bisect_left(self._sorted, prefix)
-        return [name for name in self._sorted[first : first + LISTED] if name.startswith(prefix)]
+        return [name for name in self._sorted[first : first + MAX_LISTED] if name.startswith(prefix)]
 
     def one(self, name: str, now_s: float) -> dict[str, Any] | None:
-        """All that is known of a pack; None: it is not known."""
-        place = self._places.get(name)
-        if place is None:
+        """Return the details of a pack; None if it is unknown."""
+        index = self._indexes.get(name)
+        if index is None:
             return None
-        row, packed = self._rows[place], self._parameters.get(name)
+        row, packed = self._rows[index], self._parameters.get(name)
         return {
             "pack": name,
             "type": list(self._types)[row["type"]],
-            "heard_s": _ago(float(row["heard_s"]), now_s),
+            "heard_s": _age_s(float(row["heard_s"]), now_s),
             "suspects": InputFault(int(row["suspects"])).text,
-            "state": _object(self._states[place]),
+            "state": _object(self._states[index]),
             "parameters": _object(zlib.decompress(packed)) if packed else None,
         }
 
-    def picture(self, now_s: float, since_s: float) -> dict[str, Any]:
+    def overview(self, now_s: float, since_s: float) -> dict[str, Any]:
         """Return an overview of the fleet.
 
         Args:
-            now_s: The clock.
-            since_s: Time since which states are received without a break; a pack that was last seen before may not be
-                silent.
+            now_s: Present time.
+            since_s: Start of uninterrupted reception. Packs count as silent only ``ALIVE_S`` after it.
 
         Returns:
-            ``packs`` (counts), ``types`` (of each: how many, and how they are spread), ``soc_std_edges`` (of bins, the last is
-            open), ``concerns`` (of each kind: how many
-            packs, and those that are worst), ``attention`` (how many packs are in any).
+            ``packs`` (counts), ``types`` (number and distribution of each), ``soc_std_edges`` (histogram edges; the last bin
+            is open), ``concerns`` (of each kind the number of packs and the worst ones), ``attention`` (number of packs with
+            any concern).
         """
         rows = self._rows[: len(self._names)]
         alive = rows["heard_s"] > now_s - ALIVE_S
-        known = rows["listed"] | (rows["heard_s"] > -math.inf)
-        silent = known & ~alive & (now_s - since_s > ALIVE_S)
+        counted = rows["listed"] | (rows["heard_s"] > -math.inf)
+        silent = counted & ~alive & (now_s - since_s > ALIVE_S)
         return {
             "packs": {
-                "known": int(known.sum()),
+                "known": int(counted.sum()),
                 "alive": int(alive.sum()),
                 "silent": int(silent.sum()),
-                "unlisted": int((known & ~rows["listed"]).sum()),
+                "unlisted": int((counted & ~rows["listed"]).sum()),
             },
-            "types": self._spreads(rows, known, alive),
+            "types": self._types_overview(rows, counted, alive),
             "soc_std_edges": STD_EDGES[:-1].tolist(),
             **self._concerns(rows, alive, silent, now_s),
         }
 
     def _row(self, name: str) -> Any:
-        """Return the row of a pack, created at its first message."""
-        place = self._places.get(name)
-        if place is None:
-            place = self._places[name] = len(self._names)
-            if place == self._rows.size:
-                self._rows = np.concatenate((self._rows, np.repeat(_NEW, place)))
+        """Return the row of a pack; create it if it is missing."""
+        index = self._indexes.get(name)
+        if index is None:
+            index = self._indexes[name] = len(self._names)
+            if index == self._rows.size:
+                self._rows = np.concatenate((self._rows, np.repeat(_NEW, index)))
             self._names.append(name)
             self._states.append(b"")
-        return self._rows[place]
+        return self._rows[index]
 
-    def _spreads(self, rows: Rows, known: Mask, alive: Mask) -> list[dict[str, Any]]:
-        counts = np.bincount(rows["type"][known], minlength=len(self._types))
+    def _types_overview(self, rows: Rows, counted: Mask, alive: Mask) -> list[dict[str, Any]]:
+        counts = np.bincount(rows["type"][counted], minlength=len(self._types))
         names = list(self._types)
-        found = sorted((-int(counts[place]), names[place], int(place)) for place in np.flatnonzero(counts))
-        often = [place for _, _, place in found[:MAX_TYPES]]
-        masks: list[tuple[str, Mask]] = [(names[place], known & (rows["type"] == place)) for place in often]
-        rest = known & ~np.isin(rows["type"], often)
+        found = sorted((-int(counts[index]), names[index], int(index)) for index in np.flatnonzero(counts))
+        shown = [index for _, _, index in found[:MAX_TYPES]]
+        masks: list[tuple[str, Mask]] = [(names[index], counted & (rows["type"] == index)) for index in shown]
+        rest = counted & ~np.isin(rows["type"], shown)
         if rest.any():
             masks.append((OTHER, rest))
-        return [{"type": name, "packs": int(mask.sum()), **_spread(rows[mask & alive])} for name, mask in masks]
+        return [{"type": name, "packs": int(mask.sum()), **_distribution(rows[mask & alive])} for name, mask in masks]
 
     def _concerns(self, rows: Rows, alive: Mask, silent: Mask, now_s: float) -> dict[str, Any]:
-        """Each kind, and how many packs there are in any."""
+        """Return number and worst packs of each concern, and the number of packs with any."""
         found, attention = {}, silent | (rows["suspects"] > 0)
         for name, concern in CONCERNS.items():
             sign = 1.0 if concern.falls else -1.0
@@ -194,33 +193,33 @@ class FleetPacks:
         suspected = _extremes(-np.bitwise_count(rows["suspects"]).astype("f8"), rows["suspects"] > 0)
         found["suspects"] = {
             "count": int(np.count_nonzero(rows["suspects"])),
-            "packs": [[self._names[i], _named(int(rows["suspects"][i]))] for i, _ in suspected],
+            "packs": [[self._names[i], _fault_names(int(rows["suspects"][i]))] for i, _ in suspected],
         }
         found["silent"] = {
             "count": int(silent.sum()),
-            "packs": [[self._names[i], _ago(heard, now_s)] for i, heard in _extremes(rows["heard_s"], silent)],
+            "packs": [[self._names[i], _age_s(heard, now_s)] for i, heard in _extremes(rows["heard_s"], silent)],
         }
         return {"concerns": found, "attention": int(attention.sum())}
 
 
-def _named(suspects: int) -> str:
-    """Describe each in a word or two."""
+def _fault_names(suspects: int) -> str:
+    """Return the names of the input faults in a bit mask."""
     return ", ".join((suspect.name or "").replace("_", " ").lower() for suspect in InputFault(suspects))
 
 
 def _extremes(column: NDArray[np.float64], mask: Mask) -> list[tuple[int, float]]:
-    """Places and values of the smallest where ``mask`` is, in order."""
-    places = np.flatnonzero(mask)
-    values = column[places]
-    if places.size > LISTED:
-        few = np.argpartition(values, LISTED)[:LISTED]
-        places, values = places[few], values[few]
+    """Return indexes and values of the ``MAX_LISTED`` smallest values where ``mask`` is true, ascending."""
+    indexes = np.flatnonzero(mask)
+    values = column[indexes]
+    if indexes.size > MAX_LISTED:
+        few = np.argpartition(values, MAX_LISTED)[:MAX_LISTED]
+        indexes, values = indexes[few], values[few]
     order = np.argsort(values, kind="stable")
-    return [(int(places[i]), float(values[i])) for i in order]
+    return [(int(indexes[i]), float(values[i])) for i in order]
 
 
-def _spread(rows: Rows) -> dict[str, Any]:
-    """Return the spread over live packs."""
+def _distribution(rows: Rows) -> dict[str, Any]:
+    """Return counts, histograms and medians of some packs."""
     return {
         "alive": int(rows.size),
         "soc": _histogram(rows["soc"], SOC_EDGES),
@@ -242,8 +241,8 @@ def _median(values: NDArray[np.float64]) -> float | None:
     return float(np.median(values)) if values.size else None
 
 
-def _ago(heard_s: float, now_s: float) -> float | None:
-    return now_s - heard_s if heard_s > -math.inf else None
+def _age_s(last_state_s: float, now_s: float) -> float | None:
+    return now_s - last_state_s if last_state_s > -math.inf else None
 
 
 def _number(value: Any) -> float:

@@ -1,4 +1,4 @@
-"""Collector of the stream ``HOURS`` into Parquet: a row is acknowledged when its file is on disk, and redelivered until then."""
+"""Collector that writes the stream ``HOURS`` to Parquet. A row is acknowledged once its file is on disk, and redelivered until then."""
 
 import asyncio
 import contextlib
@@ -25,17 +25,17 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 
 DURABLE = "collector"
-"""Name of the consumer, so that a collector continues where the last one ended."""
+"""Name of the durable consumer, with which a collector continues where the previous one ended."""
 PERIOD_S = 300.0
 """Maximum time that a row waits for its file [s]; more files of a day slow down queries."""
 MAX_ROWS = 10_000
 """Maximum number of rows of a file; they wait in memory, 5 kB each."""
-AT_ONCE = 1000
-"""Rows that are fetched at a time."""
+FETCH_ROWS = 1000
+"""Maximum number of rows in one request."""
 FETCH_S = 0.5
-"""Poll interval without rows [s]."""
+"""Timeout of a request when no row is waiting [s]."""
 COMPACT_S = 600.0
-"""Interval between two searches for days whose files should be merged [s]."""
+"""Interval between two merges of the files of a day [s]."""
 RETRY_S = 10.0
 """Retry interval after an error of disk or server [s]."""
 
@@ -43,16 +43,16 @@ log = structlog.get_logger(__name__)
 
 
 class Collector:
-    """Collects until it is stopped.
+    """Collector of hourly rows.
 
     Args:
-        nc: Connected as the tenant; it reconnects by itself.
-        folder: Folder of the days.
+        nc: Connection of the tenant, which reconnects.
+        folder: Folder of the Parquet files.
         period_s: Maximum time that a row waits for its file [s].
         clock: Wall and monotonic clock.
 
     Attributes:
-        counters: ``rows`` written, ``files``, ``unreadable`` messages, ``faults`` of server and disk.
+        counters: Numbers of written ``rows`` and ``files``, of ``unreadable`` messages, and of ``faults`` of server or disk.
     """
 
     def __init__(self, nc: Client, folder: Path, *, period_s: float = PERIOD_S, clock: Clock | None = None) -> None:
@@ -63,7 +63,7 @@ class Collector:
         self.counters = Counter[str]()
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Collect until ``stop`` is set; what waits then is written.
+        """Collect until ``stop`` is set; then write the waiting rows.
 
         Raises:
             UserError: The server has no such stream, or has closed the connection permanently.
@@ -81,9 +81,7 @@ class Collector:
 
     async def _subscribe(self) -> JetStreamContext.PullSubscription:
         js = self._nc.jetstream()
-        wait_s = (
-            2.0 * self._period_s + 60.0
-        )  # longer than any row waits here, so that none is delivered twice in normal operation
+        wait_s = 2.0 * self._period_s + 60.0  # longer than a row waits here; otherwise the server would redeliver it
         config = ConsumerConfig(
             durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=wait_s, max_ack_pending=3 * MAX_ROWS
         )
@@ -92,21 +90,21 @@ class Collector:
             return await js.pull_subscribe_bind(DURABLE, HOURS_STREAM)
         except NotFoundError:
             raise UserError(
-                f"the server has no stream {HOURS_STREAM}: `bms-estimator fleet serve` makes it when it starts"
+                f"the server has no stream {HOURS_STREAM}: `bms-estimator fleet serve` creates it when it starts"
             ) from None
 
     async def _fetch(self, stop: asyncio.Event) -> Sequence[Msg]:
-        """Fetch up to ``AT_ONCE`` messages; none while the server is away."""
+        """Fetch up to ``FETCH_ROWS`` messages; none without a connection."""
         try:
             self._subscription = self._subscription or await self._subscribe()
-            return await self._subscription.fetch(AT_ONCE, timeout=FETCH_S)
+            return await self._subscription.fetch(FETCH_ROWS, timeout=FETCH_S)
         except (nats.errors.TimeoutError, TimeoutError):
             return ()
         except nats.errors.Error as error:
             self._subscription = None
             if self._nc.is_closed:
-                raise UserError("the server has closed the connection: look at --creds") from None
-            await self._failed("the server gives no rows", error, stop)
+                raise UserError("the server has closed the connection: check --creds") from None
+            await self._failed("rows cannot be fetched from the server", error, stop)
             return ()
 
     async def _take(self, messages: Sequence[Msg]) -> None:
@@ -121,21 +119,21 @@ class Collector:
                 self._waiting.append((message, row))
 
     async def _unreadable(self, message: Msg, error: ValidationError) -> None:
-        """Report a message that cannot be decoded. It is not fetched again; the stream keeps it like any other."""
+        """Log a message that cannot be decoded, and end its delivery; it stays in the stream."""
         self.counters["unreadable"] += 1
-        fault = error.errors()[0]
-        reason = f"{'.'.join(map(str, fault['loc'])) or 'all of it'}: {fault['msg']}"
-        log.warning("this is no hour of a pack", subject=message.subject, reason=reason)
-        with contextlib.suppress(nats.errors.Error):  # the row is delivered again
+        detail = error.errors()[0]
+        reason = f"{'.'.join(map(str, detail['loc'])) or 'message'}: {detail['msg']}"
+        log.warning("invalid row of an hour", subject=message.subject, reason=reason)
+        with contextlib.suppress(nats.errors.Error):  # the message is delivered again
             await message.term()
 
     async def _save(self, stop: asyncio.Event) -> None:
-        """Write what waits, and acknowledge it; rows that cannot be written arrive again."""
+        """Write the waiting rows and acknowledge them; rows that cannot be written are delivered again."""
         waiting, self._waiting = self._waiting, []
         try:
             files = await asyncio.to_thread(write, self._folder, [row for _, row in waiting])
         except OSError as error:
-            await self._failed("the rows cannot be written; they come again", error, stop)
+            await self._failed("rows cannot be written; the server delivers them again", error, stop)
             return
         self.counters["rows"] += len(waiting)
         self.counters["files"] += len(files)
@@ -144,35 +142,36 @@ class Collector:
                 await message.ack()
             await self._nc.flush()
         except (nats.errors.Error, TimeoutError) as error:  # the rows are delivered again; queries drop duplicates
-            await self._failed("what is written could not be acknowledged", error, stop)
+            await self._failed("written rows could not be acknowledged", error, stop)
 
-    async def _failed(self, what: str, error: Exception, stop: asyncio.Event) -> None:
+    async def _failed(self, event: str, error: Exception, stop: asyncio.Event) -> None:
+        """Count and log an error, and wait before the next attempt."""
         self.counters["faults"] += 1
-        log.warning(what, reason=str(error) or type(error).__name__, again_in_s=RETRY_S)
+        log.warning(event, reason=str(error) or type(error).__name__, again_in_s=RETRY_S)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(stop.wait(), RETRY_S)
 
 
 def compact_days(folder: Path, now_s: float) -> None:
-    """Make one file of the many of days that need it; disk errors are logged, and retried later.
+    """Merge the files of each day that needs it. Disk errors are logged and retried later.
 
     Args:
-        folder: Folder of the days.
+        folder: Folder of the Parquet files.
         now_s: Wall clock [s since 1970].
     """
     for day in to_compact(folder, now_s):
         try:
             compact(day)
         except (OSError, duckdb.Error) as error:
-            log.warning("the files of a day stay many", day=str(day), reason=str(error))
+            log.warning("the files of a day cannot be merged", day=str(day), reason=str(error))
 
 
 @contextlib.contextmanager
 def only_collector(folder: Path) -> Iterator[None]:
-    """Write to ``folder`` alone, without what one that was killed has left unfinished.
+    """Lock the folder against other collectors, and remove unfinished files of a killed one.
 
     Raises:
-        UserError: Another process does, or it cannot be written.
+        UserError: Another collector writes there, or the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
-"""Questions to the hours of all packs: SQL on Parquet files, by DuckDB. Reads while a collector writes.
+"""Queries on the hours of all packs: SQL on Parquet files by DuckDB, also while a collector writes.
 
-What each means, how it is computed and where it misleads: docs/fleet/questions.md.
+Meaning, method and limits of each query are in docs/fleet/questions.md.
 """
 
 import contextlib
@@ -17,34 +17,35 @@ from typing import Any, NamedTuple
 import duckdb
 
 from bms_estimator.fleet.hour_row import HOUR_S
-from bms_estimator.fleet.queries.parquet_files import DAY, FOLDER, SCHEMA, day_folder, is_whole
+from bms_estimator.fleet.queries.parquet_files import DAY, FOLDER, SCHEMA, day_folder, is_complete
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
 
 SQL = resources.files("bms_estimator.fleet.queries") / "sql"
 AGED_SOC, CHARGE_ERROR = 1000.0, 0.002
-"""Assumptions of the filter between two estimates, as in ``kernels.kalman_filter.records.Noise``."""
-READING = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
+"""Process noise of the filter: charge after which the capacity is forgotten [capacities], and standard deviation of the counted
+charge [sqrt(capacities)]. As in ``kernels.kalman_filter.records.Noise``."""
+READ_ONLY_STATEMENTS = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 BY_CHANCE = 0.1
-"""Expected number of packs of a whole fleet that are reported by chance, for each quantity."""
+"""Expected number of packs of the fleet that are reported by chance, for each quantity."""
 MIN_STDS = 3.0
-"""Minimum deviation of a reported pack in std, for any size of fleet."""
+"""Minimum deviation of a reported pack [standard deviations], also in a small fleet."""
 
 
 class Query(NamedTuple):
-    """Query with a name."""
+    """Named query."""
 
     needs: tuple[str, ...]
-    """Tables to be made before, files of SQL."""
+    """SQL files of the tables that the query uses."""
     help: str
 
 
 QUESTIONS = {
-    "soh": Query(("days", "packs", "fits"), "capacity by the year with its band, of each type and pack"),
-    "outliers": Query(("days", "packs"), "packs whose capacity or R_s is not as that of their type"),
-    "failing": Query(("days", "packs", "fits"), "packs that reach a limit soon, or that are suspected of late"),
-    "honest": Query(("days", "packs"), "how often the SOC was within 2 std, judged in hindsight"),
-    "silent": Query(("days", "packs"), "packs that stopped"),
+    "soh": Query(("days", "packs", "fits"), "capacity trend a year with its band, of each type and pack"),
+    "outliers": Query(("days", "packs"), "packs whose capacity or R_s deviates from their type"),
+    "failing": Query(("days", "packs", "fits"), "packs that will soon reach a limit, or have recent input faults"),
+    "honest": Query(("days", "packs"), "how often the SOC was within 2 std, compared with later estimates"),
+    "silent": Query(("days", "packs"), "packs without recent hours"),
 }
 
 
@@ -53,29 +54,29 @@ class Limits:
     """Parameters of the queries."""
 
     within_days: float = 90.0
-    """failing: a limit is reached so soon."""
+    """Query failing: maximum time until a limit is reached [days]."""
     capacity_limit: float = 0.8
-    """failing: of the declared capacity."""
+    """Query failing: lower limit of the capacity, as a fraction of the rated one."""
     r_s_limit: float = 2.0
-    """failing: times that of the cell file."""
+    """Query failing: upper limit of R_s, as a multiple of the cell file's."""
     r_s_fresh_s: float = 86_400.0
-    """Maximum age of the data behind a used R_s [s]."""
+    """Maximum time since R_s was last identified [s]; older values are not used."""
     least_days: int = 7
     """Queries soh, failing: minimum number of days in a trend."""
     least_packs: int = 5
-    """Query outliers: minimum number of certain packs that define the reference of their type."""
+    """Query outliers: minimum number of packs with a certain value that define the reference of their type."""
     least_spread: float = 0.01
     """Query outliers: minimum relative std between packs of a type."""
     recent_days: int = 3
-    """Query failing: number of last days, most of which must have a new suspicion."""
+    """Query failing: number of last days, most of which must have a new input fault."""
     silent_hours: int = 2
-    """silent: no summary for longer; a living pack's newest is of the hour before."""
+    """Query silent: maximum age of the last summary [h]. The newest one of a live pack is of the previous hour."""
     most_packs: int = 10_000
     """Query honest: maximum number of packs, chosen by a hash of their name."""
     least_seen_s: float = 3590.0
     """Query honest: minimum measured part of each hour in between [s]."""
     surer: float = 0.5
-    """honest: a later estimate judges where its variance is below this part."""
+    """Query honest: a later estimate is the reference only if its variance is below this fraction."""
 
 
 LIMITS = Limits()
@@ -83,57 +84,57 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class Answer:
-    """Result table; numbers are plain, unknown values are None."""
+    """Result table; unknown values are None."""
 
     columns: tuple[str, ...]
     rows: list[tuple[Any, ...]]
 
     @property
     def records(self) -> list[dict[str, Any]]:
-        """Row by row, by column."""
+        """Rows as dictionaries by column."""
         return [dict(zip(self.columns, row, strict=True)) for row in self.rows]
 
 
 def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limits = LIMITS) -> Answer:
-    """Answer one of ``QUESTIONS``.
+    """Run one of ``QUESTIONS``.
 
     Args:
-        folder: Folder of the days, as ``fleet collect`` writes it.
-        name: Name of the question.
-        days: Number of last days with rows, whole days UTC; None: all.
-        limits: Assumed limits.
+        folder: Folder of the Parquet files, written by ``fleet collect``.
+        name: Name of the query.
+        days: Number of last days (UTC) that are used; None: all.
+        limits: Parameters of the query.
 
     Raises:
-        UserError: There is no such question, folder or row; a file is damaged.
+        UserError: The query, the folder or its rows do not exist, or a file is damaged.
     """
     if name not in QUESTIONS:
-        raise UserError(f"{name}: no such question; there are {', '.join(QUESTIONS)}, and sql 'SELECT ...'")
-    with opened(folder, days) as base:
-        (now_hour,) = base.execute("SELECT max(hour) FROM hours").fetchone() or (None,)
+        raise UserError(f"{name}: no such query; there are {', '.join(QUESTIONS)}, and sql 'SELECT ...'")
+    with opened(folder, days) as database:
+        (now_hour,) = database.execute("SELECT max(hour) FROM hours").fetchone() or (None,)
         if now_hour is None:
             raise UserError(f"--folder {folder}: its files hold no rows yet")
-        given = vars(limits) | _given(int(now_hour))
+        parameters = vars(limits) | _parameters(int(now_hour))
         for table in QUESTIONS[name].needs:
-            _run(base, _sql(table), given)
+            _run(database, _sql(table), parameters)
             if table == "packs":
-                given["stds"] = _stds(base)
-        return _answer(_run(base, _sql(name), given))
+                parameters["stds"] = _stds(database)
+        return _answer(_run(database, _sql(name), parameters))
 
 
 def select(folder: Path, query: str, *, days: int | None = None) -> Answer:
-    """Answer a query of SQL on the view ``hours``; it changes nothing and reads no other file.
+    """Run an SQL query on the view ``hours``, without write access and without access to other files.
 
     Raises:
-        UserError: There is no such folder or row; a file is damaged; the query is wrong.
+        UserError: The folder or its rows do not exist, a file is damaged, or the query is invalid.
     """
-    with opened(folder, days) as base:
-        base.execute("SET allowed_directories = $folders", {"folders": [str(folder)]})
-        base.execute("SET enable_external_access = false")
-        base.execute("SET lock_configuration = true")
+    with opened(folder, days) as database:
+        database.execute("SET allowed_directories = $folders", {"folders": [str(folder)]})
+        database.execute("SET enable_external_access = false")
+        database.execute("SET lock_configuration = true")
         try:
-            if any(each.type not in READING for each in base.extract_statements(query)):
-                raise UserError("sql: only SELECT and DESCRIBE are answered")
-            return _answer(base.execute(query))
+            if any(each.type not in READ_ONLY_STATEMENTS for each in database.extract_statements(query)):
+                raise UserError("sql: only SELECT and DESCRIBE are allowed")
+            return _answer(database.execute(query))
         except duckdb.Error as error:
             raise UserError(f"sql: {error}") from error
 
@@ -143,67 +144,70 @@ def opened(folder: Path, days: int | None = None) -> Iterator[duckdb.DuckDBPyCon
     """Open a database with the view ``hours``: one row for each hour of each pack.
 
     Raises:
-        UserError: There is no such folder, no file in it, or one that is damaged.
+        UserError: The folder does not exist, is empty, or has a damaged file.
     """
     files = _files(folder, days)
-    with duckdb.connect() as base, _damage(folder):
-        base.execute("SET TimeZone = 'UTC'")
-        _view(base, files)
-        yield base
+    with duckdb.connect() as database, _user_errors(folder):
+        database.execute("SET TimeZone = 'UTC'")
+        _view(database, files)
+        yield database
 
 
 @contextlib.contextmanager
-def _damage(folder: Path) -> Iterator[None]:
+def _user_errors(folder: Path) -> Iterator[None]:
+    """Raise errors of damaged or replaced files as ``UserError``."""
     try:
         yield
     except (duckdb.InvalidInputException, duckdb.IOException) as error:
-        raise UserError(f"--folder {folder}: a file cannot be read; ask again, or move it away: {error}") from error
+        raise UserError(
+            f"--folder {folder}: a file cannot be read; repeat the query, or move the file away: {error}"
+        ) from error
 
 
 def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
-    """Return the files by day folder; ``days``: of the last days only.
+    """Return the files by day folder, all or those of the last ``days``.
 
     Raises:
-        UserError: There are none, or one is incomplete.
+        UserError: There is no file, or one is incomplete.
     """
     if not folder.is_dir():
         raise UserError(f"--folder {folder}: no such folder; `bms-estimator fleet collect --folder {folder}` fills it")
-    found = {day: sorted(day.glob("*.parquet")) for day in sorted(folder.glob(f"{FOLDER}*"))}
-    found = {day: files for day, files in found.items() if files}
-    if days is not None and found:
-        last = datetime.fromisoformat(max(found).name.removeprefix(FOLDER)).replace(tzinfo=UTC)
+    by_day = {day: sorted(day.glob("*.parquet")) for day in sorted(folder.glob(f"{FOLDER}*"))}
+    by_day = {day: files for day, files in by_day.items() if files}
+    if days is not None and by_day:
+        last = datetime.fromisoformat(max(by_day).name.removeprefix(FOLDER)).replace(tzinfo=UTC)
         first = day_folder(folder, datetime.fromtimestamp(last.timestamp() - (days - 1) * 24 * HOUR_S, UTC).date())
-        found = {day: files for day, files in found.items() if day >= first}
-    if not found:
-        raise UserError(f"--folder {folder}: no hours of packs in it yet: a pack's first comes when its next begins")
-    for file in (file for files in found.values() for file in files):
-        if file.exists() and not is_whole(file):
-            raise UserError(f"{file}: not a whole Parquet file; move it away: what it held comes from nowhere else")
-    return found
+        by_day = {day: files for day, files in by_day.items() if day >= first}
+    if not by_day:
+        raise UserError(f"--folder {folder}: no hours yet: the first one of a pack is written when its next one begins")
+    for file in (file for files in by_day.values() for file in files):
+        if file.exists() and not is_complete(file):
+            raise UserError(f"{file}: an incomplete Parquet file; move it away: its rows are lost")
+    return by_day
 
 
-def _view(base: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
-    """Create the view ``hours``. A merged file has no duplicate rows, so that most files need no deduplication.
+def _view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
+    """Create the view ``hours``. The only, merged file of a day has no duplicate rows and needs no deduplication.
 
     Raises:
-        UserError: The files hold something else.
+        UserError: The files have other columns.
     """
-    once, maybe_twice = list[str](), list[str]()
-    for of_day in files.values():
-        alone = len(of_day) == 1 and of_day[0].name.startswith(DAY)
-        (once if alone else maybe_twice).extend(str(file) for file in of_day)
-    base.register("all_columns", SCHEMA.empty_table())  # files of other versions may lack some
-    for name, paths in (("once", once), ("maybe_twice", maybe_twice)):
-        read = base.read_parquet(paths, union_by_name=True, hive_partitioning=False) if paths else None
+    unique, with_duplicates = list[str](), list[str]()
+    for day_files in files.values():
+        is_merged = len(day_files) == 1 and day_files[0].name.startswith(DAY)
+        (unique if is_merged else with_duplicates).extend(str(file) for file in day_files)
+    database.register("all_columns", SCHEMA.empty_table())  # files of other versions may lack some columns
+    for name, paths in (("once", unique), ("maybe_twice", with_duplicates)):
+        read = database.read_parquet(paths, union_by_name=True, hive_partitioning=False) if paths else None
         if read is not None and not {"pack", "hour"} <= set(read.columns):
             raise UserError(
-                f"{Path(paths[0]).parent}: its files have no columns pack and hour: `fleet collect` wrote them not"
+                f"{Path(paths[0]).parent}: its files lack the columns pack and hour: they are not from `fleet collect`"
             )
-        (base.table("all_columns") if read is None else read).create_view(name)
-    base.execute(_sql("hours"))
+        (database.table("all_columns") if read is None else read).create_view(name)
+    database.execute(_sql("hours"))
 
 
-def _given(now_hour: int) -> dict[str, Any]:
+def _parameters(now_hour: int) -> dict[str, Any]:
     return {
         "now_hour": now_hour,
         "today": now_hour // 24,
@@ -214,9 +218,9 @@ def _given(now_hour: int) -> dict[str, Any]:
     }
 
 
-def _stds(base: duckdb.DuckDBPyConnection) -> float:
-    """Return the deviation in std that hardly one of all packs exceeds by chance."""
-    (packs,) = base.execute("SELECT count(*) FROM packs").fetchone() or (0,)
+def _stds(database: duckdb.DuckDBPyConnection) -> float:
+    """Return the deviation [standard deviations] that ``BY_CHANCE`` packs of the fleet exceed by chance."""
+    (packs,) = database.execute("SELECT count(*) FROM packs").fetchone() or (0,)
     return max(NormalDist().inv_cdf(1.0 - 0.5 * BY_CHANCE / max(packs, 1)), MIN_STDS)
 
 
@@ -224,9 +228,9 @@ def _sql(name: str) -> str:
     return (SQL / f"{name}.sql").read_text(encoding="utf-8")
 
 
-def _run(base: duckdb.DuckDBPyConnection, query: str, given: Mapping[str, Any]) -> duckdb.DuckDBPyConnection:
-    """Run the query with those of ``given`` that it names."""
-    return base.execute(query, {name: given[name] for name in set(re.findall(r"\$(\w+)", query))})
+def _run(database: duckdb.DuckDBPyConnection, query: str, parameters: Mapping[str, Any]) -> duckdb.DuckDBPyConnection:
+    """Run a query with the parameters that it names."""
+    return database.execute(query, {name: parameters[name] for name in set(re.findall(r"\$(\w+)", query))})
 
 
 def _answer(result: duckdb.DuckDBPyConnection) -> Answer:

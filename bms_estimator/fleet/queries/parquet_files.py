@@ -1,7 +1,7 @@
-"""Hours of packs in Parquet files: ``date=YYYY-MM-DD/*.parquet``, written whole or not at all, and few.
+"""Hours of packs in Parquet files ``date=YYYY-MM-DD/*.parquet``, written atomically and merged by day.
 
-A file is written under a name that no question reads, brought to the disk, and renamed. A row may be in two of them;
-queries drop the duplicate. Needs pyarrow and duckdb.
+A file is written under a name that no query reads, synced to the disk, and renamed. A row may be in two files; queries drop the
+duplicate. Needs pyarrow and duckdb.
 """
 
 import os
@@ -19,20 +19,20 @@ from bms_estimator.fleet.hour_row import HOUR_S, Hour
 
 FOLDER = "date="
 BATCH, DAY, UNFINISHED = "batch-", "day-", ".part"
-"""Prefixes of single files and of merged ones, and the suffix of an unfinished file."""
-MANY = 48
-"""Number of files at which a day is merged before its end, or again."""
+"""Prefix of a single file, prefix of a merged file, suffix of an unfinished file."""
+MAX_FILES_PER_DAY = 48
+"""Number of files at which the files of a day are merged, even before its end or again."""
 ROW_GROUP = 100_000
-"""Rows that a question reads at least [rows]."""
+"""Size of a row group [rows], the smallest unit that a query reads."""
 CLOSED_S = 2 * HOUR_S
-"""Time after its end at which a day is closed [s]: most late blocks have arrived by then."""
+"""Time after the end of a day at which its files are merged [s]: most late blocks have arrived by then."""
 MEMORY = "500MB"
-"""A day of 100,000 packs has more bytes; DuckDB sorts it in parts."""
+"""Memory limit of a merge. A day of 100,000 packs is larger; DuckDB then sorts it in parts on the disk."""
 _MAGIC = b"PAR1"
 
 
 def _column(annotation: object) -> pa.DataType:
-    """Seven digits are more than any of the values has; files are half as large."""
+    """Return the column type. Single precision is better than the accuracy of any value, and halves the files."""
     return pa.string() if annotation is str else pa.int32() if annotation is int else pa.float32()
 
 
@@ -40,23 +40,23 @@ SCHEMA = pa.schema([(name, _column(field.annotation)) for name, field in Hour.mo
 
 
 def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
-    """Rows into a new file for each of their days; they are on the disk when this returns.
+    """Write rows to a new file for each of their days, and sync the files to the disk.
 
     Args:
-        folder: Folder of the days; created if missing.
-        rows: In any order.
+        folder: Folder of the Parquet files; created if missing.
+        rows: Rows in any order.
 
     Returns:
-        The files.
+        The new files.
 
     Raises:
-        OSError: The disk takes them not; existing files are complete.
+        OSError: A file cannot be written; existing files remain complete.
     """
     return write_table(folder, pa.Table.from_pylist([row.model_dump() for row in rows], schema=SCHEMA))
 
 
 def write_table(folder: Path, table: pa.Table) -> list[Path]:
-    """Write columns of ``SCHEMA``, as ``write`` does."""
+    """Write a table with the columns of ``SCHEMA``; result and errors as of ``write``."""
     days = pc.divide(table["hour"], 24)
     return [_write_day(folder, int(day.as_py()), table.filter(pc.equal(days, day))) for day in pc.unique(days)]
 
@@ -67,12 +67,12 @@ def day_folder(folder: Path, day: date) -> Path:
 
 
 def _write_day(folder: Path, day: int, rows: pa.Table) -> Path:
-    """``day`` is in days since 1970."""
-    of_day = day_folder(folder, datetime.fromtimestamp(day * 24 * HOUR_S, UTC).date())
-    if not of_day.is_dir():
-        of_day.mkdir(parents=True, exist_ok=True)
+    """Write the rows of a day, given in days since 1970."""
+    path_of_day = day_folder(folder, datetime.fromtimestamp(day * 24 * HOUR_S, UTC).date())
+    if not path_of_day.is_dir():
+        path_of_day.mkdir(parents=True, exist_ok=True)
         _sync(folder)
-    path = of_day / f"{BATCH}{uuid.uuid4().hex}.parquet"
+    path = path_of_day / f"{BATCH}{uuid.uuid4().hex}.parquet"
     unfinished = path.with_name(f".{path.name}{UNFINISHED}")
     pq.write_table(rows, unfinished, compression="zstd")
     _finish(unfinished, path)
@@ -80,7 +80,7 @@ def _write_day(folder: Path, day: int, rows: pa.Table) -> Path:
 
 
 def _finish(unfinished: Path, path: Path) -> None:
-    """Bring a file to the disk, then give it its name, which is there, too, after a power cut."""
+    """Sync an unfinished file, rename it, and sync the folder, so that the new name survives a power cut."""
     _sync(unfinished)
     unfinished.rename(path)
     _sync(path.parent)
@@ -95,34 +95,34 @@ def _sync(path: Path) -> None:
 
 
 def to_compact(folder: Path, now_s: float) -> list[Path]:
-    """Folders of days whose files should be merged: closed for the first time, or with ``MANY`` files.
+    """Return the folders of days whose files should be merged: days that have ended, and days with ``MAX_FILES_PER_DAY`` files.
 
     Args:
-        folder: Folder of the days.
+        folder: Folder of the Parquet files.
         now_s: Wall clock [s since 1970].
     """
-    closed = datetime.fromtimestamp(now_s - CLOSED_S, UTC).date().isoformat()
-    found = []
+    ended_before = datetime.fromtimestamp(now_s - CLOSED_S, UTC).date().isoformat()
+    days = []
     for day in sorted(folder.glob(f"{FOLDER}*")):
-        files = sound_files(day)
-        first_time = day.name.removeprefix(FOLDER) < closed and not any(f.name.startswith(DAY) for f in files)
-        if len(files) >= MANY or (first_time and files):
-            found.append(day)
-    return found
+        files = complete_files(day)
+        is_unmerged = day.name.removeprefix(FOLDER) < ended_before and not any(f.name.startswith(DAY) for f in files)
+        if len(files) >= MAX_FILES_PER_DAY or (is_unmerged and files):
+            days.append(day)
+    return days
 
 
 def compact(day: Path) -> Path:
-    """One file, sorted by pack and hour, each once, in the place of all that are whole; unfinished files are removed.
+    """Merge the complete files of a day into one without duplicates, sorted by pack and hour. Return the new file.
 
-    Killed at any time it loses nothing: the old files go when the new one is on the disk.
+    The old files are removed once the new one is on the disk, so that no row is lost if the process is killed.
 
     Args:
         day: Folder of a day.
 
     Raises:
-        OSError: The disk takes it not.
+        OSError: The file cannot be written.
     """
-    files = sound_files(day)
+    files = complete_files(day)
     path = day / f"{DAY}{uuid.uuid4().hex}.parquet"
     unfinished = path.with_name(f".{path.name}{UNFINISHED}")
     names = [str(file) for file in files]
@@ -142,13 +142,13 @@ def remove_unfinished(folder: Path) -> None:
         file.unlink(missing_ok=True)
 
 
-def sound_files(day: Path) -> list[Path]:
-    """Return the complete files of a day by name."""
-    return [file for file in sorted(day.glob("*.parquet")) if is_whole(file)]
+def complete_files(day: Path) -> list[Path]:
+    """Return the complete files of a day, sorted by name."""
+    return [file for file in sorted(day.glob("*.parquet")) if is_complete(file)]
 
 
-def is_whole(file: Path) -> bool:
-    """Return True if a file has beginning and end of Parquet; False if it vanishes."""
+def is_complete(file: Path) -> bool:
+    """Return True if a file begins and ends like a Parquet file; False if it does not exist."""
     try:
         with file.open("rb") as opened:
             if opened.read(4) != _MAGIC:

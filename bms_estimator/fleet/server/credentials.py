@@ -1,15 +1,15 @@
-"""The folder of a fleet's keys: made where they are missing, each file for its owner alone.
+"""Folder of a fleet's keys and credentials. Missing files are created, readable by their owner only.
 
 ::
 
-    operator.nk              signs accounts; whoever has it may do all
+    operator.nk              private key that signs accounts; its holder controls all tenants
     claims.json              claims for the servers; public, equal on all nodes
-    TENANT/account.nk        is the account
-    TENANT/<role>.nk         signs users of that role, as ``claims.Role`` has them
-    TENANT/admin.creds ...   with which programs connect: admin, worker, reader TENANT/dashboard.token MQTT password
-    of readers of estimates
+    TENANT/account.nk        key of the account
+    TENANT/<role>.nk         key that signs users of a role (``jwt_claims.Role``)
+    TENANT/admin.creds       credentials of programs; likewise worker.creds and reader.creds
+    TENANT/dashboard.token   MQTT password of readers of estimates
 
-Private keys stay where they were made: other nodes need ``claims.json`` alone.
+Private keys need not be copied: other nodes need only ``claims.json``.
 """
 
 import json
@@ -25,9 +25,10 @@ from bms_estimator.process.private_file import UnsafeFileError, read_private, wr
 from bms_estimator.settings.fleet import TenantSettings
 
 CLAIMS = "claims.json"
-_MAX_KEY, _MAX_CLAIMS = 200, 64 << 20
-"""Bytes of a file."""
+_MAX_KEY_BYTES, _MAX_CLAIMS_BYTES = 200, 64 << 20
+"""Maximum size of a key file and of ``claims.json`` [bytes]."""
 GB = 1_000_000_000
+"""Gigabyte [bytes]."""
 
 
 def has_keys(folder: Path) -> bool:
@@ -36,12 +37,12 @@ def has_keys(folder: Path) -> bool:
 
 
 def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: datetime) -> Accounts:
-    """Claims of the operator and of all tenants, with what keys are missing for them made.
+    """Return the claims of the operator and all tenants; create missing keys and credentials.
 
     Args:
         folder: Folder of the keys; created if missing.
         tenants: Settings by tenant name.
-        now: When credentials that are made are made.
+        now: Issue time of new credentials.
 
     Raises:
         UserError: The folder cannot be read or written, or contains an invalid key.
@@ -52,48 +53,48 @@ def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: date
         tenant = _tenant(folder / name, name, settings)
         accounts[tenant.public] = jwt_claims.account(operator, tenant)
         _write_users(folder / name, tenant.public, now)
-    made = Accounts(jwt_claims.operator(operator, system.public), system.public, accounts)
-    _write(folder / CLAIMS, json.dumps(vars(made), indent=1).encode())
-    return made
+    claims = Accounts(jwt_claims.operator(operator, system.public), system.public, accounts)
+    _write(folder / CLAIMS, json.dumps(vars(claims), indent=1).encode())
+    return claims
 
 
 def read_accounts(folder: Path) -> Accounts:
-    """Claims that another machine has made.
+    """Read the claims that another machine has created.
 
     Raises:
-        UserError: They are missing or invalid.
+        UserError: The file is missing or invalid.
     """
     path = folder / CLAIMS
     try:
-        found = Accounts(**json.loads(_read(path, _MAX_CLAIMS)))
+        found = Accounts(**json.loads(_read(path, _MAX_CLAIMS_BYTES)))
     except (ValueError, TypeError):
-        raise UserError(f"{path}: no claims of a fleet: copy the file of the node that has the keys") from None
+        raise UserError(f"{path}: not a claims file of a fleet: copy it from the node that has the keys") from None
     return found
 
 
 def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: datetime | None = None) -> str:
-    """Make the token that an edge sends as MQTT password.
+    """Return a token that an edge sends as MQTT password.
 
     Args:
         folder: Folder of the keys.
         tenant: Tenant of the pack.
-        pack: The only one that it may write.
-        now: Revocation looks at it.
+        pack: Pack whose blocks the token allows to send.
+        now: Issue time; tokens issued before a configured time can be revoked.
         expires: Expiry time; None: never.
 
     Raises:
-        UserError: There are no keys of this tenant.
+        UserError: The tenant has no keys.
     """
     signer, account = folder / tenant / f"{Role.EDGE.value}.nk", folder / tenant / "account.nk"
     if not signer.exists() or not account.exists():
-        known = sorted(path.parent.name for path in folder.glob("*/account.nk"))
-        there = f"there are {', '.join(known)}" if known else "start `fleet serve` with it first"
-        raise UserError(f"{folder}: no keys of a tenant {tenant}: {there}")
+        tenants = sorted(path.parent.name for path in folder.glob("*/account.nk"))
+        hint = f"there are {', '.join(tenants)}" if tenants else "start `fleet serve` with it first"
+        raise UserError(f"{folder}: no keys of a tenant {tenant}: {hint}")
     return jwt_claims.user(_read_key(signer), _read_key(account).public, Role.EDGE, pack, now, expires)
 
 
 def credentials_file(folder: Path, tenant: str, role: Role) -> Path:
-    """Write the credentials file of a program; a token for a role that has one."""
+    """Return the path of a role's credentials file, or token file for a role that connects by MQTT."""
     return folder / tenant / f"{role.value}.{'token' if role in BEARERS else 'creds'}"
 
 
@@ -113,7 +114,7 @@ def _tenant(folder: Path, name: str, settings: TenantSettings) -> Tenant:
 
 
 def _write_users(folder: Path, account: str, now: datetime) -> None:
-    """Write the users' permissions into the account's claims, so that tokens need not be renewed."""
+    """Write the missing credentials and tokens of all roles except edges."""
     for role in Role:
         path = credentials_file(folder.parent, folder.name, role)
         if role is Role.EDGE or path.exists():
@@ -125,7 +126,7 @@ def _write_users(folder: Path, account: str, now: datetime) -> None:
 
 
 def _key(path: Path, kind: int) -> Key:
-    """Read the key of a file; make the file if it is missing."""
+    """Read a key file; create it if it is missing."""
     if not path.exists():
         _write(path, jwt_claims.new_key(kind).seed)
     return _read_key(path)
@@ -133,14 +134,14 @@ def _key(path: Path, kind: int) -> Key:
 
 def _read_key(path: Path) -> Key:
     try:
-        return jwt_claims.key_of(_read(path, _MAX_KEY).strip())
+        return jwt_claims.key_of(_read(path, _MAX_KEY_BYTES).strip())
     except ValueError:
         raise UserError(f"{path}: not a key; put the right file back") from None
 
 
-def _read(path: Path, longest: int) -> bytes:
+def _read(path: Path, max_bytes: int) -> bytes:
     try:
-        return read_private(path, longest)
+        return read_private(path, max_bytes)
     except UnsafeFileError as error:
         raise UserError(f"{path}: {error}") from None
     except OSError as error:

@@ -1,6 +1,6 @@
-"""Claims that a server checks by signature alone: an operator, its tenants' accounts, their users.
+"""Claims of an operator, its tenants' accounts and their users. A server checks them by their signatures.
 
-A claim is a JSON Web Token with the parts of https://github.com/nats-io/jwt, version 2, signed with an ed25519 key in
+A claim is a JSON Web Token with the fields of https://github.com/nats-io/jwt, version 2, signed with an ed25519 key in
 the encoding of https://github.com/nats-io/nkeys. The permissions of a role are in the account's claims, beside
 the public key that signs its users. A token contains only an identity, so the server needs no list of tokens.
 """
@@ -20,31 +20,31 @@ import nkeys
 from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES
 
 ACCOUNT, OPERATOR, USER = nkeys.PREFIX_BYTE_ACCOUNT, nkeys.PREFIX_BYTE_OPERATOR, nkeys.PREFIX_BYTE_USER
-"""Kinds of key."""
+"""Kinds of keys."""
 _VERSION = 2
-_NONE = -1
-"""Value of an absent limit."""
+_UNLIMITED = -1
+"""Value of a limit that means unlimited."""
 
 
 class Role(Enum):
     """Role of a tenant's user."""
 
     EDGE = "edge"
-    """Role of an edge: sends the blocks of one pack, and receives the confirmations."""
+    """Sends the blocks of one pack and receives the replies to it."""
     DASHBOARD = "dashboard"
     """Reads estimates over MQTT."""
     READER = "reader"
-    """Reads all that there is: the page, questions, captures."""
+    """Reads all data: fleet page, queries, captures."""
     WORKER = "worker"
-    """Estimates."""
+    """Processes blocks and publishes estimates."""
     ADMIN = "admin"
-    """Makes streams, sets packs."""
+    """Creates streams and writes the table of packs."""
 
 
 BEARERS = (Role.EDGE, Role.DASHBOARD)
-"""Roles that connect by MQTT, which has no signatures: the holder of the token is the user."""
+"""Roles with bearer tokens. They connect by MQTT, which has no challenge that a key could sign."""
 
-_READS = (
+_READER_PUBLISH = (
     "$JS.API.INFO",
     "$JS.API.STREAM.INFO.*",
     "$JS.API.STREAM.NAMES",
@@ -55,8 +55,8 @@ _READS = (
     "$JS.ACK.>",
     "$JS.FC.>",
 )
-_ESTIMATES = (
-    *_READS,
+_WORKER_PUBLISH = (
+    *_READER_PUBLISH,
     "$JS.API.STREAM.PURGE.OBJ_states",
     "$KV.checkpoints.>",
     "$O.states.>",
@@ -66,23 +66,23 @@ _ESTIMATES = (
     "fleet.>",
     "_INBOX.>",
 )
-_HEARS = ("_INBOX.>", "bms.>", "fleet.>")
+_SUBSCRIBE = ("_INBOX.>", "bms.>", "fleet.>")
 _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    # Publish, subscribe; {{name()}} is the user's name. Before 2.12.4 the server requires $MQTT.sub at QoS 1, to which no client can
-    # subscribe by that name. bms/# includes bms.
+    # Subjects to publish and to subscribe; {{name()}} is the user's name. Before 2.12.4 the server requires $MQTT.sub for
+    # QoS 1; no client can subscribe to it directly. The MQTT topic filter bms/# includes bms.
     Role.EDGE: (("raw.{{name()}}",), ("edge.{{name()}}.awaits", "$MQTT.sub.>")),
     Role.DASHBOARD: ((), ("bms", "bms.>", "fleet", "fleet.>", "$MQTT.sub.>")),
-    Role.READER: (_READS, _HEARS),
-    Role.WORKER: (_ESTIMATES, _HEARS),
+    Role.READER: (_READER_PUBLISH, _SUBSCRIBE),
+    Role.WORKER: (_WORKER_PUBLISH, _SUBSCRIBE),
     Role.ADMIN: ((">",), (">",)),
 }
 _LIMITS: dict[Role, dict[str, int]] = {
-    # An edge has one subscription, for which the server makes three. nats-server 2.15 does not compare an MQTT message with
-    # ``payload``; the stream RAW has the same limit and does.
+    # An edge has one subscription, for which the server creates three. nats-server 2.15 does not apply ``payload`` to MQTT
+    # messages; the equal limit of the stream RAW applies to them.
     Role.EDGE: {"subs": 8, "payload": MAX_BLOCK_BYTES}
 }
 _DENIED: dict[Role, tuple[str, ...]] = {
-    # a reader creates consumers of its own, and must not touch those of the partitions
+    # A reader may create consumers, but must not use those of the partitions.
     Role.READER: ("$JS.API.CONSUMER.DELETE.RAW.>", "$JS.API.CONSUMER.MSG.NEXT.RAW.>", "$JS.API.CONSUMER.UNPIN.>"),
     Role.WORKER: ("$JS.API.CONSUMER.DELETE.RAW.>",),
 }
@@ -93,14 +93,14 @@ class Key:
     """A key pair.
 
     Attributes:
-        seed: Private half, which is never shown.
+        seed: Private half; not part of ``repr``.
     """
 
     seed: bytes
 
     @property
     def public(self) -> str:
-        """The public half, by which the owner is known."""
+        """Public half, the identity of the owner."""
         return str(nkeys.from_seed(self.seed).public_key.decode())
 
     def sign(self, data: bytes) -> bytes:
@@ -112,7 +112,7 @@ class Key:
 
 
 def new_key(kind: int) -> Key:
-    """Make a key of kind ``ACCOUNT``, ``OPERATOR`` or ``USER``."""
+    """Create a key of kind ``ACCOUNT``, ``OPERATOR`` or ``USER``."""
     return Key(nkeys.encode_seed(os.urandom(32), kind))
 
 
@@ -124,8 +124,8 @@ def key_of(seed: bytes) -> Key:
     """
     try:
         nkeys.from_seed(seed)
-    except Exception:  # noqa: BLE001 - the library raises what comes, and what it says may hold the seed
-        raise ValueError("no key") from None
+    except Exception:  # noqa: BLE001 - nkeys raises various exceptions, whose texts may contain the seed
+        raise ValueError("not a key") from None
     return Key(seed)
 
 
@@ -136,25 +136,25 @@ def user_key(signer: Key, role: Role, name: str) -> Key:
 
 
 def operator(key: Key, system: str) -> str:
-    """Claims of the operator, which signs accounts.
+    """Return the claims of the operator, which signs accounts.
 
     Args:
         key: Key of the operator.
-        system: Public key of the account in which servers talk to each other.
+        system: Public key of the account in which servers communicate.
     """
     return _signed(key, key.public, "fleet", {"system_account": system, "type": "operator"})
 
 
 @dataclass(frozen=True)
 class Tenant:
-    """An account.
+    """Account of a tenant.
 
     Attributes:
-        name: For people.
-        public: The account's public key.
-        signers: Public keys that sign the users of a role.
-        disk_bytes: The most that its streams take, copies on other nodes counted; None: what there is.
-        revoked: Public key of a user -> its tokens that were made before [s since 1970] are refused.
+        name: Name shown by the server.
+        public: Public key of the account.
+        signers: Public key that signs the users of each role.
+        disk_bytes: Maximum size of its streams with all replicas [bytes]; None: unlimited.
+        revoked: Time by public key of a user [s since 1970]; tokens issued before it are rejected.
     """
 
     name: str
@@ -165,16 +165,16 @@ class Tenant:
 
 
 def account(operator_key: Key, tenant: Tenant) -> str:
-    """Claims of a tenant's account: the same for the same tenant, so that all nodes have the same."""
-    disk = _NONE if tenant.disk_bytes is None else tenant.disk_bytes
+    """Return the claims of a tenant's account. They depend only on the tenant, so that all nodes have equal claims."""
+    disk = _UNLIMITED if tenant.disk_bytes is None else tenant.disk_bytes
     claims = {
         "limits": {
             **_unlimited(),
-            "conn": _NONE,
-            "mem_storage": _NONE,
+            "conn": _UNLIMITED,
+            "mem_storage": _UNLIMITED,
             "disk_storage": disk,
-            "streams": _NONE,
-            "consumer": _NONE,
+            "streams": _UNLIMITED,
+            "consumer": _UNLIMITED,
         },
         "signing_keys": [_scope(role, key) for role, key in sorted(tenant.signers.items(), key=lambda item: item[1])],
         "revocations": dict(tenant.revoked or {}),
@@ -185,29 +185,31 @@ def account(operator_key: Key, tenant: Tenant) -> str:
 
 def system_account(operator_key: Key, public: str) -> str:
     """Return the claims of the account in which servers communicate; it has no users."""
-    limits = _unlimited() | {"conn": _NONE}
+    limits = _unlimited() | {"conn": _UNLIMITED}
     return _signed(operator_key, public, "system", {"limits": limits, "type": "account"})
 
 
-def user(signer: Key, account_key: str, role: Role, name: str, made: datetime, expires: datetime | None = None) -> str:
-    """Make the token of a user.
+def user(
+    signer: Key, account_key: str, role: Role, name: str, issued: datetime, expires: datetime | None = None
+) -> str:
+    """Return the token of a user.
 
     Args:
         signer: Signing key of the role.
         account_key: The account's public key.
-        role: What the user is; the bearer of an edge's token is the edge.
-        name: Name of the user; of an edge, its pack's.
-        made: Revocation looks at it.
+        role: Role of the user.
+        name: Name of the user; for an edge the name of its pack.
+        issued: Issue time; tokens issued before a configured time can be revoked.
         expires: Expiry time; None: never.
     """
     claims = {"issuer_account": account_key, "type": "user"}
     expiry = {"exp": int(expires.timestamp())} if expires else {}
-    times = {"iat": int(made.timestamp())} | expiry
+    times = {"iat": int(issued.timestamp())} | expiry
     return _signed(signer, user_key(signer, role, name).public, name, claims, times)
 
 
 def credentials(token: str, key: Key) -> bytes:
-    """Return a credentials file: the token of a program and the key that proves its possession."""
+    """Return the content of a credentials file: the token of a program, and the key with which it signs the challenge."""
     return (
         f"-----BEGIN NATS USER JWT-----\n{token}\n------END NATS USER JWT------\n\n"
         f"-----BEGIN USER NKEY SEED-----\n{key.seed.decode()}\n------END USER NKEY SEED------\n"
@@ -215,7 +217,7 @@ def credentials(token: str, key: Key) -> bytes:
 
 
 def _scope(role: Role, public: str) -> dict[str, Any]:
-    """Return the permissions of users that a key signs."""
+    """Return the permissions of the users that a role's key signs."""
     publish, subscribe = _ALLOWED[role]
     template = {
         "pub": _permission(publish, _DENIED.get(role, ())),
@@ -229,12 +231,12 @@ def _scope(role: Role, public: str) -> dict[str, Any]:
 
 
 def _permission(allow: tuple[str, ...], deny: tuple[str, ...]) -> dict[str, list[str]]:
-    """Return the permission; allowing nothing must deny all, because an empty list would allow all."""
+    """Return a permission. An empty list would allow everything, therefore an empty ``allow`` denies all."""
     return {"allow": list(allow), "deny": list(deny)} if allow else {"deny": [">"]}
 
 
 def _unlimited() -> dict[str, int]:
-    return {"subs": _NONE, "data": _NONE, "payload": _NONE}
+    return {"subs": _UNLIMITED, "data": _UNLIMITED, "payload": _UNLIMITED}
 
 
 def _signed(signer: Key, subject: str, name: str, claims: dict[str, Any], times: dict[str, int] | None = None) -> str:

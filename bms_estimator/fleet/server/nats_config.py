@@ -1,6 +1,6 @@
-"""The text of a nats-server's configuration: one node, or one of a cluster. Pure: the caller writes the file.
+"""Configuration text of a nats-server: a single node, or a node of a cluster. The caller writes the file.
 
-What the keys mean: the server's own documentation, https://docs.nats.io/running-a-nats-service/configuration.
+The keys are documented in https://docs.nats.io/running-a-nats-service/configuration.
 """
 
 import json
@@ -8,15 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.connection import LET_IN_S
+from bms_estimator.fleet.nats.connection import AUTH_TIMEOUT_S
 
 NATS_PORT, MQTT_PORT, MONITOR_PORT, CLUSTER_PORT = 4222, 1883, 8222, 6222
-"""Default ports of NATS; the monitor has no authentication and stays on the loopback."""
+"""Default ports of NATS. The monitor has no authentication and listens on the loopback only."""
 MAX_BLOCK_BYTES = 1 << 20
-"""Maximum size of a message [bytes]: a block of 60 samples takes 700 bytes, one of a whole day at 1 Hz less than
-this."""
+"""Maximum size of a message [bytes]. A block of 60 samples has 700 bytes, one of a whole day at 1 Hz less than this limit."""
 MAX_CONNECTIONS = 200_000
-"""Maximum number of connections of a node: if two of three are down, one has all edges. The server's default is
+"""Maximum number of connections of a node. If two of three nodes are down, all edges connect to the third. The server's default is
 65,536."""
 
 
@@ -25,8 +24,8 @@ class Cluster:
     """Cluster settings of a node.
 
     Attributes:
-        listen: Address of this node for the others, host:port.
-        routes: Addresses of all nodes for each other, host:port, including this one.
+        listen: Address on which this node listens for the others, host:port.
+        routes: Cluster addresses of all nodes, host:port, including this one.
     """
 
     listen: str
@@ -35,12 +34,12 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Tls:
-    """Files in PEM.
+    """TLS files in PEM format.
 
     Attributes:
-        cert: The server's certificate, and what leads from it to the authority.
+        cert: Certificate chain of the server.
         key: Private key.
-        ca: Authority that the nodes trust; None: as clients do, by those of the system.
+        ca: Authority that the nodes trust; None: the system's authorities.
     """
 
     cert: Path
@@ -55,7 +54,7 @@ class Accounts:
     Attributes:
         operator: The operator's claims.
         system: Public key of the system's account.
-        claims: Public key of each account -> its claims.
+        claims: Claims by public key of the account.
     """
 
     operator: str
@@ -65,19 +64,19 @@ class Accounts:
 
 @dataclass(frozen=True)
 class Node:
-    """One server.
+    """Settings of one server.
 
     Attributes:
         name: Name in the cluster.
         store: Folder of the streams.
-        nats: Address for workers, host:port; likewise ``mqtt`` for edges, and ``monitor``.
-        cluster: The other nodes; None: it is alone.
-        tls: For all ports but the monitor's; None: none.
-        accounts: Accounts of the tenants; None: whoever reaches it, as one tenant.
+        nats, mqtt, monitor: Addresses for workers, edges and the monitor, host:port.
+        cluster: Cluster settings; None: a single node.
+        tls: TLS files for all ports except the monitor's; None: without TLS.
+        accounts: Accounts of the tenants; None: without authentication, as a single tenant.
         partitions: Number of partitions of the stream ``RAW``.
-        disk_bytes: The most that streams take; None: the server's default, three quarters of the free space.
-        memory_bytes: As above.
-        sync_s: Interval between two fsyncs [s]; None: each message before it is acknowledged.
+        disk_bytes: Maximum size of the streams [bytes]; None: the server's default, three quarters of the free space.
+        memory_bytes: Maximum size of streams in memory [bytes]; None: the server's default.
+        sync_s: Interval between two fsyncs [s]; None: each message is synced before it is acknowledged.
     """
 
     name: str
@@ -97,7 +96,7 @@ class Node:
 def configuration(node: Node) -> str:
     """Return the server's configuration file."""
     tls = _tls(node.tls) if node.tls else ""
-    patience = f"authorization {{ timeout: {LET_IN_S} }}"
+    authorization = f"authorization {{ timeout: {AUTH_TIMEOUT_S} }}"
     lines = [
         f"server_name: {_text(node.name)}",
         f"listen: {_text(node.nats)}",
@@ -105,9 +104,9 @@ def configuration(node: Node) -> str:
         f"max_payload: {MAX_BLOCK_BYTES}",
         f"max_connections: {MAX_CONNECTIONS}",
         *([tls] if tls else []),
-        patience,
+        authorization,
         f"jetstream {{ {_jetstream(node)} }}",
-        f"mqtt {{ listen: {_text(node.mqtt)}, {patience}{f', {tls}' if tls else ''} }}",
+        f"mqtt {{ listen: {_text(node.mqtt)}, {authorization}{f', {tls}' if tls else ''} }}",
         *_cluster(node),
         *_accounts(node),
     ]
@@ -116,9 +115,9 @@ def configuration(node: Node) -> str:
 
 def _jetstream(node: Node) -> str:
     limits = {"max_file_store": node.disk_bytes, "max_memory_store": node.memory_bytes}
-    told = [f"{name}: {value}" for name, value in limits.items() if value is not None]
+    configured = [f"{name}: {value}" for name, value in limits.items() if value is not None]
     sync = "always" if node.sync_s is None else f'"{round(1000 * node.sync_s)}ms"'
-    return ", ".join([f"store_dir: {_text(str(node.store))}", *told, f"sync_interval: {sync}"])
+    return ", ".join([f"store_dir: {_text(str(node.store))}", *configured, f"sync_interval: {sync}"])
 
 
 def _cluster(node: Node) -> list[str]:
@@ -130,7 +129,7 @@ def _cluster(node: Node) -> list[str]:
 
 
 def _accounts(node: Node) -> list[str]:
-    """Return the lines with accounts and permissions; without accounts, any client may connect."""
+    """Return the lines of the accounts; without accounts any client may connect."""
     if node.accounts is None:
         return []
     preload = [f"  {key}: {claims}" for key, claims in node.accounts.claims.items()]
@@ -145,12 +144,12 @@ def _accounts(node: Node) -> list[str]:
 
 
 def _tls(tls: Tls, *, mutual: bool = False) -> str:
-    """Nodes show each other a certificate; clients show a token in place of one."""
+    """Return the TLS block. With ``mutual`` the peer must present a certificate; clients present a token instead."""
     files = {"cert_file": tls.cert, "key_file": tls.key} | ({"ca_file": tls.ca} if tls.ca else {})
-    told = ", ".join(f"{name}: {_text(str(path))}" for name, path in files.items())
-    return f"tls {{ {told}, timeout: {LET_IN_S}{', verify: true' if mutual else ''} }}"
+    entries = ", ".join(f"{name}: {_text(str(path))}" for name, path in files.items())
+    return f"tls {{ {entries}, timeout: {AUTH_TIMEOUT_S}{', verify: true' if mutual else ''} }}"
 
 
 def _text(value: str) -> str:
-    """Quote a text as the server reads it, as in JSON."""
+    """Return a quoted string of the server's configuration language, which equals that of JSON."""
     return json.dumps(value, ensure_ascii=False)

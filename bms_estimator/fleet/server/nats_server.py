@@ -1,6 +1,6 @@
-"""A nats-server as a child process: start it, wait for it, make its streams, forward signals.
+"""A nats-server as a child process: start it, wait for it, create its streams, forward signals.
 
-It ends with this process, even if that is killed. It is not restarted here: systemd does that.
+The child ends with this process, even if this process is killed. After a failure systemd restarts both.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ import structlog
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
-from bms_estimator.fleet.nats.connection import LET_IN_S, part
+from bms_estimator.fleet.nats.connection import AUTH_TIMEOUT_S, close
 from bms_estimator.fleet.nats.streams import NoAnswerError, make_streams
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
@@ -32,13 +32,14 @@ from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSetti
 
 log = structlog.get_logger(__name__)
 
-ASK_AGAIN_S = 0.1
-ASK_S = 5.0
-"""One request to the monitor of a server that is busy."""
-RELOAD_S = 60.0
-"""A server that has not taken new settings by then does not."""
-PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
-"""The last: let clients go to other nodes one after another, then end."""
+POLL_S = 0.1
+"""Poll interval for a state of the server [s]."""
+MONITOR_TIMEOUT_S = 5.0
+"""Timeout of a request to the server's monitor [s]."""
+RELOAD_TIMEOUT_S = 60.0
+"""Timeout of a reload of the server's settings [s]."""
+FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
+"""SIGUSR2 is the server's lame duck mode: it moves its clients to other nodes gradually, then ends."""
 CONFIGURATION = "nats-server.conf"
 
 
@@ -47,9 +48,9 @@ class NodeLocation:
     """Place of a node in the cluster, and its folder.
 
     Attributes:
-        folder: For streams and keys.
-        number: Number from 1.
-        nodes: Addresses of all nodes for each other, host:port; one alone has none.
+        folder: Folder of streams and keys.
+        number: Number of the node, from 1.
+        nodes: Cluster addresses of all nodes, host:port; empty for a single node.
     """
 
     folder: Path
@@ -68,16 +69,16 @@ class ServerSpec:
 
     Attributes:
         settings: Settings of the fleet.
-        accounts: Accounts of the tenants; None: whoever reaches it.
+        accounts: Accounts of the tenants; None: without authentication.
     """
 
     settings: FleetSettings
     accounts: Accounts | None = None
 
 
-def node_of(place: NodeLocation, told: ServerSpec) -> Node:
+def node_of(place: NodeLocation, spec: ServerSpec) -> Node:
     """Return the node's configuration."""
-    server, tls = told.settings.server, told.settings.tls
+    server, tls = spec.settings.server, spec.settings.tls
     own = place.nodes[place.number - 1] if place.nodes else ""
     return Node(
         name=f"n{place.number}",
@@ -87,7 +88,7 @@ def node_of(place: NodeLocation, told: ServerSpec) -> Node:
         monitor=server.monitor,
         cluster=Cluster(_listen_address(own), place.nodes) if place.nodes else None,
         tls=_tls(tls) if tls else None,
-        accounts=told.accounts,
+        accounts=spec.accounts,
         partitions=server.partitions,
         disk_bytes=None if server.disk_gb is None else round(credentials.GB * server.disk_gb),
         sync_s=server.sync_s or None,
@@ -103,10 +104,10 @@ def _tls(settings: TlsSettings) -> Tls:
 
 
 def _check(tls: Tls) -> None:
-    """Report a problem that the server would report in its own words with a wrong exit code.
+    """Check the TLS files before the server does, because its error has the wrong exit code.
 
     Raises:
-        UserError: A file cannot be read, or key and certificate are not of each other.
+        UserError: A file cannot be read, or the key does not belong to the certificate.
     """
     for name, path in (("cert_file", tls.cert), ("key_file", tls.key), ("ca_file", tls.ca)):
         try:
@@ -120,38 +121,38 @@ def _check(tls: Tls) -> None:
         raise UserError(f"tls.cert_file = {tls.cert}, tls.key_file = {tls.key}: {error.reason or error}") from None
 
 
-async def serve(place: NodeLocation, read: Callable[[], ServerSpec], say: Callable[[str], None]) -> int:
+async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Callable[[str], None]) -> int:
     """Run a node until it ends. SIGHUP reloads its settings: tenants, limits, revoked users.
 
     Args:
         place: Location of this node.
         read: Reads the settings; called at start and at each SIGHUP.
-        say: Receives lines for people: addresses and created streams.
+        report: Receives progress lines: addresses and created streams.
 
     Returns:
         The server's exit code; 0 after a requested end.
 
     Raises:
-        UserError: There is no server that will do, settings cannot be, or it refuses the streams.
+        UserError: The server is missing or too old, settings are invalid, or the server rejects the streams.
     """
-    binary, told = find_server(), read()
-    node = node_of(place, told)
+    binary, spec = find_server(), read()
+    node = node_of(place, spec)
     if node.tls:
         _check(node.tls)
     _write(place.folder / CONFIGURATION, configuration(node))
     async with _running(binary, place.folder / CONFIGURATION) as (process, asked_to_end):
         ended = asyncio.create_task(process.wait())
-        made = asyncio.create_task(_make_ready(place, told, process.pid, say))
-        reloading = asyncio.create_task(_reload_on_signal(place, read, process, made, say))
+        streams_ready = asyncio.create_task(_make_ready(place, spec, process.pid, report))
+        reloading = asyncio.create_task(_reload_on_signal(place, read, process, streams_ready, report))
         try:
-            await asyncio.wait((ended, made), return_when=asyncio.FIRST_COMPLETED)
-            if made.done() and not ended.done():
-                made.result()
+            await asyncio.wait((ended, streams_ready), return_when=asyncio.FIRST_COMPLETED)
+            if streams_ready.done() and not ended.done():
+                streams_ready.result()
             code = await ended
         finally:
-            made.cancel()
+            streams_ready.cancel()
             reloading.cancel()
-            await asyncio.gather(made, reloading, return_exceptions=True)
+            await asyncio.gather(streams_ready, reloading, return_exceptions=True)
         return 0 if asked_to_end.is_set() else code
 
 
@@ -159,29 +160,29 @@ async def _reload_on_signal(
     place: NodeLocation,
     read: Callable[[], ServerSpec],
     process: asyncio.subprocess.Process,
-    made: asyncio.Task[None],
-    say: Callable[[str], None],
+    streams_ready: asyncio.Task[None],
+    report: Callable[[str], None],
 ) -> None:
     """Reload the server's configuration at SIGHUP. Invalid settings are logged and change nothing."""
-    asked = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, asked.set)
-    await made
+    requested = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, requested.set)
+    await streams_ready
     while True:
-        await asked.wait()
-        asked.clear()
+        await requested.wait()
+        requested.clear()
         try:
-            told = read()
-            node = node_of(place, told)
-            async with asyncio.timeout(RELOAD_S):
-                loaded = await _wait(node, "varz", bool)
+            spec = read()
+            node = node_of(place, spec)
+            async with asyncio.timeout(RELOAD_TIMEOUT_S):
+                loaded = await _wait_for_monitor(node, "varz", bool)
                 _write(place.folder / CONFIGURATION, configuration(node))
                 process.send_signal(signal.SIGHUP)
-                await _wait(node, "varz", functools.partial(_has_reloaded, loaded))
-            await _make_all_streams(place, told, say)
+                await _wait_for_monitor(node, "varz", functools.partial(_has_reloaded, loaded))
+            await _make_all_streams(place, spec, report)
         except (UserError, NatsError) as error:
-            log.error("the settings stay as they were", reason=str(error))  # noqa: TRY400 - a person can mend it
+            log.error("the settings were not changed", reason=str(error))  # noqa: TRY400 - a user error needs no traceback
         except TimeoutError:
-            log.error("the server has not taken its new settings; what it says of them stands above")  # noqa: TRY400
+            log.error("the server has not reloaded its settings; the reason is in its log lines above")  # noqa: TRY400
         except ProcessLookupError:
             return
 
@@ -189,70 +190,70 @@ async def _reload_on_signal(
 @contextlib.asynccontextmanager
 async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subprocess.Process, asyncio.Event]]:
     """Run the server as a child that ends with this process. Yield it and a flag that a signal sets."""
-    for left in file.parent.glob("*.ports"):  # of one that was killed
+    for left in file.parent.glob("*.ports"):  # of a killed server
         left.unlink()
     process = await asyncio.create_subprocess_exec(
         binary, "-c", file, "--ports_file_dir", file.parent, preexec_fn=ends_with_us()
     )
-    asked, loop = asyncio.Event(), asyncio.get_running_loop()
+    requested, loop = asyncio.Event(), asyncio.get_running_loop()
 
-    def pass_on(number: signal.Signals) -> None:
-        asked.set()
+    def forward(number: signal.Signals) -> None:
+        requested.set()
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(number)
 
-    for number in PASSED_ON:
-        loop.add_signal_handler(number, pass_on, number)
+    for number in FORWARDED_SIGNALS:
+        loop.add_signal_handler(number, forward, number)
     try:
-        yield process, asked
+        yield process, requested
     finally:
         if process.returncode is None:
             process.terminate()
         await process.wait()
-        for number in (*PASSED_ON, signal.SIGHUP):
+        for number in (*FORWARDED_SIGNALS, signal.SIGHUP):
             loop.remove_signal_handler(number)
 
 
-async def _make_ready(place: NodeLocation, told: ServerSpec, pid: int, say: Callable[[str], None]) -> None:
-    """Wait for the server, print its addresses, wait for a quorum, and create the streams of all tenants.
+async def _make_ready(place: NodeLocation, spec: ServerSpec, pid: int, report: Callable[[str], None]) -> None:
+    """Wait for the server, report its addresses, wait for a quorum, and create the streams of all tenants.
 
-    Another server may answer on the port: this one writes a file with its number once it listens on its ports.
+    A response on the port could come from another server. Therefore the file that this server writes once it listens is awaited.
     """
-    node = node_of(place, told)
-    while not list(place.folder.glob(f"*_{pid}.ports")):  # noqa: ASYNC110 - it has no other way to tell
-        await asyncio.sleep(ASK_AGAIN_S)
+    node = node_of(place, spec)
+    while not list(place.folder.glob(f"*_{pid}.ports")):  # noqa: ASYNC110 - the server has no other signal
+        await asyncio.sleep(POLL_S)
     secure = "s" if node.tls else ""
-    say(f"edges: mqtt{secure}://{node.mqtt}  workers: {_scheme(node)}://{node.nats}  monitor: http://{node.monitor}")
+    report(f"edges: mqtt{secure}://{node.mqtt}  workers: {_scheme(node)}://{node.nats}  monitor: http://{node.monitor}")
     if node.cluster:
-        say(f"waiting for the other nodes: {', '.join(node.cluster.routes)}")
-    await _wait(node, "healthz", _has_streams)
+        report(f"waiting for the other nodes: {', '.join(node.cluster.routes)}")
+    await _wait_for_monitor(node, "healthz", _is_healthy)
     while True:
         try:
-            return await _make_all_streams(place, told, say)
-        except NoAnswerError as error:  # of a node that is busy with reconnecting clients, or without a quorum
-            log.warning("the streams are not there yet; trying again", reason=str(error))
+            return await _make_all_streams(place, spec, report)
+        except NoAnswerError as error:  # the node is busy with reconnecting clients, or the cluster has no quorum
+            log.warning("the streams cannot be created yet; trying again", reason=str(error))
 
 
-async def _make_all_streams(place: NodeLocation, told: ServerSpec, say: Callable[[str], None]) -> None:
-    """Make the streams of all tenants from one of several nodes: the one with the keys, else the first."""
-    node = node_of(place, told)
+async def _make_all_streams(place: NodeLocation, spec: ServerSpec, report: Callable[[str], None]) -> None:
+    """Create the streams of all tenants, if this is the node with the keys or, without accounts, the first node."""
+    node = node_of(place, spec)
     if place.number != 1 if node.accounts is None else not credentials.has_keys(place.keys):
-        say("ready; streams are made by the node that has the keys, the first")
+        report("ready; streams are made by the node that has the keys, the first")
         return
-    for name, tenant in (told.settings.tenants or {"": TenantSettings()}).items():
-        await _make_streams(place, told, name, tenant)
-        where = f"; its keys: {place.keys / name}" if name else ""
-        say(f"{f'tenant {name}: ' if name else ''}streams ready, {node.partitions} partitions{where}")
+    for name, tenant in (spec.settings.tenants or {"": TenantSettings()}).items():
+        await _make_streams(place, spec, name, tenant)
+        keys = f"; its keys: {place.keys / name}" if name else ""
+        report(f"{f'tenant {name}: ' if name else ''}streams ready, {node.partitions} partitions{keys}")
 
 
-async def _make_streams(place: NodeLocation, told: ServerSpec, name: str, tenant: TenantSettings) -> None:
-    node, server = node_of(place, told), told.settings.server
+async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant: TenantSettings) -> None:
+    node, server = node_of(place, spec), spec.settings.server
     try:
         nc = await connect(node, credentials.credentials_file(place.keys, name, Role.ADMIN) if name else None)
     except TimeoutError:
-        raise NoAnswerError(f"{node.nats}: the server does not let us in in time") from None
+        raise NoAnswerError(f"{node.nats}: the server does not accept the connection in time") from None
     except (NatsError, OSError) as error:
-        raise UserError(f"{node.nats}: the server lets us not in: {error}") from None
+        raise UserError(f"{node.nats}: the server rejects the connection: {error}") from None
     try:
         await make_streams(
             nc,
@@ -264,34 +265,38 @@ async def _make_streams(place: NodeLocation, told: ServerSpec, name: str, tenant
     except NoAnswerError:
         raise
     except UserError as error:
-        hint = "; less raw_gb, or more disk, for this tenant or all?" if "insufficient" in str(error) else ""
+        hint = (
+            ": reduce raw_gb or increase disk_gb, of this tenant or of the server"
+            if "insufficient" in str(error)
+            else ""
+        )
         raise UserError(f"{f'tenant {name}: ' if name else ''}{error}{hint}") from None
     finally:
-        await part(nc)
+        await close(nc)
 
 
 async def connect(node: Node, credentials_file: Path | None) -> Client:
     """Connect to the server on this machine.
 
     Raises:
-        NatsError: It refuses.
+        NatsError: The server rejects the connection.
     """
     host, port = reachable(node.nats)
-    where = f"{_scheme(node)}://{f'[{host}]' if ':' in host else host}:{port}"
-    more = {"tls": _own_certificate(node.tls)} if node.tls else {}
+    url = f"{_scheme(node)}://{f'[{host}]' if ':' in host else host}:{port}"
+    tls = {"tls": _own_certificate(node.tls)} if node.tls else {}
     users = {"user_credentials": credentials_file} if credentials_file else {}
-    return await nats.connect(where, allow_reconnect=False, connect_timeout=LET_IN_S, **more, **users)
+    return await nats.connect(url, allow_reconnect=False, connect_timeout=AUTH_TIMEOUT_S, **tls, **users)
 
 
 def _own_certificate(tls: Tls) -> ssl.SSLContext:
-    """Trusts the certificate of this machine's server under any name."""
+    """Return a TLS context that trusts the certificate of this machine's server under any name."""
     context = ssl.create_default_context(cafile=str(tls.cert))
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
     context.check_hostname = False
     return context
 
 
-def _has_streams(health: Mapping[str, object]) -> bool:
+def _is_healthy(health: Mapping[str, object]) -> bool:
     return health.get("status") == "ok"
 
 
@@ -299,19 +304,21 @@ def _has_reloaded(before: Mapping[str, object], varz: Mapping[str, object]) -> b
     return varz.get("config_load_time") not in (None, before.get("config_load_time"))
 
 
-async def _wait(node: Node, what: str, is_so: Callable[[Mapping[str, object]], bool]) -> Mapping[str, object]:
+async def _wait_for_monitor(
+    node: Node, path: str, condition: Callable[[Mapping[str, object]], bool]
+) -> Mapping[str, object]:
     """Poll the server's monitor until a condition holds; return its response."""
-    while not is_so(said := await _ask(node, what)):  # noqa: ASYNC110 - it has no other way to tell
-        await asyncio.sleep(ASK_AGAIN_S)
-    return said
+    while not condition(response := await _query_monitor(node, path)):  # noqa: ASYNC110 - the monitor has no notifications
+        await asyncio.sleep(POLL_S)
+    return response
 
 
-async def _ask(node: Node, what: str) -> Mapping[str, object]:
+async def _query_monitor(node: Node, path: str) -> Mapping[str, object]:
     """Return the response of the server's monitor; empty without a response."""
     host, port = reachable(node.monitor)
-    url = f"http://{f'[{host}]' if ':' in host else host}:{port}/{what}"
+    url = f"http://{f'[{host}]' if ':' in host else host}:{port}/{path}"
     with contextlib.suppress(aiohttp.ClientError, TimeoutError, ValueError):
-        async with aiohttp.request("GET", url, timeout=aiohttp.ClientTimeout(total=ASK_S)) as answer:
+        async with aiohttp.request("GET", url, timeout=aiohttp.ClientTimeout(total=MONITOR_TIMEOUT_S)) as answer:
             found = await answer.json()
             return found if isinstance(found, dict) else {}
     return {}
@@ -322,7 +329,7 @@ def _scheme(node: Node) -> str:
 
 
 def _listen_address(own: str) -> str:
-    """Return the address on which a node listens for others; ``own`` may resolve to any of its addresses."""
+    """Return the listen address of a node: all interfaces, because ``own`` may resolve to any of them, or the loopback."""
     listen = reachable(own)
     return own if listen.loopback else f"0.0.0.0:{listen.port}"
 

@@ -1,4 +1,4 @@
-"""The nats-server program: where it is installed, and whether it is recent enough."""
+"""Search for the nats-server program, and check of its version."""
 
 import re
 import shutil
@@ -8,8 +8,8 @@ from pathlib import Path
 
 from bms_estimator.model.errors import UserError
 
-OLDEST = (2, 11)
-"""First version with pinned consumers."""
+MIN_VERSION = (2, 11)
+"""Oldest supported version, the first one with pinned consumers."""
 VERSION_S = 60.0
 """Timeout of ``nats-server -v`` [s]."""
 
@@ -33,7 +33,7 @@ def find_server(extra: str = "fleet") -> Path:
     except (OSError, subprocess.SubprocessError) as error:
         raise UserError(f"{found}: does not report its version: {error}; {install}") from None
     version = re.search(r"v(\d+)\.(\d+)", output)
-    if not version or (int(version[1]), int(version[2])) < OLDEST:
-        oldest = ".".join(map(str, OLDEST))
-        raise UserError(f"{found}: {output.strip() or 'reports no version'}; {oldest} or later is needed: {install}")
+    if not version or (int(version[1]), int(version[2])) < MIN_VERSION:
+        minimum = ".".join(map(str, MIN_VERSION))
+        raise UserError(f"{found}: {output.strip() or 'reports no version'}; {minimum} or later is needed: {install}")
     return Path(found)

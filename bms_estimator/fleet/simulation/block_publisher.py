@@ -1,6 +1,6 @@
-"""Simulated edges on their way: blocks out over a few MQTT connections, and what workers await of them.
+"""Publisher of simulated edges: sends their blocks over a few MQTT connections and receives the workers' replies.
 
-One connection serves many edges: one socket each would measure the kernel's sockets, not a fleet.
+One connection serves many edges. With a socket for each edge the operating system, not the fleet, would limit the load.
 """
 
 import asyncio
@@ -22,51 +22,53 @@ from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.mqtt.broker_config import brokers, password, tls_context
 from bms_estimator.settings.mqtt import MqttSettings
 
-ROUND_S = 0.1
+POLL_S = 0.1
 """Interval between two checks for due blocks [s]."""
 MAX_IN_FLIGHT = 2000
-"""Blocks that a connection may have sent without an acknowledgement."""
+"""Maximum number of blocks of a connection without an acknowledgment."""
 QUIET_S = 3.0
-"""Time after the last block in which a worker may request a missing one [s]."""
-SAID_S = 5.0
+"""Time after the last block during which a worker may request a missing one [s]."""
+PROGRESS_S = 5.0
 """Interval between two progress lines [s]."""
 KEEPALIVE_S = 20
 MIN_WAIT_S, MAX_WAIT_S = 1, 4
 """Minimum and maximum delay before a reconnect [s]."""
-_HEARD = awaits("+").replace(".", "/")
+_REPLIES = awaits("+").replace(".", "/")
 
 
 class Report(NamedTuple):
-    """Result of publishing."""
+    """Totals of a run."""
 
     blocks: int
-    """Sent, those sent again among them."""
+    """Number of sent blocks, with repetitions."""
     again: int
+    """Number of repetitions."""
     bytes: int
-    """Size of the blocks [bytes]."""
+    """Total size of the blocks [bytes]."""
     resends: int
-    """Requested by workers."""
+    """Number of resend requests of workers."""
     unacknowledged: int
+    """Number of blocks without an acknowledgment."""
     lag_s: float
-    """Age of the oldest complete block that was not sent [s]."""
+    """Age of the oldest due block that was not sent [s]."""
 
     def __str__(self) -> str:
         return (
-            f"{self.blocks:,} blocks sent, {self.again:,} of them again as workers asked {self.resends:,} times, "
+            f"{self.blocks:,} blocks sent, {self.again:,} of them again after {self.resends:,} requests of workers, "
             f"{self.unacknowledged:,} not acknowledged, {self.lag_s:.1f} s behind"
         )
 
 
 class _Connection:
-    """One MQTT connection, made again whenever it breaks; what the broker has not acknowledged is sent again.
+    """MQTT connection that reconnects and resends unacknowledged blocks.
 
     Args:
-        settings: The brokers, tried in turn.
-        heard: Receives the payloads of ``BlockRequest`` with their topics; None: no subscription.
+        settings: MQTT settings; the brokers are tried in turn.
+        replies: Receives the workers' replies as (topic, payload); None: no subscription.
     """
 
-    def __init__(self, settings: MqttSettings, heard: deque[tuple[str, bytes]] | None) -> None:
-        self._heard = heard
+    def __init__(self, settings: MqttSettings, replies: deque[tuple[str, bytes]] | None) -> None:
+        self._replies = replies
         self._brokers = itertools.cycle(brokers(settings))
         self.published, self.acknowledged = 0, 0
         self._client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=f"simulated-{uuid.uuid4().hex[:12]}")
@@ -75,43 +77,43 @@ class _Connection:
             self._client.tls_set_context(tls_context(settings))
         self._client.max_inflight_messages_set(MAX_IN_FLIGHT)
         self._client.reconnect_delay_set(MIN_WAIT_S, MAX_WAIT_S)
-        self._client.on_connect = self._subscribe
-        self._client.on_publish = self._count
+        self._client.on_connect = self._on_connect
+        self._client.on_publish = self._on_publish
         self._client.on_message = self._on_message
-        self._client.on_connect_fail = self._client.on_disconnect = self._turn
-        self._turn()
+        self._client.on_connect_fail = self._client.on_disconnect = self._use_next_broker
+        self._use_next_broker()
         self._client.loop_start()
 
     @property
     def in_flight(self) -> int:
-        """Blocks without an acknowledgement."""
+        """Number of blocks without an acknowledgment."""
         return self.published - self.acknowledged
 
     def publish(self, topic: str, payload: bytes) -> None:
-        """Hand over a block; it is sent later if necessary."""
+        """Queue a block for sending."""
         self._client.publish(topic, payload, qos=1)
         self.published += 1
 
     def end(self) -> None:
-        """Take leave of the broker."""
+        """Disconnect."""
         self._client.disconnect()
         self._client.loop_stop()
 
-    def _turn(self, *_: object) -> None:
-        """Go to the next broker at the next attempt."""
+    def _use_next_broker(self, *_: object) -> None:
+        """Use the next broker in the next connection attempt."""
         broker = next(self._brokers)
         self._client.connect_async(broker.host, broker.port, KEEPALIVE_S)
 
-    def _subscribe(self, client: mqtt.Client, *_: object) -> None:
-        if self._heard is not None:
-            client.subscribe(_HEARD)
+    def _on_connect(self, client: mqtt.Client, *_: object) -> None:
+        if self._replies is not None:
+            client.subscribe(_REPLIES)
 
-    def _count(self, *_: object) -> None:
-        self.acknowledged += 1  # by the connection's own thread alone
+    def _on_publish(self, *_: object) -> None:
+        self.acknowledged += 1  # called only in the connection's thread
 
     def _on_message(self, _client: mqtt.Client, _data: Any, message: mqtt.MQTTMessage) -> None:
-        if self._heard is not None:
-            self._heard.append((message.topic, bytes(message.payload)))
+        if self._replies is not None:
+            self._replies.append((message.topic, bytes(message.payload)))
 
 
 async def run_edges(
@@ -121,69 +123,69 @@ async def run_edges(
     *,
     connections: int,
     stop: asyncio.Event,
-    said: Callable[[str], object],
+    report: Callable[[str], object],
     quiet_s: float = QUIET_S,
 ) -> Report:
-    """Send blocks as they are complete, until ``stop`` or until all edges have sent their last.
+    """Send blocks when they are due, until ``stop`` is set or all edges have sent their last block.
 
     Args:
-        fleet: The packs.
+        fleet: Simulated packs.
         edges: Simulated edges.
         settings: Address and credentials of the server.
         connections: Number of connections for all edges.
-        stop: Ends it.
-        said: Receives progress messages.
-        quiet_s: After the last block.
+        stop: Ends the run when set.
+        report: Receives progress lines.
+        quiet_s: Time after the last block in which workers may request others [s].
 
     Raises:
         UserError: An address, password or certificate cannot be used.
     """
-    heard: deque[tuple[str, bytes]] = deque()
-    links = [_Connection(settings, None if i else heard) for i in range(connections)]
+    replies: deque[tuple[str, bytes]] = deque()
+    open_connections = [_Connection(settings, None if i else replies) for i in range(connections)]
     topics = [raw(name).replace(".", "/") for name in fleet.names]
-    size, spoke_s, busy_s = 0, time.monotonic(), time.monotonic()
+    size, progress_s, busy_s = 0, time.monotonic(), time.monotonic()
     try:
         while not await _ended(stop) and time.monotonic() - busy_s < quiet_s:
-            _listen(heard, edges)
-            size += _send(fleet, edges, links, topics)
-            if not edges.done or any(link.in_flight for link in links):
+            _process_replies(replies, edges)
+            size += _send(fleet, edges, open_connections, topics)
+            if not edges.done or any(connection.in_flight for connection in open_connections):
                 busy_s = time.monotonic()
-            if time.monotonic() - spoke_s >= SAID_S:
-                spoke_s = time.monotonic()
-                said(str(_report(edges, links, size)))
-        return _report(edges, links, size)
+            if time.monotonic() - progress_s >= PROGRESS_S:
+                progress_s = time.monotonic()
+                report(str(_report(edges, open_connections, size)))
+        return _report(edges, open_connections, size)
     finally:
-        for link in links:
-            await asyncio.to_thread(link.end)
+        for connection in open_connections:
+            await asyncio.to_thread(connection.end)
 
 
 async def _ended(stop: asyncio.Event) -> bool:
-    """Return True if it should end; waits at most ``ROUND_S``."""
+    """Wait up to ``POLL_S`` for ``stop``; return True if it is set."""
     with contextlib.suppress(TimeoutError):
-        await asyncio.wait_for(stop.wait(), ROUND_S)
+        await asyncio.wait_for(stop.wait(), POLL_S)
     return stop.is_set()
 
 
-def _listen(heard: deque[tuple[str, bytes]], edges: SimulatedEdges) -> None:
-    while heard:
-        topic, payload = heard.popleft()
+def _process_replies(replies: deque[tuple[str, bytes]], edges: SimulatedEdges) -> None:
+    while replies:
+        topic, payload = replies.popleft()
         try:
-            answer = BlockRequest.model_validate_json(payload)
+            reply = BlockRequest.model_validate_json(payload)
         except ValidationError:
-            continue  # not a worker's
-        edges.hear(topic.split("/")[1], answer, time.monotonic())
+            continue  # a message of another client
+        edges.receive_reply(topic.split("/")[1], reply, time.monotonic())
 
 
-def _send(fleet: SimulatedFleet, edges: SimulatedEdges, links: list[_Connection], topics: list[str]) -> int:
-    """Send due blocks within the limit of messages in flight. Returns how many bytes of blocks that was."""
-    free = min(MAX_IN_FLIGHT - link.in_flight for link in links)
+def _send(fleet: SimulatedFleet, edges: SimulatedEdges, open_connections: list[_Connection], topics: list[str]) -> int:
+    """Send due blocks within the limit of messages in flight; return their size [bytes]."""
+    free = min(MAX_IN_FLIGHT - connection.in_flight for connection in open_connections)
     due = edges.due(time.time(), max(0, free))
-    blocks = list(fleet.blocks(*due))  # all of them first: the connections' threads would take turns with this one
+    blocks = list(fleet.blocks(*due))  # first, because the connections' threads would slow down this one
     for pack, block in zip(due.packs.tolist(), blocks, strict=True):
-        links[pack % len(links)].publish(topics[pack], block)
+        open_connections[pack % len(open_connections)].publish(topics[pack], block)
     return sum(map(len, blocks))
 
 
-def _report(edges: SimulatedEdges, links: list[_Connection], size: int) -> Report:
-    unacknowledged = sum(link.in_flight for link in links)
+def _report(edges: SimulatedEdges, open_connections: list[_Connection], size: int) -> Report:
+    unacknowledged = sum(connection.in_flight for connection in open_connections)
     return Report(edges.sent, edges.again, size, edges.resends, unacknowledged, edges.lag_s(time.time()))

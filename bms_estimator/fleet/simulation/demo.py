@@ -1,6 +1,6 @@
-"""The demo of a fleet: server, simulated edges, two workers and the page as processes; one worker is killed.
+"""Demo of a fleet: server, simulated edges, two workers and the page as processes. One worker is killed.
 
-It reports what it receives: heartbeats of the workers, and estimates of some packs beside their true SOC.
+It reports the workers' heartbeats, and compares the estimates of some packs with their true SOC.
 """
 
 import asyncio
@@ -31,37 +31,35 @@ from bms_estimator.process.child_process import ends_with_us
 
 LOOPBACK = "127.0.0.1"
 SPEED = 10.0
-"""The packs' seconds per second: their minute is over in 6 s."""
+"""Simulated seconds per second: an edge sends its block of a minute every 6 s."""
 SEED = 7
-LISTENED = 100
+OBSERVED_PACKS = 100
 """Number of packs whose estimates are compared with the truth."""
-SAID_S = 5.0
+PROGRESS_S = 5.0
 """Interval between two progress lines [s]."""
 KILL_AFTER = 0.4
-"""Part of the time after which a worker is killed."""
-PATIENCE_S = 120.0
-"""Timeout of events that should take seconds: a server, a worker, the last blocks [s]."""
+"""Fraction of the duration after which a worker is killed."""
+TIMEOUT_S = 120.0
+"""Timeout of a start, a takeover and the last blocks [s], which normally take seconds."""
 _WORKERS = ("ada", "bob")
 _KILLED = _WORKERS[0]
 _PORTS = range(20_000, 32_768)
 """Ports below the range that the kernel gives to outgoing connections, which could occupy one before a server
 listens."""
-_numbers = itertools.count(random.randrange(len(_PORTS)))
-
-Say = Callable[[str], object]
+_port_offsets = itertools.count(random.randrange(len(_PORTS)))
 
 
 @dataclass
 class DemoObserver:
-    """Observer of a demo.
+    """Heartbeats and estimates received during a demo.
 
     Attributes:
         partitions: Partitions with packs.
-        workers: Last heartbeat by name, with its moment of a monotonic clock [s].
-        errors: Estimated less true SOC, of estimates since the last line.
-        within: Whether the true SOC was within two standard deviations.
-        dead: Workers that were killed on purpose.
-        worst_s: Longest lag since the last line [s].
+        workers: Last heartbeat of each worker and the monotonic clock of its arrival [s].
+        errors: Estimated minus true SOC since the last progress line.
+        within: Numbers of estimates with the true SOC within two standard deviations (True) or not (False).
+        dead: Names of the killed workers.
+        max_lag_s: Largest lag since the last progress line [s].
     """
 
     partitions: set[int]
@@ -69,32 +67,32 @@ class DemoObserver:
     errors: list[float] = field(default_factory=list)
     within: Counter[bool] = field(default_factory=Counter)
     dead: set[str] = field(default_factory=set)
-    worst_s: float = 0.0
+    max_lag_s: float = 0.0
 
     @property
     def alive(self) -> dict[str, Heartbeat]:
-        """Workers with a heartbeat within ``DEAD_S`` that were not killed since."""
+        """Last heartbeats of the workers that are alive."""
         now_s = time.monotonic()
         return {
-            name: beat
-            for name, (heard_s, beat) in self.workers.items()
-            if now_s - heard_s < DEAD_S and name not in self.dead
+            name: heartbeat
+            for name, (received_s, heartbeat) in self.workers.items()
+            if now_s - received_s < DEAD_S and name not in self.dead
         }
 
     @property
     def held(self) -> set[int]:
-        """Partitions of workers that are alive."""
-        return {number for beat in self.alive.values() for number in beat.partitions}
+        """Partitions of the live workers."""
+        return {number for heartbeat in self.alive.values() for number in heartbeat.partitions}
 
     @property
-    def done(self) -> int:
-        """Blocks that all workers have stepped, what one did again that another had lost among them."""
-        return sum(beat.blocks for _, beat in self.workers.values())
+    def processed(self) -> int:
+        """Number of blocks that all workers have processed, including those that were processed again after the kill."""
+        return sum(heartbeat.blocks for _, heartbeat in self.workers.values())
 
     @property
-    def taken(self) -> int:
-        """Blocks, as the partitions' own counts have it: each once, whoever took it."""
-        return sum(beat.counters.get("blocks", 0) for beat in self.alive.values())
+    def counted_blocks(self) -> int:
+        """Number of blocks according to the counters of the partitions, which count each block once."""
+        return sum(heartbeat.counters.get("blocks", 0) for heartbeat in self.alive.values())
 
 
 @dataclass(frozen=True)
@@ -105,24 +103,24 @@ class Demo:
         packs: Number of packs.
         seconds: Duration for which edges send.
         page_port: Port of the page.
-        folder: For the server's files and all logs.
-        say: Receives the progress, line by line.
-        opened: Called with the page's address.
+        folder: Folder of the server's files and of all logs.
+        report: Receives progress lines.
+        on_page: Called with the page's address.
     """
 
     packs: int
     seconds: float
     page_port: int
     folder: Path
-    say: Say
-    opened: Callable[[str], object]
+    report: Callable[[str], object]
+    on_page: Callable[[str], object]
 
 
 async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
-    """Run it until its end, or ``stop``.
+    """Run the demo until its end or until ``stop`` is set.
 
     Raises:
-        UserError: A process of it ends, or is not there in time.
+        UserError: A process has ended or did not start in time.
     """
     nats_port, mqtt_port, monitor_port = (free_port() for _ in range(3))
     server, mqtt = f"nats://{LOOPBACK}:{nats_port}", f"mqtt://{LOOPBACK}:{mqtt_port}"
@@ -140,122 +138,125 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
         stack.push_async_callback(processes.end)
         await processes.start("server", "serve", config)
         nc = await stack.enter_async_context(_connected(server, processes, stop))
-        demo.say(f"server: {server} for workers and the page, {mqtt} for edges")
+        demo.report(f"server: {server} for workers and the page, {mqtt} for edges")
         await processes.run("packs", "packs", "load", table, "--server", server)
-        demo.say(
-            f"table: {demo.packs:,} packs of four kinds of cells; how much each has aged, and its SOC, nobody is told"
+        demo.report(
+            f"table: {demo.packs:,} packs of four kinds of cells; ageing and SOC of each are hidden from the workers"
         )
-        seen = await _listen(nc, fleet)
+        observer = await _observe(nc, fleet)
         for name in _WORKERS:
             await processes.start(name, "worker", "--server", server, "--name", name, "--checkpoint-s", 10)
         page = ("--listen", f"{LOOPBACK}:{demo.page_port}", "--no-browser")
         await processes.start("page", "page", "--server", server, *page)
-        await processes.until(lambda: len(seen.alive) == len(_WORKERS), stop)
-        demo.say(
-            f"two workers: {' and '.join(_WORKERS)}, who share the packs by {subjects.PARTITIONS} partitions of them"
-        )
-        demo.say(f"the fleet's page: http://{LOOPBACK}:{demo.page_port}/")
-        demo.opened(f"http://{LOOPBACK}:{demo.page_port}/")
+        await processes.until(lambda: len(observer.alive) == len(_WORKERS), stop)
+        demo.report(f"two workers: {' and '.join(_WORKERS)}, which share {subjects.PARTITIONS} partitions of the packs")
+        demo.report(f"the fleet's page: http://{LOOPBACK}:{demo.page_port}/")
+        demo.on_page(f"http://{LOOPBACK}:{demo.page_port}/")
         begin = datetime.fromtimestamp(begin_s, UTC).astimezone().replace(tzinfo=None).isoformat()
         edges = ("--packs", demo.packs, "--seed", SEED, "--speed", SPEED, "--begin", begin, "--mqtt", mqtt)
         await processes.start("edges", "simulate", *edges)
-        demo.say(
-            f"{demo.packs:,} edges, {SPEED:g} times as fast as real ones: each sends its block, a minute of samples, every "
+        demo.report(
+            f"{demo.packs:,} edges, {SPEED:g} times as fast as real ones: each sends a block, a minute of samples, every "
             f"{BLOCK_S / SPEED:g} s"
         )
-        await processes.until(lambda: seen.held >= seen.partitions, stop)  # workers hold those without a pack, too
-        await _report_progress(demo, seen, processes, stop)
+        await processes.until(
+            lambda: observer.held >= observer.partitions, stop
+        )  # workers also claim partitions without packs
+        await _report_progress(demo, observer, processes, stop)
         if not stop.is_set():
             await processes.stop("edges")
-            demo.say(await _counted(nc, seen, processes, stop))
+            demo.report(await _totals(nc, observer, processes, stop))
 
 
-async def _report_progress(demo: Demo, seen: DemoObserver, processes: "Processes", stop: asyncio.Event) -> None:
-    """Report the progress, and kill a worker in the middle; the other one takes over with the packs' next blocks."""
-    begin_s, kill_s, gone_s, spoke, done = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
+async def _report_progress(demo: Demo, observer: DemoObserver, processes: "Processes", stop: asyncio.Event) -> None:
+    """Report the progress, kill a worker after ``KILL_AFTER``, and report when the other one has taken over."""
+    begin_s, kill_s, killed_s, line_count, processed = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
     while not stop.is_set():
         now_s = time.monotonic() - begin_s
-        if kill_s == math.inf and now_s >= demo.seconds + (0.0 if gone_s == math.inf else PATIENCE_S):
+        if kill_s == math.inf and now_s >= demo.seconds + (0.0 if killed_s == math.inf else TIMEOUT_S):
             return
         processes.check()
         if now_s >= kill_s:
-            held = len(seen.alive[_KILLED].partitions) if _KILLED in seen.alive else 0
+            held = len(observer.alive[_KILLED].partitions) if _KILLED in observer.alive else 0
             await processes.kill(_KILLED)
-            seen.dead.add(_KILLED)
-            demo.say(
-                f"{now_s:4.0f} s  {_KILLED} is killed (SIGKILL), and with it all that it knew of its {held} partitions"
+            observer.dead.add(_KILLED)
+            demo.report(f"{now_s:4.0f} s  {_KILLED} is killed (SIGKILL), and its states of {held} partitions are lost")
+            kill_s, killed_s = math.inf, now_s
+        if killed_s < now_s and observer.held >= observer.partitions:
+            demo.report(
+                f"{now_s:4.0f} s  {_WORKERS[1]} has all partitions, {now_s - killed_s:.1f} s after the kill: it continues from "
+                f"{_KILLED}'s last checkpoints and reads the later blocks from the stream"
             )
-            kill_s, gone_s = math.inf, now_s
-        if gone_s < now_s and seen.held >= seen.partitions:
-            demo.say(
-                f"{now_s:4.0f} s  {_WORKERS[1]} has all partitions, {now_s - gone_s:.1f} s after the kill: it goes on from "
-                f"{_KILLED}'s last checkpoints, and reads from the stream what came since"
-            )
-            gone_s = math.inf
-        if now_s >= spoke * SAID_S:
-            demo.say(f"{now_s:4.0f} s  {_line(seen, done)}")
-            spoke, done = spoke + 1, seen.done
-            seen.errors.clear()
-            seen.worst_s = 0.0
+            killed_s = math.inf
+        if now_s >= line_count * PROGRESS_S:
+            demo.report(f"{now_s:4.0f} s  {_line(observer, processed)}")
+            line_count, processed = line_count + 1, observer.processed
+            observer.errors.clear()
+            observer.max_lag_s = 0.0
         await asyncio.sleep(0.1)
 
 
-def _line(seen: DemoObserver, done: int) -> str:
-    rate = f"{(seen.done - done) / SAID_S:4,.0f} blocks/s estimated, {seen.worst_s:.1f} s after they came at most"
-    error = f"; SOC {100.0 * float(np.mean(np.abs(seen.errors))):.1f} % off on average" if seen.errors else ""
-    return f"{rate}{error}; {_who(seen)} partitions"
+def _line(observer: DemoObserver, processed: int) -> str:
+    rate = f"{(observer.processed - processed) / PROGRESS_S:4,.0f} blocks/s estimated, at most {observer.max_lag_s:.1f} s after their arrival"
+    error = f"; mean SOC error {100.0 * float(np.mean(np.abs(observer.errors))):.1f} %" if observer.errors else ""
+    return f"{rate}{error}; {_partition_counts(observer)} partitions"
 
 
-def _who(seen: DemoObserver) -> str:
-    return " and ".join(f"{name} with {len(beat.partitions)}" for name, beat in sorted(seen.alive.items()))
-
-
-async def _counted(nc: Client, seen: DemoObserver, processes: "Processes", stop: asyncio.Event) -> str:
-    """Count the blocks that arrived and those that were processed."""
-    kept = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages
-
-    def all_taken() -> bool:
-        return seen.taken + sum(beat.counters.get("resends", 0) for beat in seen.alive.values()) >= kept
-
-    await processes.until(all_taken, stop)
-    within = seen.within[True] / max(1, seen.within.total())
-    counted = Counter[str]()
-    for beat in seen.alive.values():
-        counted.update(beat.counters)
-    return (
-        f"end: {kept:,} blocks came into the stream; {seen.taken:,} were taken, each once, {counted['resends']:,} had come "
-        f"before, {counted['lost_blocks']:,} lost; the true SOC was within two standard deviations in {100.0 * within:.0f} % "
-        f"of {seen.within.total():,} estimates"
+def _partition_counts(observer: DemoObserver) -> str:
+    return " and ".join(
+        f"{name} with {len(heartbeat.partitions)}" for name, heartbeat in sorted(observer.alive.items())
     )
 
 
-async def _listen(nc: Client, fleet: SimulatedFleet) -> DemoObserver:
-    """Receive all heartbeats, and the estimates of some packs."""
-    seen = DemoObserver({subjects.partition_of(name, subjects.PARTITIONS) for name in fleet.names})
+async def _totals(nc: Client, observer: DemoObserver, processes: "Processes", stop: asyncio.Event) -> str:
+    """Wait until all blocks are processed, and return the totals as text."""
+    stored = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages
+
+    def all_taken() -> bool:
+        return (
+            observer.counted_blocks + sum(heartbeat.counters.get("resends", 0) for heartbeat in observer.alive.values())
+            >= stored
+        )
+
+    await processes.until(all_taken, stop)
+    within = observer.within[True] / max(1, observer.within.total())
+    counters = Counter[str]()
+    for heartbeat in observer.alive.values():
+        counters.update(heartbeat.counters)
+    return (
+        f"end: {stored:,} blocks are in the stream; {observer.counted_blocks:,} were processed once, {counters['resends']:,} were repetitions"
+        f", {counters['lost_blocks']:,} lost; the true SOC was within two standard deviations in {100.0 * within:.0f} % "
+        f"of {observer.within.total():,} estimates"
+    )
+
+
+async def _observe(nc: Client, fleet: SimulatedFleet) -> DemoObserver:
+    """Subscribe to all heartbeats and to the estimates of some packs."""
+    observer = DemoObserver({subjects.partition_of(name, subjects.PARTITIONS) for name in fleet.names})
     index = {name: i for i, name in enumerate(fleet.names)}
 
-    async def beat(message: Msg) -> None:
-        heard = Heartbeat.model_validate_json(message.data)
-        seen.workers[heard.id] = time.monotonic(), heard
-        seen.worst_s = max(seen.worst_s, heard.lag_s or 0.0)
+    async def on_heartbeat(message: Msg) -> None:
+        heartbeat = Heartbeat.model_validate_json(message.data)
+        observer.workers[heartbeat.id] = time.monotonic(), heartbeat
+        observer.max_lag_s = max(observer.max_lag_s, heartbeat.lag_s or 0.0)
 
     async def state(message: Msg) -> None:
         estimate = json.loads(message.data)
         pack = np.array([index[message.subject.split(".")[1]]])
         error = estimate["soc"] - float(fleet.soc(pack, np.array([estimate["board_time_s"]]))[0])
-        seen.errors.append(error)
-        seen.within[abs(error) <= 2.0 * estimate["soc_std"]] += 1
+        observer.errors.append(error)
+        observer.within[abs(error) <= 2.0 * estimate["soc_std"]] += 1
 
-    await nc.subscribe(subjects.worker(), cb=beat)
-    for name in fleet.names[:: max(1, len(fleet.names) // LISTENED)]:
+    await nc.subscribe(subjects.worker(), cb=on_heartbeat)
+    for name in fleet.names[:: max(1, len(fleet.names) // OBSERVED_PACKS)]:
         await nc.subscribe(subjects.published(name, "state"), cb=state)
     await nc.flush()
-    return seen
+    return observer
 
 
 @contextlib.asynccontextmanager
 async def _connected(server: str, processes: "Processes", stop: asyncio.Event) -> AsyncIterator[Client]:
-    """Connect once the server has its streams."""
+    """Connect once the server has created its streams."""
     log = processes.folder / "server.log"
     await processes.until(lambda: "streams ready" in log.read_text(), stop)
     nc = await nats.connect(server)
@@ -266,14 +267,14 @@ async def _connected(server: str, processes: "Processes", stop: asyncio.Event) -
 
 
 class Processes:
-    """Commands of ``fleet`` as processes; the output of each is in a file of ``folder``."""
+    """Processes of ``fleet`` commands; each writes its output to a file in ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._running: dict[str, asyncio.subprocess.Process] = {}
 
     async def start(self, name: str, *arguments: object) -> asyncio.subprocess.Process:
-        """Start one in its own process group, so that Ctrl-C reaches this process only, which ends the others."""
+        """Start a command in a new session, so that Ctrl-C reaches only this process, which ends the others."""
         command = (sys.executable, "-c", "from bms_estimator.cli.main import main; main()", "fleet")
         with (self.folder / f"{name}.log").open("ab") as log:
             process = await asyncio.create_subprocess_exec(
@@ -288,73 +289,73 @@ class Processes:
         return process
 
     async def run(self, name: str, *arguments: object) -> None:
-        """Start one and wait for its end.
+        """Run a command to its end.
 
         Raises:
-            UserError: It fails.
+            UserError: The command fails.
         """
         process = await self.start(name, *arguments)
         if await process.wait():
             raise self._ended(name)
         del self._running[name]
 
-    async def until(self, true: Callable[[], bool], stop: asyncio.Event) -> None:
-        """Wait for something, or for ``stop``.
+    async def until(self, condition: Callable[[], bool], stop: asyncio.Event) -> None:
+        """Wait for a condition, or for ``stop``.
 
         Raises:
-            UserError: A process has ended, or it takes too long.
+            UserError: A process has ended, or the wait has timed out.
         """
-        end_s = time.monotonic() + PATIENCE_S
-        while not stop.is_set() and not true():
+        end_s = time.monotonic() + TIMEOUT_S
+        while not stop.is_set() and not condition():
             self.check()
             if time.monotonic() > end_s:
-                raise UserError(f"the demo has waited {PATIENCE_S:g} s in vain; {', '.join(self._running)} run")
+                raise UserError(f"the demo timed out after {TIMEOUT_S:g} s; running: {', '.join(self._running)}")
             await asyncio.sleep(HEARTBEAT_S / 10.0)
 
     def check(self) -> None:
         """Check that all processes run.
 
         Raises:
-            UserError: One has ended.
+            UserError: A process has ended.
         """
         for name, process in self._running.items():
             if process.returncode is not None:
                 raise self._ended(name)
 
     async def kill(self, name: str) -> None:
-        """Kill by SIGKILL."""
+        """Kill a process by SIGKILL."""
         process = self._running.pop(name)
         process.kill()
         await process.wait()
 
     async def stop(self, name: str) -> None:
-        """Stop by SIGTERM, then by SIGKILL."""
+        """Stop a process by SIGTERM; after a timeout by SIGKILL."""
         process = self._running.pop(name)
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
         try:
-            await asyncio.wait_for(process.wait(), PATIENCE_S)
+            await asyncio.wait_for(process.wait(), TIMEOUT_S)
         except TimeoutError:
             process.kill()
             await process.wait()
 
     async def end(self) -> None:
-        """All, the server last."""
+        """Stop all processes, the server last."""
         for name in reversed(list(self._running)):
             await self.stop(name)
 
     def _ended(self, name: str) -> UserError:
-        said = (self.folder / f"{name}.log").read_text(errors="replace").strip().splitlines()
-        return UserError(f"{name} has ended: {said[-1] if said else 'it said nothing'}")
+        lines = (self.folder / f"{name}.log").read_text(errors="replace").strip().splitlines()
+        return UserError(f"{name} has ended: {lines[-1] if lines else 'without output'}")
 
 
 def free_port() -> int:
-    """Return a free loopback port; never the same one twice in a row.
+    """Return a free loopback port, another one at each call.
 
     Raises:
-        UserError: It does not exist.
+        UserError: No port is free.
     """
-    for number in itertools.islice(_numbers, len(_PORTS)):
+    for number in itertools.islice(_port_offsets, len(_PORTS)):
         port = _PORTS[number % len(_PORTS)]
         with socket.socket() as probe, contextlib.suppress(OSError):
             probe.bind((LOOPBACK, port))

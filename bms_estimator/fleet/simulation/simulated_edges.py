@@ -1,4 +1,4 @@
-"""Sent and repeated blocks of simulated edges: the edge protocol for many at once, without I/O."""
+"""Block order of many simulated edges: which blocks each one sends and resends. No I/O."""
 
 from typing import NamedTuple
 
@@ -9,12 +9,12 @@ from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFle
 from bms_estimator.model.arrays import Floats
 
 RESEND_S = 5.0
-"""Minimum interval between two resends of a block [s]: a worker that lags repeats its request before the block can
+"""Minimum interval between two resends of a block [s]: a lagging worker repeats its request before the resent block can
 arrive."""
 
 
 class Due(NamedTuple):
-    """Blocks to be sent now, at most one a pack. Arrays of one shape."""
+    """Due blocks, at most one of each pack. Arrays of equal shape."""
 
     packs: Whole
     numbers: Whole
@@ -23,13 +23,13 @@ class Due(NamedTuple):
 
 
 class SimulatedEdges:
-    """Edges of a fleet. Each one can send any earlier block again, because blocks are computed when needed.
+    """Edges of a fleet. Each one can resend any block, because blocks are computed when needed.
 
     Args:
-        fleet: The packs.
+        fleet: Simulated packs.
         start_s: Wall clock at which the first block began [s since 1970].
-        speed: The packs' seconds per second.
-        last: Number of the last block; None without end.
+        speed: Simulated seconds per second.
+        last: Number of the last block; None: unlimited.
 
     Attributes:
         next: Number of the block that each edge sends next, shape (packs,).
@@ -42,18 +42,18 @@ class SimulatedEdges:
     def __init__(self, fleet: SimulatedFleet, *, start_s: float, speed: float, last: int | None = None) -> None:
         self._fleet, self._start_s, self._speed, self._last = fleet, start_s, speed, last
         self._index = {name: i for i, name in enumerate(fleet.names)}
-        self._later_s = (fleet.store - fleet.begin_ns) / 1e9
+        self._store_offset_s = (fleet.store - fleet.begin_ns) / 1e9
         self.next: Whole = np.ones(len(fleet.names), dtype=np.int64)
         self.safe, self._furthest = self.next.copy(), self.next.copy()
-        self._asked: Whole = np.zeros(len(fleet.names), dtype=np.int64)
-        self._asked_s: Floats = np.full(len(fleet.names), -np.inf)
+        self._requested: Whole = np.zeros(len(fleet.names), dtype=np.int64)
+        self._requested_s: Floats = np.full(len(fleet.names), -np.inf)
         self.resends = self.sent = self.again = 0
 
     def due(self, now_s: float, most: int) -> Due:
         """Return the blocks complete at ``now_s`` [s since 1970] and not sent yet; beyond ``most`` only the oldest."""
         ready_s = self._ready_s(self.next)
-        open_ = ready_s <= now_s if self._last is None else (ready_s <= now_s) & (self.next <= self._last)
-        packs = np.flatnonzero(open_)
+        is_due = ready_s <= now_s if self._last is None else (ready_s <= now_s) & (self.next <= self._last)
+        packs = np.flatnonzero(is_due)
         if packs.size > most:
             packs = packs[np.argpartition(ready_s[packs], most)[:most]]
         numbers = self.next[packs]
@@ -63,19 +63,21 @@ class SimulatedEdges:
         self._furthest[packs] = np.maximum(self._furthest[packs], self.next[packs])
         return Due(packs, numbers, ready_s[packs])
 
-    def hear(self, pack: str, awaits: BlockRequest, now_s: float) -> bool:
-        """Receive a worker's message at ``now_s``. Returns whether the pack is one of these, and the store its."""
+    def receive_reply(self, pack: str, reply: BlockRequest, now_s: float) -> bool:
+        """Process a worker's reply; return False if it is for another fleet's pack or store."""
         i = self._index.get(pack)
-        if i is None or awaits.store != self._fleet.store[i]:
+        if i is None or reply.store != self._fleet.store[i]:
             return False
-        known, self.safe[i] = self.safe[i], max(self.safe[i], awaits.number)
-        if awaits.resend:
+        safe_before, self.safe[i] = self.safe[i], max(self.safe[i], reply.number)
+        if reply.resend:
             self.resends += 1
-            if awaits.number >= known and (awaits.number != self._asked[i] or now_s - self._asked_s[i] >= RESEND_S):
-                self.next[i] = min(self.next[i], awaits.number)
-                self._asked[i], self._asked_s[i] = awaits.number, now_s
-        else:  # what went before this program began is not sent again
-            self.next[i] = max(self.next[i], awaits.number)
+            if reply.number >= safe_before and (
+                reply.number != self._requested[i] or now_s - self._requested_s[i] >= RESEND_S
+            ):
+                self.next[i] = min(self.next[i], reply.number)
+                self._requested[i], self._requested_s[i] = reply.number, now_s
+        else:  # skip blocks that an earlier run has sent
+            self.next[i] = max(self.next[i], reply.number)
         return True
 
     @property
@@ -84,11 +86,11 @@ class SimulatedEdges:
         return self._last is not None and bool((self.next > self._last).all())
 
     def lag_s(self, now_s: float) -> float:
-        """Age of the oldest complete block that was not sent [s]; 0 without one."""
+        """Return the age of the oldest due block that was not sent [s]; 0 without one."""
         ready_s = self._ready_s(self.next)
         return 0.0 if self.done else max(0.0, now_s - float(ready_s.min()))
 
     def _ready_s(self, numbers: Whole) -> Floats:
-        """Wall clock at which a block of each pack is complete [s since 1970]."""
-        own_s = self._later_s + numbers * BLOCK_S
-        return self._start_s + own_s / self._speed
+        """Return the wall clock at which a block of each pack is complete [s since 1970]."""
+        end_s = self._store_offset_s + numbers * BLOCK_S
+        return self._start_s + end_s / self._speed

@@ -1,11 +1,11 @@
-"""Packs that never were: what a fleet's edges would send, and the truth beside it.
+"""Simulated packs: the blocks of their edges, and the ground truth.
 
-Nothing is stored: a block is a function of seed, pack and number, so that 100,000 packs need no disk and any block
-can be sent again. SOC is a closed form of time, so that whoever estimates can be judged at any moment.
+A block is a function of seed, pack and number. Therefore 100,000 packs need no storage, and any block can be resent. SOC is a
+closed-form function of time, so that estimates can be compared with the truth at any time.
 
-A pack swings slowly between full and empty, with a pulse each minute that takes no charge over it. Its voltage is that of
-the shipped cell's OCV and elements (2.4), with two branches of fixed time constants; capacity and resistances differ
-from what the table of packs declares, as ages and makes do.
+The SOC of a pack oscillates slowly, with a zero-mean current pulse each minute. The voltage follows from the shipped cell's OCV
+and elements (2.4), with two branches of fixed time constants. Capacity and resistances differ from the values in the table of
+packs, because real packs age and vary.
 """
 
 import math
@@ -27,27 +27,28 @@ Whole = NDArray[np.int64]
 Bits = NDArray[np.uint64]
 
 BLOCK_S = 60
-"""Length of a block at one sample a second [s]."""
-MIDDLE_SOC, SWING_SOC = 0.52, 0.36
-"""SOC range is 0.16 to 0.88."""
-SLOW, QUICK, QUICKNESS = 0.75, 0.25, 3.3
-"""Shares of the two oscillations of SOC, and how much faster the second is."""
-MIN_S, MAX_S = 8 * 3600.0, 24 * 3600.0
-"""Period of the slow one [s]: up to 0.43 C."""
+"""Duration of a block [s], with one sample a second."""
+MEAN_SOC, SOC_AMPLITUDE = 0.52, 0.36
+"""Mean and amplitude of SOC: it stays within 0.16 to 0.88."""
+SLOW_PART, FAST_PART, FREQUENCY_RATIO = 0.75, 0.25, 3.3
+"""Relative amplitudes of the two oscillations of SOC, and the ratio of their frequencies."""
+MIN_PERIOD_S, MAX_PERIOD_S = 8 * 3600.0, 24 * 3600.0
+"""Range of the period of the slow oscillation [s]; the current reaches 0.43 C."""
 PULSE_S, PULSE_C = 15, 0.6
-"""Length [s] and maximum size [C] of a pulse in each minute; a third of it in the other direction follows."""
-PAST_MINUTES = 5
-"""Number of pulses that still have an effect: e^(-300/20) of a pulse remains after that."""
+"""Duration [s] and maximum current [C-rate] of the pulse in each minute. A third of the current in the other direction follows, so
+that the mean is zero."""
+PAST_PULSES = 5
+"""Number of past pulses in the branch current; after these, e^(-300/20) of a pulse remains."""
 TAU_TS_S, TAU_TL_S = 20.0, 800.0
 """Time constants of the branches [s]."""
 JITTER_S = 0.02
 """Maximum error of a real device's timestamps [s]."""
-WORN, NEW, TIRED = 0.75, 1.02, 0.6
-"""Range of true to declared capacity, and its value for a pack with a defect."""
-MAX_RESISTANCE, FAILING = 1.6, 3.0
-"""True resistances to the cell file's: the range begins at 0.8; and those of a pack about to fail."""
-OUTLIERS = 0.01
-"""Part of the packs that is tired, and as many again that are failing."""
+MIN_CAPACITY, MAX_CAPACITY, WORN_OUT_CAPACITY = 0.75, 1.02, 0.6
+"""Range of true divided by rated capacity, and its value for a worn-out pack."""
+MAX_RESISTANCE, FAILING_RESISTANCE = 1.6, 3.0
+"""Maximum of true divided by the cell file's resistance, whose range begins at 0.8, and its value for a failing pack."""
+OUTLIER_FRACTION = 0.01
+"""Fraction of packs that are worn out, and fraction that are failing."""
 
 
 class Kind(NamedTuple):
@@ -68,7 +69,7 @@ KINDS = (
     Kind("nca", 3.0, 20, 10, 0.02, 0.1, thermometer=False),
     Kind("ncr18650", None, 10, 4, 0.01, 0.02, thermometer=True),
 )
-"""A store at home, a bicycle, a scooter, a pack of the shipped cell: a quarter of the fleet each."""
+"""Home storage, bicycle, scooter, and a pack of the shipped cell: a quarter of the fleet each."""
 
 COLUMNS = (
     "pack",
@@ -96,27 +97,27 @@ class _Curves:
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth of each pack, which no estimator gets. Arrays of shape (packs,)."""
+    """Ground truth of each pack, hidden from the estimators. Arrays of shape (packs,)."""
 
     capacity_as: Floats
-    """[A s]"""
+    """True capacity [A s]."""
     resistance: Floats
-    """Times the cell file's elements."""
+    """True divided by the cell file's resistances."""
 
 
 class SimulatedFleet:
-    """A fleet of ``packs`` packs.
+    """Fleet of simulated packs.
 
     Args:
         packs: Number of packs.
-        seed: Another seed, another fleet.
-        begin_ns: When the first edge's store was made [ns since 1970]; the others' follow within a minute.
+        seed: Seed of all random values.
+        begin_ns: Creation time of the first edge's store [ns since 1970]; the others follow within a minute.
         prefix: Prefix of the packs' names.
 
     Attributes:
         names: Names of the packs.
-        store: When each edge's store was made [ns since 1970], shape (packs,).
-        truth: The true values.
+        store: Creation time of each edge's store [ns since 1970], shape (packs,).
+        truth: Ground truth of the packs.
     """
 
     def __init__(self, packs: int, *, seed: int, begin_ns: int, prefix: str = "sim") -> None:
@@ -125,29 +126,29 @@ class SimulatedFleet:
         self._salt = np.uint64(seed % 2**64)
         self._curves = tuple(_Curves(kind) for kind in KINDS)
         self._kind = pack % len(KINDS)
-        within_s = self._dice(pack, 1) * BLOCK_S
+        within_s = self._uniform(pack, 1) * BLOCK_S
         self.begin_ns = begin_ns
         self.store: Whole = begin_ns + (within_s * 1e9).astype(np.int64)
-        self._omega = 2.0 * math.pi / (MIN_S + (MAX_S - MIN_S) * self._dice(pack, 2))
-        self._phase = 2.0 * math.pi * self._dice(pack, 3)
-        self._warm_c = np.round(20.0 + 10.0 * self._dice(pack, 4), 1)
-        self.truth = self._aged(pack)
+        self._omega = 2.0 * math.pi / (MIN_PERIOD_S + (MAX_PERIOD_S - MIN_PERIOD_S) * self._uniform(pack, 2))
+        self._phase = 2.0 * math.pi * self._uniform(pack, 3)
+        self._temperature_c = np.round(20.0 + 10.0 * self._uniform(pack, 4), 1)
+        self.truth = self._draw_truth(pack)
 
-    def _aged(self, pack: Whole) -> Truth:
-        fate = self._dice(pack, 5)
-        capacity = WORN + (NEW - WORN) * self._dice(pack, 6)
-        resistance = 0.8 + (MAX_RESISTANCE - 0.8) * self._dice(pack, 7)
-        capacity[fate < OUTLIERS] = TIRED
-        resistance[(fate >= OUTLIERS) & (fate < 2 * OUTLIERS)] = FAILING
+    def _draw_truth(self, pack: Whole) -> Truth:
+        defect = self._uniform(pack, 5)
+        capacity = MIN_CAPACITY + (MAX_CAPACITY - MIN_CAPACITY) * self._uniform(pack, 6)
+        resistance = 0.8 + (MAX_RESISTANCE - 0.8) * self._uniform(pack, 7)
+        capacity[defect < OUTLIER_FRACTION] = WORN_OUT_CAPACITY
+        resistance[(defect >= OUTLIER_FRACTION) & (defect < 2 * OUTLIER_FRACTION)] = FAILING_RESISTANCE
         rated_as = np.array([curves.capacity_as for curves in self._curves])
         return Truth(capacity * rated_as[self._kind], resistance)
 
     def kind(self, pack: int) -> Kind:
-        """Return the declared kind of a pack."""
+        """Return the kind of a pack as in the table of packs."""
         return KINDS[self._kind[pack]]
 
     def blocks(self, packs: Whole, numbers: Whole, arrival_s: Floats) -> Iterator[bytes]:
-        """Return one block for each pack, as edges send it.
+        """Yield one encoded block of each pack, as edges send it.
 
         Args:
             packs: Numbers of the packs, shape (n,).
@@ -159,19 +160,19 @@ class SimulatedFleet:
             yield encode(Block(int(self.store[pack]), number, 1, float(arrival_s[i]), samples[i]))
 
     def samples(self, packs: Whole, numbers: Whole) -> SampleBlock:
-        """One block of each of ``packs``: shape (n, BLOCK_S), dtype ``SAMPLE``."""
+        """Return the samples of one block of each pack: shape (n, BLOCK_S), dtype ``SAMPLE``."""
         second = np.arange(BLOCK_S)
         index = ((numbers[:, None] - 1) * BLOCK_S + second).astype(np.int64)
         samples = np.zeros((packs.size, BLOCK_S), dtype=SAMPLE)
-        samples["time_s"] = index + np.round(JITTER_S * self._dice(packs[:, None], 8, index), 3)
-        samples["temperature_c"] = self._warm_c[packs][:, None]
+        samples["time_s"] = index + np.round(JITTER_S * self._uniform(packs[:, None], 8, index), 3)
+        samples["temperature_c"] = self._temperature_c[packs][:, None]
         for kind, (declared, curves) in enumerate(zip(KINDS, self._curves, strict=True)):
             rows = np.flatnonzero(self._kind[packs] == kind)
             if rows.size:
                 current_a, voltage_v = self._terminals(packs[rows], numbers[rows], curves)
-                noise = [self._dice(packs[rows][:, None], what, index[rows]) - 0.5 for what in (9, 10)]
-                samples["current_a"][rows] = _read(current_a, noise[0], declared.current_resolution_a)
-                samples["voltage_v"][rows] = _read(voltage_v, 2.0 * noise[1], declared.voltage_resolution_v)
+                noise = [self._uniform(packs[rows][:, None], stream, index[rows]) - 0.5 for stream in (9, 10)]
+                samples["current_a"][rows] = _quantize(current_a, noise[0], declared.current_resolution_a)
+                samples["voltage_v"][rows] = _quantize(voltage_v, 2.0 * noise[1], declared.voltage_resolution_v)
                 if not declared.thermometer:
                     samples["temperature_c"][rows] = np.nan
         return samples
@@ -183,7 +184,7 @@ class SimulatedFleet:
         return "\n".join(lines) + "\n"
 
     def truth_table(self) -> str:
-        """Return the ground truth as CSV, which no estimator gets."""
+        """Return the ground truth as CSV, for comparison with estimates."""
         rows = zip(self.names, self.truth.capacity_as.tolist(), self.truth.resistance.tolist(), strict=True)
         lines = ["pack,capacity_ah,resistance_factor"]
         lines += [f"{name},{capacity_as / 3600.0:.4f},{factor:.4f}" for name, capacity_as, factor in rows]
@@ -198,42 +199,48 @@ class SimulatedFleet:
 
     def _slow_soc(self, packs: Whole, time_s: Floats) -> Floats:
         angle = self._omega[packs] * time_s + self._phase[packs]
-        return MIDDLE_SOC + SWING_SOC * (SLOW * np.sin(angle) + QUICK * np.sin(QUICKNESS * angle))
+        return MEAN_SOC + SOC_AMPLITUDE * (SLOW_PART * np.sin(angle) + FAST_PART * np.sin(FREQUENCY_RATIO * angle))
 
     def _slow_a(self, packs: Whole, time_s: Floats) -> Floats:
         """Return the current [A] that produces ``_slow_soc``, positive on discharge."""
         angle, omega = self._omega[packs] * time_s + self._phase[packs], self._omega[packs]
-        slope = SWING_SOC * omega * (SLOW * np.cos(angle) + QUICKNESS * QUICK * np.cos(QUICKNESS * angle))
+        slope = (
+            SOC_AMPLITUDE
+            * omega
+            * (SLOW_PART * np.cos(angle) + FREQUENCY_RATIO * FAST_PART * np.cos(FREQUENCY_RATIO * angle))
+        )
         return -slope * self.truth.capacity_as[packs]
 
     def _pulse_a(self, packs: Whole, minutes: Whole) -> Floats:
-        """Height [A] of the pulse in each minute."""
-        return PULSE_C / 3600.0 * self.truth.capacity_as[packs] * (2.0 * self._dice(packs, 11, minutes) - 1.0)
+        """Return the current of the pulse in each minute [A]."""
+        return PULSE_C / 3600.0 * self.truth.capacity_as[packs] * (2.0 * self._uniform(packs, 11, minutes) - 1.0)
 
     def _terminals(self, packs: Whole, numbers: Whole, curves: _Curves) -> tuple[Floats, Floats]:
         """Return true current [A] and voltage [V] in each second of a block, both of shape (n, BLOCK_S)."""
         column, second = packs[:, None], np.arange(BLOCK_S, dtype=np.float64)
         time_s = (numbers[:, None] - 1) * BLOCK_S + second
-        slow_a, late_a = self._slow_a(column, time_s), self._slow_a(column, time_s - TAU_TL_S)
-        past_a = self._pulse_a(column, numbers[:, None] - 1 - np.arange(PAST_MINUTES + 1))
+        slow_a, delayed_a = self._slow_a(column, time_s), self._slow_a(column, time_s - TAU_TL_S)
+        past_a = self._pulse_a(column, numbers[:, None] - 1 - np.arange(PAST_PULSES + 1))
         current_a = slow_a + past_a[:, :1] * _PULSE
-        felt_a = slow_a + past_a[:, :1] * _RESPONSE + (past_a[:, 1:] @ _REST)[:, None] * np.exp(-second / TAU_TS_S)
+        branch_a = (
+            slow_a + past_a[:, :1] * _RESPONSE + (past_a[:, 1:] @ _REMAINDER)[:, None] * np.exp(-second / TAU_TS_S)
+        )
         soc = self.soc(column, time_s)
         ocv_v, r_s, r_ts, r_tl = (
             np.interp(soc, curves.soc, values) for values in (curves.ocv_v, curves.r_s, curves.r_ts, curves.r_tl)
         )
-        drop_v = r_s * current_a + r_ts * felt_a + r_tl * late_a  # (2.4)
+        drop_v = r_s * current_a + r_ts * branch_a + r_tl * delayed_a  # (2.4)
         return current_a, ocv_v - self.truth.resistance[column] * drop_v
 
-    def _dice(self, packs: Whole, what: int, index: Whole | int = 0) -> Floats:
-        """Numbers in [0, 1) that follow from seed, pack, ``what`` and ``index`` alone."""
-        key = _mixed(np.asarray(packs, dtype=np.uint64) + (self._salt << np.uint64(32)) + np.uint64(what << 56))
+    def _uniform(self, packs: Whole, stream: int, index: Whole | int = 0) -> Floats:
+        """Return uniform numbers in [0, 1) that depend only on seed, pack, ``stream`` and ``index``."""
+        key = _mixed(np.asarray(packs, dtype=np.uint64) + (self._salt << np.uint64(32)) + np.uint64(stream << 56))
         bits = _mixed(key + np.asarray(index).astype(np.uint64)) >> np.uint64(11)
         return bits.astype(np.float64) * 2.0**-53
 
 
 def _mixed(bits: Bits) -> Bits:
-    """Bits that look random: the finalizer of SplitMix64 (Steele et al., OOPSLA 2014)."""
+    """Return pseudo-random bits: the finalizer of SplitMix64 (Steele et al., OOPSLA 2014)."""
     with np.errstate(over="ignore"):
         bits = bits * np.uint64(0x9E3779B97F4A7C15) + np.uint64(0x9E3779B97F4A7C15)
         bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -246,14 +253,14 @@ def _row(name: str, kind: Kind) -> str:
     return ",".join(map(str, (name, *cells, kind.voltage_resolution_v, kind.current_resolution_a, 1)))
 
 
-def _read(values: Floats, noise: Floats, step: float) -> Floats:
-    """Quantize ``values`` with ``noise`` to the steps of a converter."""
-    read: Floats = np.rint(values / step + noise) * step
-    return read
+def _quantize(values: Floats, noise: Floats, step: float) -> Floats:
+    """Quantize ``values`` with ``noise`` [steps] to the steps of an A/D converter."""
+    quantized: Floats = np.rint(values / step + noise) * step
+    return quantized
 
 
 def _pulse_charge_s(second: Floats) -> Floats:
-    """Charge that a pulse of 1 A has taken ``second`` into its minute [A s]."""
+    """Return the charge of a pulse of 1 A up to ``second`` of its minute [A s]."""
     return np.where(second < PULSE_S, second, PULSE_S * (BLOCK_S - second) / (BLOCK_S - PULSE_S))
 
 
@@ -261,16 +268,16 @@ def _response() -> tuple[Floats, Floats, Floats]:
     """Return the response to a pulse of 1 A [A].
 
     Returns:
-        The current in each second of its minute; what a branch of ``TAU_TS_S`` feels of it then; its effect at the
-        beginning of each of the following minutes.
+        The current in each second of the minute; the current of the branch ``TAU_TS_S`` in each second; its remainder at the
+        beginning of each following minute.
     """
     second = np.arange(BLOCK_S)
     pulse = np.where(second < PULSE_S, 1.0, -PULSE_S / (BLOCK_S - PULSE_S))
     decay = math.exp(-1.0 / TAU_TS_S)
-    felt = np.zeros(BLOCK_S + 1)
+    branch_current = np.zeros(BLOCK_S + 1)
     for i in second:
-        felt[i + 1] = felt[i] * decay + pulse[i] * (1.0 - decay)
-    return pulse, felt[:-1], felt[-1] * np.exp(-np.arange(PAST_MINUTES) * BLOCK_S / TAU_TS_S)
+        branch_current[i + 1] = branch_current[i] * decay + pulse[i] * (1.0 - decay)
+    return pulse, branch_current[:-1], branch_current[-1] * np.exp(-np.arange(PAST_PULSES) * BLOCK_S / TAU_TS_S)
 
 
-_PULSE, _RESPONSE, _REST = _response()
+_PULSE, _RESPONSE, _REMAINDER = _response()

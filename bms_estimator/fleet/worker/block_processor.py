@@ -1,4 +1,4 @@
-"""Estimation of a block of the pack on the bench, and its publications."""
+"""Estimation of one block of a pack, and the messages that result from it."""
 
 import math
 from collections import Counter
@@ -14,7 +14,7 @@ from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
 from bms_estimator.fleet.worker import hour_summary
-from bms_estimator.fleet.worker.density import MAX_STORE_S
+from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
 from bms_estimator.fleet.worker.pack_state import PACK_STATE, Fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads import Payload
@@ -25,21 +25,22 @@ from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 from bms_estimator.telemetry.state import make_state_payload
 
-LAST_WALL_S = 2.0**34
-"""No wall clock shows a later time: the year 2514 [s since 1970]."""
-AT_ONCE = 4096
-"""Samples: each estimate takes 200 bytes, for each type of pack in each partition."""
-Published = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
-"""Topics ``state`` and ``parameters``, and the rows of finished hours, each with an id."""
+MAX_WALL_S = 2.0**34
+"""Latest plausible wall clock [s since 1970]: the year 2514."""
+MAX_PART_SAMPLES = 4096
+"""Maximum number of samples estimated at a time. It limits the buffer of estimates, 200 bytes each, which every type of pack
+in every partition has."""
+Publications = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
+"""Payloads of the topics ``state`` and ``parameters``, and the rows of finished hours, each with its message id."""
 
 
 class BlockProcessor:
-    """Steps the pack on the bench.
+    """Processor of the pack whose state is in the work record.
 
     Args:
-        record: The bench's, shape (1,), dtype ``PACK_STATE``.
-        counters: Faults are counted here.
-        wall: Wall clock of the publications [s since 1970].
+        record: Work record, shape (1,), dtype ``PACK_STATE``.
+        counters: Counters of the partition; updated.
+        wall: Wall clock for publish times [s since 1970].
     """
 
     def __init__(self, record: NDArray[np.void], counters: Counter[str], wall: Callable[[], float]) -> None:
@@ -48,149 +49,158 @@ class BlockProcessor:
         self._observer = record[0]["estimator"]["observer"]
         self._window = Window()
 
-    def step(self, pack: str, block: Block, of_type: PackType, former: Fields | None) -> Published:
-        """Take the pack's next block.
+    def step(self, pack: str, block: Block, pack_type: PackType, former: Fields | None) -> Publications:
+        """Estimate the pack's next block and return the resulting messages.
 
         Args:
             pack: Name of the pack.
-            block: It; time stamps that cannot be become NaN.
-            of_type: The pack's type; its estimator works on the bench.
-            former: Fields of its estimator as another version left them; None: they are on the bench.
+            block: The block; its implausible timestamps are set to NaN.
+            pack_type: Type of the pack; its estimator is bound to the work record.
+            former: Estimator fields in the layout of another version; None if the work record has them.
         """
         self._check_times(block.samples)
-        self._settle(of_type, former, block)
-        rows, turned = self._turn_hour(pack, block, of_type)
-        self._follow_clock(of_type.estimator, block)
+        self._restore_or_reset(pack_type, former, block)
+        rows, is_new_hour = self._roll_over_hour(pack, block, pack_type)
+        self._resume_after_store_change(pack_type.estimator, block)
         self._window.previous_end_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
-        self._note_clock(block)
+        self._record_last_sample(block)
         arrival_s, now_s = self._arrival_s(block), self._wall()
-        self._estimate(block, of_type, arrival_s)
-        state = self._state(of_type, now_s)
-        told = turned and state is not None
-        return state, self._parameters(of_type.estimator, arrival_s, now_s) if told else None, rows
+        self._estimate(block, pack_type, arrival_s)
+        state = self._state(pack_type, now_s)
+        parameters = (
+            self._parameters(pack_type.estimator, arrival_s, now_s) if is_new_hour and state is not None else None
+        )
+        return state, parameters, rows
 
-    def forget(self) -> None:
+    def reset_window(self) -> None:
         """Drop the samples of a failed block from the publish window."""
         self._window = Window()
 
-    def _settle(self, of_type: PackType, former: Fields | None, block: Block) -> None:
-        """Make the pack one of its type: as it is, or taken over from other settings or from another version."""
+    def _restore_or_reset(self, pack_type: PackType, former: Fields | None, block: Block) -> None:
+        """Adapt the pack's state to its present settings and this version; reset it if they are incompatible."""
         d, record = self._delivery, self._record[0]
-        same = _digest(d["made_of"]) == of_type.made_of
+        same = _digest(d["made_of"]) == pack_type.config_digest
         if same and former is None:
             return
-        known = bool(self._hour["store"])
-        if _digest(d["meaning"]) == of_type.state_digest and known:
+        has_state = bool(self._hour["store"])
+        if _digest(d["meaning"]) == pack_type.state_digest and has_state:
             saved = former if former is not None else {name: v.copy() for name, v in fields(self._record["estimator"])}
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
-            wrong = restore_state(of_type.estimator, saved if same else without_observer(saved), self._unseen_s(block))
+            error = restore_state(pack_type.estimator, saved if same else without_observer(saved), self._gap_s(block))
             self._flows["sums"]["counted"] = self._hour["outliers_before"] = self._hour["searches_before"] = 0
-            self._counters["not_taken_over" if wrong else "taken_over"] += 1
+            self._counters["not_taken_over" if error else "taken_over"] += 1
         else:
             for name in ("flow", "hour", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
             d["clock"] = d["hour"] = 0
-            self._counters["begun_anew"] += known
-        d["made_of"], d["meaning"] = of_type.made_of, of_type.state_digest
+            self._counters["begun_anew"] += has_state
+        d["made_of"], d["meaning"] = pack_type.config_digest, pack_type.state_digest
 
-    def _follow_clock(self, estimator: Estimator, block: Block) -> None:
-        """Time stamps of another store have nothing to do with those before."""
+    def _resume_after_store_change(self, estimator: Estimator, block: Block) -> None:
+        """Resume the estimator after a gap if the block is of another store, because timestamps count from the store's creation."""
         if int(self._delivery["clock"]) == block.store:
             return
         self._flows["sums"]["counted"] = 0
         if self._observer["started"] and math.isfinite(
             self._observer["time_s"]
-        ):  # otherwise it already awaits another store
-            estimator.resume(self._unseen_s(block))
+        ):  # otherwise the estimator has already been resumed
+            estimator.resume(self._gap_s(block))
 
-    def _estimate(self, block: Block, of_type: PackType, arrival_s: float) -> None:
-        """Step the samples, and pass the estimates to hour, meter and window."""
+    def _estimate(self, block: Block, pack_type: PackType, arrival_s: float) -> None:
+        """Estimate the samples; add the estimates to the hour, the charge and energy meter and the publish window."""
         observer, counters = self._observer, self._counters
         accepted, steps_back = int(observer["samples"]), int(observer["time_steps_back"])
-        of_type.meter.continue_from(ChargeEnergy(*(float(self._flows[name]) for name in ChargeEnergy._fields)))
+        pack_type.meter.continue_from(ChargeEnergy(*(float(self._flows[name]) for name in ChargeEnergy._fields)))
         for part in _parts(block):
-            trace = of_type.estimator.run(part.samples)
-            hour_summary.add(self._record["hour"], trace, part, of_type.estimator)
-            of_type.meter.add(trace)
+            trace = pack_type.estimator.run(part.samples)
+            hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
+            pack_type.meter.add(trace)
             self._window.add(trace, arrival_s)
         counters["blocks"] += 1
         counters["samples"] += block.samples.size
         counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted)
         counters["time_steps_back"] += int(observer["time_steps_back"]) - steps_back
 
-    def _state(self, of_type: PackType, now_s: float) -> bytes | None:
-        """Topic ``state`` of the window; None when no sample was accepted."""
-        flow, window, d = of_type.meter.flow, self._window.take(), self._delivery
+    def _state(self, pack_type: PackType, now_s: float) -> bytes | None:
+        """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
+        flow, window, d = pack_type.meter.flow, self._window.take(), self._delivery
         for name, value in zip(ChargeEnergy._fields, flow, strict=True):
             self._flows[name] = value
         if window is None:
             return None
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
-        remaining = remaining_charge(of_type.estimator, window.current_a)
-        return _json(make_state_payload(window, remaining, counters, now_s, flow, of_type.capacity_ah))
+        remaining = remaining_charge(pack_type.estimator, window.current_a)
+        return _json(make_state_payload(window, remaining, counters, now_s, flow, pack_type.capacity_ah))
 
     def _parameters(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
-        """Topic ``parameters``; ages in it are counted from the samples' arrival, however late they are worked off."""
+        """Return the payload of topic ``parameters``; its ages refer to the arrival of the samples, not to their processing."""
         return _json(make_parameters_payload(estimator, arrival_s).model_copy(update={"publish_time": iso_utc(now_s)}))
 
     def _check_times(self, samples: SampleBlock) -> None:
         """Set implausible timestamps to NaN."""
         times = samples["time_s"]
-        fit = (times >= 0.0) & (times <= MAX_STORE_S)
-        if not fit.all():
-            self._counters["no_time"] += int(np.count_nonzero(~fit))
-            times[~fit] = math.nan
+        plausible = (times >= 0.0) & (times <= MAX_TIMESTAMP_S)
+        if not plausible.all():
+            self._counters["no_time"] += int(np.count_nonzero(~plausible))
+            times[~plausible] = math.nan
 
-    def _unseen_s(self, block: Block) -> float:
+    def _gap_s(self, block: Block) -> float:
         """Return the length of the gap before a block [s]; infinite if unknown."""
-        d, known_s = self._delivery, _known(block.samples)
-        if not d["clock"] or not known_s.size:
+        d, times_s = self._delivery, _finite_times_s(block.samples)
+        if not d["clock"] or not times_s.size:
             return math.inf
-        passed_s = (block.store - int(d["clock"])) / 1e9 + (float(known_s[0]) - float(d["last_s"]))
+        passed_s = (block.store - int(d["clock"])) / 1e9 + (float(times_s[0]) - float(d["last_s"]))
         return passed_s if passed_s >= 0.0 else math.inf
 
-    def _turn_hour(self, pack: str, block: Block, of_type: PackType) -> tuple[tuple[tuple[str, bytes], ...], bool]:
-        """Finish the hour before if a block is of a later one, and begin the new one; return the row if it has data."""
-        present, before = hour_summary.hour_of(block), int(self._delivery["hour"])
-        if present <= before:
+    def _roll_over_hour(
+        self, pack: str, block: Block, pack_type: PackType
+    ) -> tuple[tuple[tuple[str, bytes], ...], bool]:
+        """Finish the current hour if the block is of a later one, and begin the new hour.
+
+        Returns:
+            The row of the finished hour, none for the first hour of a pack; True if a new hour has begun.
+        """
+        hour, current = hour_summary.hour_of(block), int(self._delivery["hour"])
+        if hour <= current:
             return (), False
         rows: tuple[tuple[str, bytes], ...] = ()
-        if before:
-            settings = of_type.settings.model_copy(update={"name": pack})
+        if current:
+            settings = pack_type.settings.model_copy(update={"name": pack})
             rows = (
                 (
-                    f"{pack}.{before}",
-                    _json(hour_summary.row(settings, before, self._record["hour"], of_type.estimator)),
+                    f"{pack}.{current}",
+                    _json(hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)),
                 ),
             )
         hour_summary.begin(self._record["hour"], self._record[0]["estimator"])
-        self._delivery["hour"] = present
+        self._delivery["hour"] = hour
         return rows, True
 
-    def _note_clock(self, block: Block) -> None:
-        known_s = _known(block.samples)
-        if known_s.size:
-            self._delivery["clock"], self._delivery["last_s"] = block.store, known_s[-1]
+    def _record_last_sample(self, block: Block) -> None:
+        """Record store and timestamp of the last valid sample."""
+        times_s = _finite_times_s(block.samples)
+        if times_s.size:
+            self._delivery["clock"], self._delivery["last_s"] = block.store, times_s[-1]
 
     def _arrival_s(self, block: Block) -> float:
-        """Wall clock at the last sample's arrival at the edge, if plausible [s since 1970]."""
-        if 0.0 <= block.arrival_s <= LAST_WALL_S:
+        """Return when the last sample arrived at the edge; if that is implausible, the time of the last sample [s since 1970]."""
+        if 0.0 <= block.arrival_s <= MAX_WALL_S:
             return block.arrival_s
         self._counters["no_arrival"] += 1
         return block.store / 1e9 + float(self._delivery["last_s"])
 
 
 def _parts(block: Block) -> Iterator[Block]:
-    """Split a block into parts of at most ``AT_ONCE`` samples."""
-    if block.samples.size <= AT_ONCE:
+    """Split a block into parts of at most ``MAX_PART_SAMPLES`` samples."""
+    if block.samples.size <= MAX_PART_SAMPLES:
         yield block
         return
-    for first in range(0, block.samples.size, AT_ONCE):
-        yield replace(block, samples=block.samples[first : first + AT_ONCE])
+    for first in range(0, block.samples.size, MAX_PART_SAMPLES):
+        yield replace(block, samples=block.samples[first : first + MAX_PART_SAMPLES])
 
 
-def _known(samples: SampleBlock) -> NDArray[np.float64]:
-    """Time stamps that can be [s]."""
+def _finite_times_s(samples: SampleBlock) -> NDArray[np.float64]:
+    """Return the finite timestamps [s]."""
     times: NDArray[np.float64] = samples["time_s"]
     return times[np.isfinite(times)]
 

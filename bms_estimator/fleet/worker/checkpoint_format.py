@@ -1,4 +1,4 @@
-"""A partition as bytes, from which another worker continues.
+"""Checkpoint format: a partition as bytes, from which another worker continues.
 
 Layout, little-endian::
 
@@ -6,13 +6,14 @@ Layout, little-endian::
     8  format   u2   1
     10 length   u4   of the header
     14 crc      u4   CRC-32 of the header
-    18 header        JSON: partition, sequence, counters, spans of packs that wait, layouts of records, entries
+    18 header        JSON: partition, sequence, counters, spans of deferred messages, record layouts, number of entries
     .. chunks        length u4, CRC-32 u4, entries; the last has length 0
 
     entry:  layout u1, length of the name u2, of the data u4, name, data
 
-A layout names each field of a record, so that a version with other fields can take the state over. Layout 255 is a
-block that an earlier version stored here for an unknown pack: this pack's messages are read from the stream again.
+An entry is one pack's packed record; its layout is an index into the header's layouts. A layout names each field of a record,
+so that a version with other fields can restore the state. Layout 255 is not an index: an earlier version stored blocks of
+unknown packs here. The messages of such a pack are read from the stream again.
 """
 
 import json
@@ -30,68 +31,72 @@ from bms_estimator.kernels.packed_record import symmetry_map
 
 FORMAT = 1
 CHUNK_BYTES = 1 << 20
+"""Size at which a chunk of entries is finished [bytes]."""
 _HEAD, _CHUNK, _ENTRY = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
 _MAGIC, _FORMER_BLOCK, _MAX_LAYOUTS = b"BMSFLEET", 255, 255
-_MAX_RECORD = 1 << 24
+_MAX_RECORD_BYTES = 1 << 24
+"""Maximum size of a record that a layout from a checkpoint may describe [bytes]."""
 
 
 class CheckpointError(ValueError):
-    """Error in a checkpoint, and what can be done."""
+    """Unreadable checkpoint; the message gives the reason and a remedy."""
 
 
 class PreviousLayoutState(NamedTuple):
-    """A pack's state as another version left it."""
+    """A pack's record in the layout of another version."""
 
     layout: str
     packed: bytes
 
 
 def layout_of(dtype: np.dtype[Any]) -> str:
-    """Return the fields of a record as text."""
-    return json.dumps(_described(dtype), separators=(",", ":"))
+    """Return the fields of a record dtype as JSON text."""
+    return json.dumps(_layout_fields(dtype), separators=(",", ":"))
 
 
 def dtype_of(layout: str) -> np.dtype[Any]:
     """Return the dtype that ``layout_of`` describes.
 
     Raises:
-        ValueError: It describes none.
+        ValueError: The text does not describe a record.
     """
     try:
-        dtype = np.dtype(_fields(json.loads(layout)))
+        dtype = np.dtype(_dtype_fields(json.loads(layout)))
     except (TypeError, KeyError, IndexError, RecursionError, OverflowError) as error:
         raise ValueError(f"no layout of a record: {error}") from None
-    if dtype.itemsize > _MAX_RECORD:
+    if dtype.itemsize > _MAX_RECORD_BYTES:
         raise ValueError(f"{dtype.itemsize} bytes: no layout of a pack's record")
     symmetry_map(dtype)  # rejects data that are not whole words
     return dtype
 
 
-def _described(dtype: np.dtype[Any]) -> list[Any]:
+def _layout_fields(dtype: np.dtype[Any]) -> list[Any]:
     return [
-        [name, _described(part) if part.names else part.base.str, list(part.shape)]
+        [name, _layout_fields(part) if part.names else part.base.str, list(part.shape)]
         for name, (part, *_) in (dtype.fields or {}).items()
     ]
 
 
-def _fields(described: Any) -> list[Any]:
-    return [(name, _fields(part) if isinstance(part, list) else part, tuple(shape)) for name, part, shape in described]
+def _dtype_fields(layout: Any) -> list[Any]:
+    return [
+        (name, _dtype_fields(part) if isinstance(part, list) else part, tuple(shape)) for name, part, shape in layout
+    ]
 
 
-PRESENT = layout_of(PACK_STATE)
+CURRENT_LAYOUT = layout_of(PACK_STATE)
 
 
 @dataclass(frozen=True)
 class PartitionCheckpoint:
-    """A partition at one moment.
+    """Snapshot of a partition.
 
     Attributes:
         number: Number of the partition.
-        sequence: Stream sequence of the last included message.
+        sequence: Stream sequence number of the last included message.
         counters: Counts by name.
-        packs: Packed records by pack, of this version's layout.
-        former: Records of packs by another version.
-        deferred: Messages of packs that wait, in the order of their turns.
+        packs: Packed records in this version's layout, by pack.
+        former: Packed records in another version's layout, by pack.
+        deferred: Deferred messages by pack, in the order in which the packs are served.
     """
 
     number: int
@@ -103,7 +108,7 @@ class PartitionCheckpoint:
 
     def chunks(self) -> Iterator[bytes]:
         """Yield the checkpoint's bytes in chunks of about ``CHUNK_BYTES``."""
-        layouts = list(dict.fromkeys([PRESENT, *(each.layout for each in self.former.values())]))[:_MAX_LAYOUTS]
+        layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.former.values())]))[:_MAX_LAYOUTS]
         header = {
             "partition": self.number,
             "sequence": self.sequence,
@@ -120,16 +125,16 @@ class PartitionCheckpoint:
             entries.append(entry)
             size += len(entry)
             if size >= CHUNK_BYTES:
-                yield b"".join([*chunk, *_sealed(entries)])
+                yield b"".join([*chunk, *_framed_chunk(entries)])
                 chunk, entries, size = [], [], 0
-        yield b"".join([*chunk, *(_sealed(entries) if entries else ()), _CHUNK.pack(0, 0)])
+        yield b"".join([*chunk, *(_framed_chunk(entries) if entries else ()), _CHUNK.pack(0, 0)])
 
     def _entries(self, layouts: list[str]) -> Iterator[bytes]:
-        places = {layout: place for place, layout in enumerate(layouts)}
+        indexes = {layout: place for place, layout in enumerate(layouts)}
         for pack, packed in self.packs.items():
-            yield _entry(places[PRESENT], pack, packed)
+            yield _entry(indexes[CURRENT_LAYOUT], pack, packed)
         for pack, former in self.former.items():
-            yield _entry(places[former.layout], pack, former.packed)
+            yield _entry(indexes[former.layout], pack, former.packed)
 
 
 def _entry(layout: int, pack: str, data: bytes) -> bytes:
@@ -137,7 +142,7 @@ def _entry(layout: int, pack: str, data: bytes) -> bytes:
     return _ENTRY.pack(layout, len(name), len(data)) + name + data
 
 
-def _sealed(entries: list[bytes]) -> tuple[bytes, bytes]:
+def _framed_chunk(entries: list[bytes]) -> tuple[bytes, bytes]:
     content = b"".join(entries)
     return _CHUNK.pack(len(content), zlib.crc32(content)), content
 
@@ -146,7 +151,7 @@ def read_checkpoint(data: bytes) -> PartitionCheckpoint:
     """Read a whole checkpoint written by ``PartitionCheckpoint.chunks``.
 
     Raises:
-        CheckpointError: It is damaged, not a checkpoint, or of an unknown version.
+        CheckpointError: The bytes are damaged, not a checkpoint, or of an unknown format.
     """
     try:
         return _read(memoryview(data))
@@ -159,28 +164,28 @@ def read_checkpoint(data: bytes) -> PartitionCheckpoint:
 def _read(data: memoryview) -> PartitionCheckpoint:
     magic, version, length, crc = _HEAD.unpack_from(data)
     if magic != _MAGIC:
-        raise CheckpointError("these bytes do not begin as a checkpoint does")
+        raise CheckpointError("not a checkpoint: its first bytes differ")
     if version != FORMAT:
         raise CheckpointError(
             f"the checkpoint is of format {version}, this version reads {FORMAT}: start the version that wrote it, "
-            "or begin anew from the stream"
+            "or start without a checkpoint, from the stream"
         )
     at = _HEAD.size + length
-    header = json.loads(_checked(data[_HEAD.size : at], length, crc))
+    header = json.loads(_verified(data[_HEAD.size : at], length, crc))
     layouts = [json.dumps(layout, separators=(",", ":")) for layout in header["layouts"]]
     for layout in layouts:
-        if layout != PRESENT:
+        if layout != CURRENT_LAYOUT:
             dtype_of(layout)
     packs: dict[str, bytes] = {}
     former: dict[str, PreviousLayoutState] = {}
     sequence = int(header["sequence"])
     deferred = {str(pack): Span(int(first), int(last)) for pack, (first, last) in header.get("deferred", {}).items()}
     entries = 0
-    for place, pack, content in _entries_of(data, at):
+    for place, pack, content in _read_entries(data, at):
         entries += 1
         if place == _FORMER_BLOCK:
             deferred[pack] = Span(1, sequence)
-        elif layouts[place] == PRESENT:
+        elif layouts[place] == CURRENT_LAYOUT:
             packs[pack] = content
         else:
             former[pack] = PreviousLayoutState(layouts[place], content)
@@ -190,7 +195,7 @@ def _read(data: memoryview) -> PartitionCheckpoint:
     return PartitionCheckpoint(int(header["partition"]), sequence, counters, packs, former, deferred)
 
 
-def _entries_of(data: memoryview, at: int) -> Iterator[tuple[int, str, bytes]]:
+def _read_entries(data: memoryview, at: int) -> Iterator[tuple[int, str, bytes]]:
     while True:
         length, crc = _CHUNK.unpack_from(data, at)
         at += _CHUNK.size
@@ -198,20 +203,21 @@ def _entries_of(data: memoryview, at: int) -> Iterator[tuple[int, str, bytes]]:
             if at != len(data) or crc:
                 raise CheckpointError(f"the checkpoint is damaged: its end is at {at} of {len(data)} bytes")
             return
-        chunk = _checked(data[at : at + length], length, crc)
+        chunk = _verified(data[at : at + length], length, crc)
         at += length
         place = 0
         while place < length:
-            layout, of_name, of_data = _ENTRY.unpack_from(chunk, place)
+            layout, name_bytes, data_bytes = _ENTRY.unpack_from(chunk, place)
             place += _ENTRY.size
-            name, content = chunk[place : place + of_name], chunk[place + of_name : place + of_name + of_data]
-            place += of_name + of_data
+            name, content = (
+                chunk[place : place + name_bytes],
+                chunk[place + name_bytes : place + name_bytes + data_bytes],
+            )
+            place += name_bytes + data_bytes
             yield layout, str(name, "utf-8"), bytes(content)
 
 
-def _checked(part: memoryview, length: int, crc: int) -> bytes:
+def _verified(part: memoryview, length: int, crc: int) -> bytes:
     if len(part) != length or zlib.crc32(part) != crc:
-        raise CheckpointError(
-            f"the checkpoint is damaged: {len(part)} of {length} bytes, or not those that were written"
-        )
+        raise CheckpointError(f"the checkpoint is damaged: {len(part)} of {length} bytes, or a wrong checksum")
     return bytes(part)

@@ -1,8 +1,9 @@
-"""Checkpoints of partitions on the server: the bytes as objects of their own, and a pointer to them in a key-value bucket.
+"""Checkpoints of partitions on the server: the bytes in an object store, and a pointer to them in a key-value bucket.
 
-A pointer is replaced only with knowledge of its last revision. A worker that takes over a partition replaces it at once with its
-own name. A slow or suspended former owner then fails to write its next checkpoint. An object is written before the pointer that
-names it. A pointer also names the next object, so that the object of a worker killed between the two writes is found and removed.
+A pointer is replaced by compare-and-set on its revision. A worker that takes over a partition first writes its own name into
+the pointer, so that the next checkpoint of a slow or suspended former owner fails. An object is written before the pointer that
+names it. A pointer also names the next object, so that the next owner finds and removes the object of a worker that was killed
+between the two writes.
 """
 
 import asyncio
@@ -27,10 +28,10 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stored_messages import stored
 from bms_estimator.model.clock import iso_utc
 
-KEPT = 2
-"""Number of stored checkpoints of a partition: the last, and one before in case the last is damaged."""
-PIECE_BYTES = 128 << 10
-"""Size of an object's chunk, one message [bytes]."""
+CHECKPOINTS_PER_PARTITION = 2
+"""Number of stored checkpoints of a partition: the last one, and the one before in case the last one is damaged."""
+MESSAGE_BYTES = 128 << 10
+"""Size of one message of an object [bytes]."""
 _STREAM = f"OBJ_{subjects.STATES_BUCKET}"
 
 log = structlog.get_logger(__name__)
@@ -41,17 +42,18 @@ class FencedError(Exception):
 
 
 class CheckpointInfo(BaseModel):
-    """A checkpoint."""
+    """Metadata of a stored checkpoint."""
 
     model_config = ConfigDict(frozen=True)
 
     sequence: int
-    """Sequence number of the last message of the stream in it."""
+    """Stream sequence number of the last included message."""
     object: str
-    """Name in the bucket of states."""
+    """Name in the object store ``states``."""
     bytes: int
+    """Size [bytes]."""
     made_s: float
-    """Wall clock [s since 1970]."""
+    """Wall clock at which it was written [s since 1970]."""
 
 
 class Pointer(BaseModel):
@@ -62,14 +64,14 @@ class Pointer(BaseModel):
     worker: str
     """Name of the owning worker."""
     next: str
-    """The object that this worker writes next, maybe in part."""
+    """Name of the object that this worker writes next; it may exist in part."""
     kept: tuple[CheckpointInfo, ...] = ()
-    """The newest first."""
+    """Stored checkpoints, newest first."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """Claim of a partition: the pointer as this worker wrote it."""
+    """Claim of a partition: the pointer that this worker wrote last, and its revision."""
 
     partition: int
     revision: int
@@ -80,30 +82,28 @@ class CheckpointStore:
     """Checkpoints of one tenant.
 
     Args:
-        nc: Connected.
-        worker: Our name.
-        checkpoints: Bucket of the pointers.
-        states: Bucket of the objects.
+        nc: Connection of the tenant.
+        worker: Name of this worker.
+        checkpoints: Key-value bucket of the pointers.
+        states: Object store of the checkpoints.
     """
 
     def __init__(self, nc: Client, worker: str, checkpoints: KeyValue, states: ObjectStore) -> None:
         self._nc, self._js, self._worker = nc, nc.jetstream(), worker
         self._checkpoints, self._states = checkpoints, states
         self._names = NUID()
-        self._tried: dict[int, Pointer] = {}  # last written checkpoint by partition, possibly without a response
+        self._last_sent: dict[int, Pointer] = {}  # last pointer sent by partition, possibly without a response
 
     async def claim(self, partition: int) -> Claim:
-        """Take a partition over, whoever had it.
+        """Take over a partition from its present owner, if any.
 
         Raises:
-            FencedError: Another worker does it at the same time.
+            FencedError: Another worker has claimed it at the same time.
         """
-        found = await self._look(partition)
-        revision, before = found or (0, None)
-        kept = before.kept if before else ()
-        claim = await self._replace(partition, revision, kept)
-        if before:
-            await self._remove(before.next)
+        revision, previous = await self._read_pointer(partition) or (0, None)
+        claim = await self._write_pointer(partition, revision, previous.kept if previous else ())
+        if previous:
+            await self._remove_object(previous.next)
         return claim
 
     async def confirm_claim(self, claim: Claim) -> Claim:
@@ -112,23 +112,23 @@ class CheckpointStore:
         Raises:
             FencedError: Another worker has taken the partition over.
         """
-        found = await self._look(claim.partition)
-        if found is None or found[0] <= claim.revision:  # less: of a node that is behind
+        found = await self._read_pointer(claim.partition)
+        if found is None or found[0] <= claim.revision:  # a lower revision comes from a lagging node
             return claim
-        if found[1] == self._tried.get(claim.partition):
+        if found[1] == self._last_sent.get(claim.partition):
             return Claim(claim.partition, *found)
         raise FencedError(found[1].worker)
 
     async def load(self, claim: Claim) -> AsyncGenerator[tuple[CheckpointInfo, bytes], None]:
-        """Yield the readable checkpoints, the newest first; log why others are not readable."""
+        """Yield the readable checkpoints, newest first; log the damaged ones."""
         for kept in claim.pointer.kept:
             try:
-                data = await self._read(kept.object)
+                data = await self._read_object(kept.object)
             except (NotFoundError, BadObjectMetaError):
                 data = None
             if data is None:
                 log.warning(
-                    "a checkpoint is damaged: going on from what was before",
+                    "a checkpoint is damaged: continuing from an earlier one, or from the stream",
                     partition=claim.partition,
                     object=kept.object,
                     sequence=kept.sequence,
@@ -140,28 +140,28 @@ class CheckpointStore:
         """Write a checkpoint.
 
         Args:
-            claim: As the last write left it.
-            sequence: Stream sequence of the last included message.
-            chunks: Bytes of the checkpoint; taken in a thread.
+            claim: Claim that the last write returned.
+            sequence: Stream sequence number of the last included message.
+            chunks: Bytes of the checkpoint; iterated in a thread.
 
         Raises:
             FencedError: Another worker has taken the partition over; nothing was changed.
         """
         claim = await self.confirm_claim(claim)
         pointer = claim.pointer
-        size = await self._put(pointer.next, chunks)
+        size = await self._write_object(pointer.next, chunks)
         made = CheckpointInfo(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())
         kept = (made, *pointer.kept)
         try:
-            claim = await self._replace(claim.partition, claim.revision, kept[:KEPT])
+            claim = await self._write_pointer(claim.partition, claim.revision, kept[:CHECKPOINTS_PER_PARTITION])
         except FencedError:
-            await self._remove(pointer.next)
+            await self._remove_object(pointer.next)
             raise
-        for old in kept[KEPT:]:
-            await self._remove(old.object)
+        for old in kept[CHECKPOINTS_PER_PARTITION:]:
+            await self._remove_object(old.object)
         return claim
 
-    async def _look(self, partition: int) -> tuple[int, Pointer] | None:
+    async def _read_pointer(self, partition: int) -> tuple[int, Pointer] | None:
         try:
             entry = await self._checkpoints.get(_key(partition))
         except KeyNotFoundError:
@@ -169,34 +169,34 @@ class CheckpointStore:
         try:
             return entry.revision or 0, Pointer.model_validate_json(entry.value or b"")
         except ValidationError as error:
-            log.warning("what points to a checkpoint cannot be read", partition=partition, reason=str(error))
+            log.warning("the pointer to a checkpoint cannot be read", partition=partition, reason=str(error))
             return entry.revision or 0, Pointer(worker="", next="")
 
-    async def _replace(self, partition: int, revision: int, kept: tuple[CheckpointInfo, ...]) -> Claim:
+    async def _write_pointer(self, partition: int, revision: int, kept: tuple[CheckpointInfo, ...]) -> Claim:
         pointer = Pointer(worker=self._worker, next=f"p{partition}-{self._names.next().decode()}", kept=kept)
-        self._tried[partition] = pointer
+        self._last_sent[partition] = pointer
         try:
             data = pointer.model_dump_json().encode()
             return Claim(partition, await self._checkpoints.update(_key(partition), data, revision), pointer)
         except KeyWrongLastSequenceError:
-            found = await self._look(partition)
-            if found and found[1] == pointer:  # it was written, and the answer lost
+            found = await self._read_pointer(partition)
+            if found and found[1] == pointer:  # the write succeeded, but its response was lost
                 return Claim(partition, found[0], pointer)
             raise FencedError(found[1].worker if found else "") from None
 
-    async def _put(self, name: str, chunks: Iterator[bytes]) -> int:
-        """Write an object; how many bytes it has.
+    async def _write_object(self, name: str, chunks: Iterator[bytes]) -> int:
+        """Write an object and return its size [bytes].
 
-        As ``ObjectStore.put`` does, but for where the pieces are: under the object's name, so that those of one that was never
-        finished are found.
+        Unlike ``ObjectStore.put``, the subject of the chunks contains the object's name, so that the chunks of an unfinished
+        object can be found and removed.
         """
-        subject, digest, size, count = _pieces(name), hashlib.sha256(), 0, 0
-        await self._js.purge_stream(_STREAM, subject=subject)  # of an attempt before
-        reader = io.BufferedReader(_Chunks(chunks), PIECE_BYTES)
-        while piece := await asyncio.to_thread(reader.read, PIECE_BYTES):
-            await self._js.publish(subject, piece)
-            digest.update(piece)
-            size, count = size + len(piece), count + 1
+        subject, digest, size, count = _chunk_subject(name), hashlib.sha256(), 0, 0
+        await self._js.purge_stream(_STREAM, subject=subject)  # of an earlier attempt
+        reader = io.BufferedReader(_ChunkReader(chunks), MESSAGE_BYTES)
+        while message := await asyncio.to_thread(reader.read, MESSAGE_BYTES):
+            await self._js.publish(subject, message)
+            digest.update(message)
+            size, count = size + len(message), count + 1
         info = ObjectInfo(
             name=name,
             bucket=subjects.STATES_BUCKET,
@@ -206,11 +206,11 @@ class CheckpointStore:
             digest=_digest(digest.digest()),
             mtime=iso_utc(time.time()),
         )
-        described = json.dumps(info.as_dict()).encode()
-        await self._js.publish(_described(name), described, headers={Header.ROLLUP: MSG_ROLLUP_SUBJECT})
+        metadata = json.dumps(info.as_dict()).encode()
+        await self._js.publish(_metadata_subject(name), metadata, headers={Header.ROLLUP: MSG_ROLLUP_SUBJECT})
         return size
 
-    async def _read(self, name: str) -> bytes | None:
+    async def _read_object(self, name: str) -> bytes | None:
         """Return the bytes of an object; None if some are missing or the digest differs."""
         info = await self._states.get_info(name)
         subject = f"$O.{subjects.STATES_BUCKET}.C.{info.nuid}"
@@ -218,15 +218,15 @@ class CheckpointStore:
         data = b"".join([message.data async for message in stored(self._nc, _STREAM, subject, 1, last)])
         return data if len(data) == info.size and info.digest == _digest(hashlib.sha256(data).digest()) else None
 
-    async def _remove(self, name: str) -> None:
+    async def _remove_object(self, name: str) -> None:
         """Remove an object and its metadata, as far as they exist; a deletion marker would keep its name forever."""
         if name:
-            for subject in (_described(name), _pieces(name)):
+            for subject in (_metadata_subject(name), _chunk_subject(name)):
                 await self._js.purge_stream(_STREAM, subject=subject)
 
 
-class _Chunks(io.RawIOBase):
-    """Bytes in pieces as a file."""
+class _ChunkReader(io.RawIOBase):
+    """Iterator of bytes as a readable file."""
 
     def __init__(self, chunks: Iterator[bytes]) -> None:
         self._chunks, self._rest = chunks, memoryview(b"")
@@ -246,12 +246,12 @@ class _Chunks(io.RawIOBase):
         return count
 
 
-def _pieces(name: str) -> str:
+def _chunk_subject(name: str) -> str:
     """Return the subject of an object's chunks."""
     return f"$O.{subjects.STATES_BUCKET}.C.{name}"
 
 
-def _described(name: str) -> str:
+def _metadata_subject(name: str) -> str:
     """Return the subject of an object's metadata."""
     return f"$O.{subjects.STATES_BUCKET}.M.{base64.urlsafe_b64encode(name.encode()).decode()}"
 

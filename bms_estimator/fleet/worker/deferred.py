@@ -1,29 +1,29 @@
-"""Deferred messages. They stay in the stream and are read from there when it is the pack's turn."""
+"""Deferred messages. They stay in the stream and are read from there when their pack is served."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 MAX_UNKNOWN = 8192
-"""Maximum number of unknown packs of a partition that wait: a server without tenants accepts any name."""
+"""Maximum number of packs of a partition with deferred messages: a server without tenants accepts any name."""
 
 
 class Span(NamedTuple):
-    """Messages of one pack that wait."""
+    """Range of the deferred messages of one pack."""
 
     first: int
-    """Sequence of the first of them in the stream."""
+    """Stream sequence number of the first one."""
     last: int
-    """Sequence of the last of them."""
+    """Stream sequence number of the last one."""
 
 
 class Deferred:
-    """The packs that wait, in the order of their turns.
+    """Queue of the packs with deferred messages, in the order in which they are served.
 
     Args:
-        spans: Span of each pack that waits.
+        spans: Span of each pack.
 
     Attributes:
-        is_saved: True if a checkpoint covers all messages that were taken from here.
+        is_saved: True if the last checkpoint includes all processed deferred messages.
     """
 
     def __init__(self, spans: Mapping[str, Span] | None = None) -> None:
@@ -57,7 +57,7 @@ class Deferred:
         return pack, span
 
     def advance(self, pack: str, sequence: int) -> None:
-        """Note that the messages of a pack up to a sequence were taken or are not in the stream any more."""
+        """Record that a pack's messages up to ``sequence`` were processed or have left the stream."""
         span = self._spans.get(pack)
         if span is None:  # cleared while the message was read
             return

@@ -1,4 +1,4 @@
-"""Plausibility of a block's number of samples. Pure."""
+"""Plausibility of a block's number of samples."""
 
 import numpy as np
 
@@ -6,16 +6,15 @@ from bms_estimator.edge.batching import MAX_SAMPLES as EDGE_MAX_SAMPLES
 from bms_estimator.model.sample import SampleBlock
 
 MAX_RATE_HZ = 1000.0
-"""Highest sample rate of a source."""
+"""Maximum sample rate of a source."""
 MAX_SAMPLES = 20_000
-"""Maximum number of samples in a block: the limit of earlier edges; later ones cut at ``EDGE_MAX_SAMPLES``."""
-MAX_STORE_S = 2.0**33
-"""Latest plausible time stamp [s since the store was created]: a store may be created in 1970 on a machine without
-the time."""
+"""Maximum number of samples in a block: the limit of earlier edge versions. Present edges use ``EDGE_MAX_SAMPLES``."""
+MAX_TIMESTAMP_S = 2.0**33
+"""Latest plausible timestamp [s since the store was created]. A machine whose clock is not set creates its store in 1970."""
 
 
 def density_fault(samples: SampleBlock) -> str:
-    """Return why a block has too many samples, in total or for its duration; empty if it has not.
+    """Return why a block has too many samples, in total or for its duration; empty if the number is plausible.
 
     ``EDGE_MAX_SAMPLES`` are allowed beyond the rate, because an edge's clock may stand still while a source's is
     corrected.
@@ -23,7 +22,7 @@ def density_fault(samples: SampleBlock) -> str:
     if samples.size > MAX_SAMPLES:
         return f"{samples.size} samples: at most {MAX_SAMPLES}"
     times = samples["time_s"]
-    plausible = times[(times >= 0.0) & (times <= MAX_STORE_S)]
+    plausible = times[(times >= 0.0) & (times <= MAX_TIMESTAMP_S)]
     elapsed_s = float(np.ptp(plausible)) if plausible.size else 0.0
     if samples.size <= EDGE_MAX_SAMPLES + MAX_RATE_HZ * elapsed_s:
         return ""

@@ -1,6 +1,6 @@
 """Summary of an hour's blocks as one row.
 
-The row follows from the stream alone: whoever works a pack's blocks off once more makes the same one.
+The row depends only on the stream: a worker that processes the blocks again computes an equal row.
 """
 
 import math
@@ -23,7 +23,7 @@ from bms_estimator.settings.pack import PackSettings
 __all__ = ["HOUR_S", "HOUR_SUMS", "Hour", "add", "begin", "hour_of", "row"]
 
 REST_C = 0.01
-"""A pack rests while its current is at most this, in units of the current that empties it in an hour."""
+"""Maximum current of a resting pack, as a C-rate [1/h]."""
 
 Sums = NDArray[np.void]
 """Shape (1,), dtype ``HOUR_SUMS``; all zero before the first block."""
@@ -39,11 +39,11 @@ def hour_of(block: Block) -> int:
 
 
 def begin(sums: Sums, record: np.void) -> None:
-    """Begin an hour: counts are of it alone, the last sample stays.
+    """Begin an hour: reset its counts and keep the last sample.
 
     Args:
-        sums: Updated in place.
-        record: The pack's, of dtype ESTIMATOR_STATE.
+        sums: Updated in position.
+        record: The pack's record of dtype ``ESTIMATOR_STATE``.
     """
     for name in OF_HOUR:
         sums[name] = 0
@@ -51,13 +51,13 @@ def begin(sums: Sums, record: np.void) -> None:
 
 
 def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> None:
-    """Add a block.
+    """Add a block to the sums of the hour.
 
     Args:
-        sums: Updated in place.
-        trace: What the estimator made of the block's samples.
+        sums: Updated in position.
+        trace: Estimates of the block's samples.
         block: Block of samples.
-        estimator: Estimator of the pack, or of any of its type: only its settings are read.
+        estimator: Estimator of the pack, or of another pack of its type: only its settings are read.
     """
     settings = estimator.settings[0]
     rest_a = REST_C * float(settings["capacity_as"]) / HOUR_S
@@ -70,7 +70,7 @@ def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour
     """Return the row of a finished hour.
 
     Args:
-        pack: Type of the pack, from its settings.
+        pack: Settings of the pack.
         hour: Hours since 1970.
         sums: Sums of the hour; read only.
         estimator: Estimator with the pack's state at the hour's end; read only.
@@ -78,14 +78,15 @@ def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour
     h, record = sums[0], estimator.record[0]
     capacity_ah = None if isinstance(estimator.cell, FuelCellModel) else float(estimator.cell.cell.capacity_ah)
     unknown = dict.fromkeys(Hour.model_fields)
-    values = unknown | _counted(h, record) | _measured(h) | _observed(record) | _identified(estimator)
-    named = {"pack": pack.name, "cell": pack.cell, "series": pack.series, "parallel": pack.parallel}
+    values = unknown | _counts(h, record) | _measurements(h) | _observer_values(record) | _filter_values(estimator)
+    identity = {"pack": pack.name, "cell": pack.cell, "series": pack.series, "parallel": pack.parallel}
     return Hour.model_validate(
-        {name: _finite(value) for name, value in values.items()} | named | {"hour": hour, "capacity_ah": capacity_ah}
+        {name: _finite(value) for name, value in values.items()} | identity | {"hour": hour, "capacity_ah": capacity_ah}
     )
 
 
-def _counted(h: np.void, record: np.void) -> dict[str, object]:
+def _counts(h: np.void, record: np.void) -> dict[str, object]:
+    """Return counts, durations and totals."""
     return {
         "samples": int(h["samples"]),
         "dropped": int(h["dropped"]),
@@ -103,8 +104,8 @@ def _counted(h: np.void, record: np.void) -> dict[str, object]:
     }
 
 
-def _measured(h: np.void) -> dict[str, object]:
-    """Means and extremes; nothing where no sample was accepted."""
+def _measurements(h: np.void) -> dict[str, object]:
+    """Return means and extremes; empty if no sample was accepted."""
     values: dict[str, object] = {}
     for names, unit, count in (
         ("voltage", "v", "samples"),
@@ -125,8 +126,8 @@ def _measured(h: np.void) -> dict[str, object]:
     return values
 
 
-def _observed(record: np.void) -> dict[str, object]:
-    """Return the observer's values; empty before the first sample."""
+def _observer_values(record: np.void) -> dict[str, object]:
+    """Return the observer's values; empty before the pack's first sample."""
     s = record["observer"]
     return {name: float(s[name]) for name in ("soc", "delta_1", "delta_2")} if s["started"] else {}
 
@@ -134,7 +135,7 @@ def _observed(record: np.void) -> dict[str, object]:
 class _Element(NamedTuple):
     name: str
     unit: str
-    place: int
+    position: int
 
 
 _ELEMENTS = (
@@ -146,7 +147,7 @@ _ELEMENTS = (
 )
 
 
-def _identified(estimator: Estimator) -> dict[str, object]:
+def _filter_values(estimator: Estimator) -> dict[str, object]:
     """Return the filter's values; empty without a filter and before its first sample."""
     record, settings = estimator.record[0], estimator.settings_record[0]
     f = record["filter"]
@@ -173,9 +174,9 @@ def _identified(estimator: Estimator) -> dict[str, object]:
     for name, (j, k) in _CORRELATIONS.items():
         values[name] = _correlation(covariance, j, k)
     for element in _ELEMENTS:
-        value = float(record["elements"]["value"][element.place])
+        value = float(record["elements"]["value"][element.position])
         values[f"{element.name}_{element.unit}"] = value
-        variance = float(record["elements"]["ln_variance"][element.place])
+        variance = float(record["elements"]["ln_variance"][element.position])
         values[f"{element.name}_std_{element.unit}"] = value * math.sqrt(variance)
     return values
 

@@ -1,4 +1,4 @@
-"""All that a worker computes with, called once before it connects: nothing compiles while the server waits for an answer."""
+"""Kernel warm-up of a worker. Kernels are compiled before it connects, so that no response to the server is late."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ HOUR_NS = 3600 * 10**9
 
 
 def load_fleet_kernels() -> None:
-    """Load the kernels that blocks go through; a first start compiles them."""
+    """Load the kernels that process blocks. The first start on a machine compiles them."""
     cell, settings = load_cell(CELL), Settings()
     samples = np.zeros(3, dtype=SAMPLE)
     samples["time_s"], samples["voltage_v"] = np.arange(3.0), cell.cell.nominal_voltage_v

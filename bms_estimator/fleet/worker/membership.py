@@ -1,9 +1,9 @@
-"""Assignment of partitions to workers, which each worker computes from heartbeats. Pure: the clock is an argument.
+"""Assignment of partitions to workers, computed by each worker from heartbeats. The clock is an argument.
 
 Rendezvous hashing (Thaler and Ravishankar, "A name-based mapping scheme for rendezvous", 1996) with bounded loads (Mirrokni,
 Thorup and Zadimoghaddam, "Consistent hashing with bounded loads", 2016): a partition belongs to the worker with the highest
-hash of the pair, unless that worker has its fair number already. Therefore few partitions move when a worker joins or leaves, and
-no worker has more than its share. The workers need not agree at each moment: the server's pin decides.
+hash of the pair, unless that worker already has its fair share. Therefore few partitions move when a worker joins or leaves.
+The workers may disagree for a moment, because the server pins each partition to one worker.
 """
 
 import math
@@ -15,15 +15,17 @@ from bms_estimator.fleet.heartbeat import DEAD_S
 
 
 def assign_partitions(partitions: int, workers: Collection[str]) -> list[str]:
-    """Assign each partition to one of the workers, of which there is at least one."""
-    most = math.ceil(partitions / len(workers))
-    has = Counter[str]()
-    found = []
+    """Return the worker of each partition; ``workers`` must not be empty."""
+    max_partitions = math.ceil(partitions / len(workers))
+    counts = Counter[str]()
+    owners = []
     for number in range(partitions):
-        owner = max((each for each in workers if has[each] < most), key=lambda worker: _weight(number, worker))
-        has[owner] += 1
-        found.append(owner)
-    return found
+        owner = max(
+            (each for each in workers if counts[each] < max_partitions), key=lambda worker: _weight(number, worker)
+        )
+        counts[owner] += 1
+        owners.append(owner)
+    return owners
 
 
 def _weight(partition: int, worker: str) -> tuple[bytes, str]:
@@ -31,35 +33,37 @@ def _weight(partition: int, worker: str) -> tuple[bytes, str]:
 
 
 class Membership:
-    """The workers that are alive.
+    """Set of the workers that are alive; times are of one monotonic clock [s].
 
     Args:
-        me: Always one of them, until it leaves.
+        me: Name of this worker, which is always a member.
     """
 
     def __init__(self, me: str) -> None:
         self.me = me
-        self._heard: dict[str, float] = {}
+        self._last_heartbeat_s: dict[str, float] = {}
         self._alive: list[str] = []
         self._share: set[int] = set()
 
     def on_heartbeat(self, worker: str, now_s: float, *, leaving: bool = False) -> bool:
-        """Take a heartbeat, at ``now_s`` of a monotonic clock. Whether the worker is new."""
+        """Process a heartbeat; return True if the worker is a new one."""
         if leaving:
-            self._heard.pop(worker, None)
+            self._last_heartbeat_s.pop(worker, None)
             return False
-        new = worker not in self._heard
-        self._heard[worker] = now_s
+        new = worker not in self._last_heartbeat_s
+        self._last_heartbeat_s[worker] = now_s
         return new and worker != self.me
 
     def extend_all(self, now_s: float) -> None:
-        """Extend the deadline of all workers after a time in which none could be received."""
-        self._heard = dict.fromkeys(self._heard, now_s)
+        """Extend the deadline of all workers after a time without a connection, in which no heartbeat could arrive."""
+        self._last_heartbeat_s = dict.fromkeys(self._last_heartbeat_s, now_s)
 
     def alive(self, now_s: float) -> list[str]:
-        """All of them."""
-        self._heard = {worker: heard_s for worker, heard_s in self._heard.items() if now_s - heard_s < DEAD_S}
-        return sorted({self.me, *self._heard})
+        """Return the names of all live workers, sorted."""
+        self._last_heartbeat_s = {
+            worker: last_s for worker, last_s in self._last_heartbeat_s.items() if now_s - last_s < DEAD_S
+        }
+        return sorted({self.me, *self._last_heartbeat_s})
 
     def share(self, partitions: int, now_s: float) -> set[int]:
         """Return the partitions that this worker should claim."""

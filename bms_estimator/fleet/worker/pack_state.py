@@ -1,7 +1,6 @@
-"""State of one pack in a worker: next block, totals, the hour's sums, the estimator's record.
+"""State of one pack in a worker: next block, totals, sums of the hour, estimator record.
 
-One record of numbers, stored packed (``kernels.packed_record``) in immutable bytes, so that a holder keeps the pack
-unchanged.
+The record is stored packed (``kernels.packed_record``) in immutable bytes, so that a snapshot of a partition needs no copy.
 """
 
 from collections.abc import Mapping
@@ -18,24 +17,24 @@ from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer,
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 
 Fields = Mapping[str, NDArray[Any]]
-"""Fields of a record by name, those of parts as ``part.field``."""
-MAX_LOST = 2**62
-"""No more lost blocks are counted."""
+"""Fields of a record by name; a nested field is named ``part.field``."""
+MAX_LOST_BLOCKS = 2**62
+"""Limit of the count of lost blocks, so that it cannot overflow."""
 
 DELIVERY = np.dtype(
     [
         ("store", "u8"),  # the edge's store with the awaited blocks [ns since 1970]; 0: no block yet
         ("awaited", "u8"),  # number of the next block
-        ("ahead", "i8"),  # blocks after a missing one
-        ("first_ahead", "u8"),  # lowest number of these; 0: none
-        ("passed", "i8"),  # number of times that it was received
-        ("blocks", "i8"),  # taken
-        ("lost_blocks", "i8"),  # blocks that were never received
+        ("ahead", "i8"),  # number of received blocks behind a missing one
+        ("first_ahead", "u8"),  # lowest number of a block behind a missing one; 0: none
+        ("passed", "i8"),  # how often block ``first_ahead`` was received
+        ("blocks", "i8"),  # number of processed blocks
+        ("lost_blocks", "i8"),  # number of blocks that were never received
         ("clock", "u8"),  # store of the last sample's block, the origin of its time stamps; 0: no sample yet
         ("last_s", "f8"),  # the last sample's time stamp [s]
-        ("hour", "i8"),  # that is summed up now [hours since 1970]; 0: none yet
-        ("made_of", "u8", 2),  # digests of the type of the pack
-        ("meaning", "u8", 2),
+        ("hour", "i8"),  # current hour [hours since 1970]; 0: no block yet
+        ("made_of", "u8", 2),  # ``PackType.config_digest``
+        ("meaning", "u8", 2),  # ``PackType.state_digest``
     ],
     align=True,
 )
@@ -49,18 +48,18 @@ FLOW = np.dtype(
     ],
     align=True,
 )
-"""All that has flowed (``telemetry.charge_energy.ChargeEnergy``), and what ``ChargeEnergyMeter`` counts in."""
+"""Total charge and energy (``telemetry.charge_energy.ChargeEnergy``) and the sums of ``ChargeEnergyMeter``."""
 PACK_STATE = np.dtype(
     [("delivery", DELIVERY), ("flow", FLOW), ("hour", HOUR_SUMS), ("estimator", ESTIMATOR_STATE)], align=True
 )
 
 
 class StateError(ValueError):
-    """The bytes of a pack are invalid."""
+    """Invalid bytes of a packed record."""
 
 
 class WorkRecord:
-    """A record on which one pack after the other is worked on.
+    """Work record: one unpacked record into which the packs of a partition are loaded in turn.
 
     Attributes:
         record: Shape (1,), dtype ``PACK_STATE``.
@@ -70,59 +69,59 @@ class WorkRecord:
         self.record: NDArray[np.void] = np.zeros(1, dtype)
         self._words = self.record.view(np.uint64)
         self._mirror = symmetry_map(dtype)
-        self._packed = packed_buffer(self._words.size)
+        self._buffer = packed_buffer(self._words.size)
 
     @property
     def delivery(self) -> np.void:
-        """The part of dtype ``DELIVERY``."""
+        """Part of dtype ``DELIVERY``."""
         part: np.void = self.record[0]["delivery"]
         return part
 
     def clear(self) -> None:
-        """Lay a pack there of which nothing is known."""
+        """Set all fields to zero, the state of a new pack."""
         self._words.fill(0)
 
-    def put(self, packed: bytes) -> None:
-        """Lay a pack there.
+    def load(self, packed: bytes) -> None:
+        """Unpack a pack's record into this one.
 
         Raises:
-            StateError: It does not have this layout.
+            StateError: The bytes do not have this layout.
         """
-        whole = len(packed) % WORD_BYTES == 0
-        if not (whole and unpack(np.frombuffer(packed, np.uint64), self._mirror, self._words)):
-            raise StateError(f"{len(packed)} bytes are no state of a pack")
+        are_words = len(packed) % WORD_BYTES == 0
+        if not (are_words and unpack(np.frombuffer(packed, np.uint64), self._mirror, self._words)):
+            raise StateError(f"{len(packed)} bytes are not a packed record")
 
-    def put_former(self, dtype: np.dtype[Any], packed: bytes) -> Fields:
-        """Store a pack's record of another layout, except for its estimator, as far as the fields match.
+    def load_previous_layout(self, dtype: np.dtype[Any], packed: bytes) -> Fields:
+        """Unpack a pack's record of another layout into this one: the fields that exist here, except for the estimator.
 
         Args:
-            dtype: Dtype of its record.
-            packed: It.
+            dtype: Dtype of the record.
+            packed: The packed record.
 
         Returns:
-            The fields of its estimator, by their names.
+            The fields of the estimator by name.
 
         Raises:
-            ValueError: It does not have this layout, or the layout is not that of a pack.
+            ValueError: The bytes do not have this dtype, or the dtype is not that of a pack.
         """
         former = WorkRecord(dtype)
-        former.put(packed)
-        of_estimator, others = {}, {}
+        former.load(packed)
+        estimator_fields, others = {}, {}
         for name, value in fields(former.record):
             part, _, rest = name.partition(".")
             if part == "estimator":
-                of_estimator[rest] = value
+                estimator_fields[rest] = value
             else:
                 others[name] = value
         self.clear()
         copy_known_fields(self.record, others)
-        return of_estimator
+        return estimator_fields
 
     def count_lost(self, blocks: int) -> None:
         """Count blocks of this hour as lost."""
-        lost = self.record[0]["hour"]
-        lost["lost_blocks"] = min(int(lost["lost_blocks"]) + blocks, MAX_LOST)
+        hour = self.record[0]["hour"]
+        hour["lost_blocks"] = min(int(hour["lost_blocks"]) + blocks, MAX_LOST_BLOCKS)
 
-    def take(self) -> bytes:
-        """Return the pack's record, packed."""
-        return self._packed[: pack(self._words, self._mirror, self._packed)].tobytes()
+    def packed_bytes(self) -> bytes:
+        """Return the packed record."""
+        return self._buffer[: pack(self._words, self._mirror, self._buffer)].tobytes()

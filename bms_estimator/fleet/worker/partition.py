@@ -1,7 +1,7 @@
-"""A partition: its packs' states, stepped block by block by the same kernel as everywhere.
+"""A partition: states of its packs, estimated block by block by the kernel that all commands use.
 
-What a worker does follows from the stream's order and the table of packs alone: from any checkpoint on, the same blocks
-leave the same states to the last bit. No connection, no file; the only clock is that of the publications.
+The states depend only on the order of the stream and on the table of packs: from any checkpoint on, equal blocks lead to
+bit-identical states. There is no I/O here; the clock is used only for publish times.
 """
 
 import time
@@ -32,25 +32,25 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
 Table = Callable[[str], tuple[Settings, PackModel] | None]
-"""The settings of a pack, and the pack as one object; None: it is not known."""
+"""Function that returns settings and model of a pack; None: the pack is unknown."""
 
 log = structlog.get_logger(__name__)
 
 
 class BlockResult(NamedTuple):
-    """Result of a block.
+    """Result of a message.
 
     Attributes:
         pack: Name of the pack.
-        awaits: For its edge.
-        state: Topic ``state``.
-        parameters: Topic ``parameters``.
-        hours: Finished hours: an id that is the same whoever makes the row, and the row.
-        failed: Blocks that were skipped because of an internal error.
+        reply: Reply to the edge; None: none is due.
+        state: Payload of topic ``state``.
+        parameters: Payload of topic ``parameters``.
+        hours: Rows of finished hours, each with a message id that is equal for all workers, so that the server drops repeats.
+        failed: Number of blocks that were skipped because of an internal error.
     """
 
     pack: str
-    awaits: BlockRequest | None = None
+    reply: BlockRequest | None = None
     state: bytes | None = None
     parameters: bytes | None = None
     hours: tuple[tuple[str, bytes], ...] = ()
@@ -62,13 +62,13 @@ class Partition:
 
     Args:
         number: Number of the partition.
-        table: The packs' settings.
-        wall: Wall clock of the publications [s since 1970].
+        table: Settings and models of the packs.
+        wall: Wall clock for publish times [s since 1970].
 
     Attributes:
         number: Number of the partition.
-        sequence: Sequence of the last message that was taken or deferred; 0: none.
-        deferred: Packs whose messages wait in the stream.
+        sequence: Stream sequence number of the last processed or deferred message; 0: none.
+        deferred: Queue of packs with deferred messages.
     """
 
     def __init__(self, number: int, table: Table, *, wall: Callable[[], float] = time.time) -> None:
@@ -79,33 +79,33 @@ class Partition:
         self._former: dict[str, PreviousLayoutState] = {}
         self._former_deliveries: dict[str, np.void] = {}
         self.deferred = Deferred()
-        self._known: dict[str, PackType] = {}
-        self._greeted: set[str] = set()
-        self._refused: set[str] = set()
-        self._bench = WorkRecord()
-        self._types = PackTypes(self._bench.record)
-        self._stepping = BlockProcessor(self._bench.record, self._counters, wall)
+        self._type_by_pack: dict[str, PackType] = {}
+        self._replied: set[str] = set()
+        self._logged_rejections: set[str] = set()
+        self._work = WorkRecord()
+        self._types = PackTypes(self._work.record)
+        self._processor = BlockProcessor(self._work.record, self._counters, wall)
 
     @classmethod
     def restore(cls, number: int, table: Table, data: bytes, *, wall: Callable[[], float] = time.time) -> Self:
-        """Go on from a snapshot's bytes.
+        """Restore a partition from the bytes of a checkpoint.
 
         Raises:
-            CheckpointError: They are damaged, of another partition, or of a version that is not known.
+            CheckpointError: The bytes are damaged, of another partition, or of an unknown format.
         """
-        found = read_checkpoint(data)
-        if found.number != number:
-            raise CheckpointError(f"the checkpoint is of partition {found.number}, not of {number}")
-        made = cls(number, table, wall=wall)
-        made.sequence = found.sequence
-        made._counters.update(found.counters)
-        made._packs.update(found.packs)
-        made._former.update(found.former)
-        made.deferred = Deferred(found.deferred)
-        return made
+        checkpoint = read_checkpoint(data)
+        if checkpoint.number != number:
+            raise CheckpointError(f"the checkpoint is of partition {checkpoint.number}, not of {number}")
+        partition = cls(number, table, wall=wall)
+        partition.sequence = checkpoint.sequence
+        partition._counters.update(checkpoint.counters)
+        partition._packs.update(checkpoint.packs)
+        partition._former.update(checkpoint.former)
+        partition.deferred = Deferred(checkpoint.deferred)
+        return partition
 
     def snapshot(self) -> PartitionCheckpoint:
-        """Return a snapshot of the partition; it costs only a copied list of packs."""
+        """Return a snapshot of the partition. Records are not copied, because they are immutable bytes."""
         spans = self.deferred.spans()
         return PartitionCheckpoint(
             self.number, self.sequence, dict(self._counters), dict(self._packs), dict(self._former), spans
@@ -113,29 +113,29 @@ class Partition:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Counters since the partition began."""
+        """Counters since the partition was created, over all its workers."""
         return {**self._counters, "packs": len(self._packs) + len(self._former), "unknown": len(self.unknown)}
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Unknown packs with messages."""
+        """Unknown packs with deferred messages."""
         return tuple(pack for pack in self.deferred if not self.is_known(pack))
 
     def state(self, pack: str) -> NDArray[np.void] | None:
-        """Return a copy of a pack's record, shape (1,), dtype PACK_STATE; None if this version has none."""
+        """Return a copy of a pack's record, shape (1,), dtype ``PACK_STATE``; None if it has another layout or does not exist."""
         packed = self._packs.get(pack)
         if packed is None:
             return None
-        self._bench.put(packed)
-        return self._bench.record.copy()
+        self._work.load(packed)
+        return self._work.record.copy()
 
     def take(self, pack: str, data: bytes, sequence: int) -> BlockResult:
-        """Take a message of the stream, or defer it where its pack is not known or has others that wait.
+        """Process a message of the stream, or defer it if its pack is unknown or has other deferred messages.
 
         Args:
             pack: Name of the sending pack.
-            data: A block, or what an edge sends for one: faults are counted by kind.
-            sequence: In the stream; one that was taken is not taken again.
+            data: Bytes of a block; if they are damaged, the message is counted and skipped.
+            sequence: Stream sequence number. A message that was already processed is counted and skipped.
         """
         if sequence <= self.sequence:
             self._counters["repeated"] += 1
@@ -143,16 +143,16 @@ class Partition:
         if pack in self.deferred:
             return self.defer(pack, sequence)
         self.sequence = sequence
-        block = self._decoded(data)
+        block = self._decode(data)
         if block is None:
             return BlockResult(pack)
-        known = self._look_up(pack)
-        if known is None:
+        pack_type = self._look_up(pack)
+        if pack_type is None:
             return self.defer(pack, sequence)
-        return self._take(pack, block, known)
+        return self._take(pack, block, pack_type)
 
     def defer(self, pack: str, sequence: int) -> BlockResult:
-        """Leave a message in the stream until its pack's turn."""
+        """Defer a message: it stays in the stream until its pack is served."""
         self.sequence = max(self.sequence, sequence)
         if pack in self.deferred or len(self.deferred) < MAX_UNKNOWN or self.is_known(pack):
             self.deferred.add(pack, sequence)
@@ -162,32 +162,32 @@ class Partition:
         return BlockResult(pack)
 
     def take_deferred(self, pack: str, data: bytes, sequence: int) -> BlockResult:
-        """Take the next message of a known pack that waits; arguments as in ``take``."""
-        known = self._look_up(pack)
-        if known is None or pack not in self.deferred:
+        """Process the next deferred message of a known pack; arguments as in ``take``."""
+        pack_type = self._look_up(pack)
+        if pack_type is None or pack not in self.deferred:
             return BlockResult(pack)
         self.deferred.advance(pack, sequence)
-        block = self._decoded(data)
-        return self._take(pack, block, known) if block else BlockResult(pack)
+        block = self._decode(data)
+        return self._take(pack, block, pack_type) if block else BlockResult(pack)
 
     def is_known(self, pack: str) -> bool:
         """Return whether the table has the pack."""
         return self._table(pack) is not None
 
-    def refuse(self, pack: str, sequence: int) -> BlockResult:
-        """Leave out a message that is not in its pack's partition, whoever put it there."""
+    def reject_misplaced(self, pack: str, sequence: int) -> BlockResult:
+        """Skip and count a message of a pack that belongs to another partition."""
         if sequence > self.sequence:
             self.sequence = sequence
             self._counters["misplaced"] += 1
-            self._log_refusal(pack, "the pack belongs to another partition")
+            self._log_rejection(pack, "the pack belongs to another partition")
         return BlockResult(pack)
 
     def settings_changed(self, pack: str) -> None:
-        """Read the settings of a pack from the table again with its next block."""
-        self._known.pop(pack, None)
+        """Have the settings of a pack read from the table again with its next block."""
+        self._type_by_pack.pop(pack, None)
 
-    def _decoded(self, data: bytes) -> Block | None:
-        """Return the block in a message; None: it is damaged."""
+    def _decode(self, data: bytes) -> Block | None:
+        """Return the block in a message; None if it is damaged."""
         try:
             return decode(data)
         except BlockError:
@@ -195,82 +195,83 @@ class Partition:
             return None
 
     def _look_up(self, pack: str) -> PackType | None:
-        known = self._known.get(pack)
-        if known is None:
-            found = self._table(pack)
-            if found is None:
+        """Return the type of a pack; None if the pack is unknown."""
+        pack_type = self._type_by_pack.get(pack)
+        if pack_type is None:
+            entry = self._table(pack)
+            if entry is None:
                 return None
-            known = self._known[pack] = self._types.of(*found)
-        return known
+            pack_type = self._type_by_pack[pack] = self._types.of(*entry)
+        return pack_type
 
-    def _take(self, pack: str, block: Block, of_type: PackType) -> BlockResult:
-        former = self._open(pack)
-        d = self._bench.delivery
+    def _take(self, pack: str, block: Block, pack_type: PackType) -> BlockResult:
+        """Process a block of a known pack."""
+        former = self._load(pack)
+        d = self._work.delivery
         lost = int(d["lost_blocks"])
         self._put_former_delivery(pack)
         order = classify_block(d, block)
         lost = int(d["lost_blocks"]) - lost
-        self._bench.count_lost(lost)
-        made = BlockResult(pack)
+        self._work.count_lost(lost)
+        result = BlockResult(pack)
         if order is BlockOrder.NEXT:
             stepped, fault = None, density_fault(block.samples)
             if fault:
-                self._log_refusal(pack, fault)
+                self._log_rejection(pack, fault)
             else:
-                stepped = self._step(pack, block, of_type, former)
-            if stepped is None:  # as if it had brought nothing
-                self._open(pack)
+                stepped = self._step(pack, block, pack_type, former)
+            if stepped is None:  # reload the record, which the failed block may have changed
+                self._load(pack)
                 self._put_former_delivery(pack)
                 classify_block(d, block)
-                self._bench.count_lost(lost)
+                self._work.count_lost(lost)
                 self._counters["too_dense" if fault else "failed"] += 1
-            made = stepped or BlockResult(pack, failed=int(not fault))
+            result = stepped or BlockResult(pack, failed=int(not fault))
             mark_taken(d)
             self._former.pop(pack, None)
             self._former_deliveries.pop(pack, None)
         else:
             self._counters[order.value] += 1
-            if former is not None:  # its estimator is not made yet; the count of resent blocks must go on
+            if former is not None:  # the record is migrated only by the next block, but its counts must not be lost
                 self._former_deliveries[pack] = d.copy()
-        if (
-            order is BlockOrder.NEXT or former is None
-        ):  # what another version left stays as it is until a block is taken
+        # A record of another layout stays unchanged until a block is processed.
+        if order is BlockOrder.NEXT or former is None:
             self._counters["lost_blocks"] += lost
-            self._packs[pack] = self._bench.take()
-        first = pack not in self._greeted
-        self._greeted.add(pack)
-        return made._replace(awaits=edge_reply(order, d, block, first=first))
+            self._packs[pack] = self._work.packed_bytes()
+        first = pack not in self._replied
+        self._replied.add(pack)
+        return result._replace(reply=edge_reply(order, d, block, first=first))
 
     def _put_former_delivery(self, pack: str) -> None:
-        """Add the counts of blocks since the start for a pack with a record of another layout."""
+        """Restore the block counts of this process for a pack whose record has another layout."""
         if pack in self._former_deliveries:
-            self._bench.record["delivery"][0] = self._former_deliveries[pack]
+            self._work.record["delivery"][0] = self._former_deliveries[pack]
 
-    def _log_refusal(self, pack: str, why: str) -> None:
-        """Log the first refused block of a pack; ``counters`` has the others."""
-        if pack not in self._refused:
-            self._refused.add(pack)
-            log.warning("a block is refused", partition=self.number, pack=pack, reason=why)
+    def _log_rejection(self, pack: str, why: str) -> None:
+        """Log the first rejected block of a pack; ``counters`` counts all."""
+        if pack not in self._logged_rejections:
+            self._logged_rejections.add(pack)
+            log.warning("a block is rejected", partition=self.number, pack=pack, reason=why)
 
-    def _step(self, pack: str, block: Block, of_type: PackType, former: Fields | None) -> BlockResult | None:
-        """Process the next block; None if it cannot be processed."""
+    def _step(self, pack: str, block: Block, pack_type: PackType, former: Fields | None) -> BlockResult | None:
+        """Estimate the next block; None after an internal error."""
         try:
-            return BlockResult(pack, None, *self._stepping.step(pack, block, of_type, former))
-        except Exception:  # an internal error with one block: awaiting it forever would stop the pack
-            log.exception("a block is left out", partition=self.number, pack=pack, number=block.number)
-        self._stepping.forget()
+            return BlockResult(pack, None, *self._processor.step(pack, block, pack_type, former))
+        except Exception:  # an internal error with one block must not stop the pack
+            log.exception("a block is skipped", partition=self.number, pack=pack, number=block.number)
+        self._processor.reset_window()
         return None
 
-    def _open(self, pack: str) -> Fields | None:
-        """Lay a pack on the bench. A record of another layout also gets the estimator's fields, which it lacks."""
+    def _load(self, pack: str) -> Fields | None:
+        """Load a pack into the work record. Return the estimator fields if its record has another layout, else None."""
         packed, former = self._packs.get(pack), self._former.get(pack)
         try:
             if packed is not None:
-                self._bench.put(packed)
+                self._work.load(packed)
                 return None
             if former is not None:
-                return self._bench.put_former(dtype_of(former.layout), former.packed)
-        except ValueError:  # no checkpoint that was read can be so
+                return self._work.load_previous_layout(dtype_of(former.layout), former.packed)
+        except ValueError:  # does not happen with a checkpoint whose checksums were correct
             self._counters["damaged_states"] += 1
-        self._bench.clear()
+        self._work.clear()
         return None

@@ -1,8 +1,8 @@
 """Lease of one partition by a worker: take over, process message by message, save, release.
 
-The state follows from the order of the stream alone, so that the number of its last message defines it. Messages that may
-have gone to another worker, or were lost in transit, are read from the stream again. That is also done during silence, because
-messages that were delivered to a worker before it died are not delivered again.
+The state depends only on the order of the stream, therefore the sequence number of its last message defines it. Messages that
+were delivered to another worker, or lost in transit, are read from the stream. The stream is also read after some time without
+a delivery, because the server does not redeliver messages that it delivered to a worker that has died.
 """
 
 import asyncio
@@ -34,42 +34,42 @@ from bms_estimator.process.tasks import until_first_ends
 RETRY_S = 0.5
 """Retry interval of server requests [s]."""
 SILENCE_S = 3.0
-"""Time without a message after which the stream is checked for another one [s]: a worker that releases a partition
-has finished by then."""
-LATER_S = 5.0 * SILENCE_S
-"""Time of silence after which a stream without a further message is checked again [s]."""
-HOURS_AT_ONCE = 128
-"""Summaries that wait for the server's answer at a time."""
-TROUBLES = (NatsError, TimeoutError, StreamError)
-"""Errors between worker and server that are retried."""
+"""Time without a delivery after which the stream is searched for further messages [s]: a worker that releases a partition has
+finished by then."""
+IDLE_SILENCE_S = 5.0 * SILENCE_S
+"""Interval of further searches while the stream has no further message [s]."""
+MAX_PENDING_HOURS = 128
+"""Maximum number of published summaries that wait for the server's acknowledgment."""
+RETRYABLE_ERRORS = (NatsError, TimeoutError, StreamError)
+"""Errors of the connection or the server after which a request is repeated."""
 
 log = structlog.get_logger(__name__)
 
 
 class PartitionLease:
-    """Partition that this worker claims, and owns while no other has claimed it.
+    """Partition that this worker claims, and owns while no other worker has claimed it.
 
     Args:
-        nc: Connected.
+        nc: Connection of the tenant.
         number: Number of the partition.
-        table: What each pack is.
-        keeping: Store of the checkpoints.
-        inbox: As ``PinnedConsumer`` has it.
-        turn: Held while a block is stepped: of all partitions one at a time, so that the loop sees to requests and heartbeats
-            between any two.
+        table: Settings and models of the packs.
+        checkpoints: Store of the checkpoints.
+        inbox: Prefix of the subject for responses (``PinnedConsumer``).
+        step_lock: Lock of the worker, held while a block is estimated. The event loop can send requests and heartbeats between
+            two blocks.
         partitions: Number of partitions of the stream.
-        is_busy: Returns true while any partition of the worker has received messages that are not taken.
+        is_busy: Returns True while any partition of the worker has received messages that are not processed.
 
     Attributes:
-        consumer: Requests the messages.
-        partition: The state; None: not taken over.
-        claim: Claim of this worker; None: it is not.
-        hours: Summaries that the server has not acknowledged yet: (id, pack, row).
+        consumer: Consumer of the messages.
+        partition: State of the packs; None while the partition is not taken over.
+        claim: Claim of this worker; None while it has none.
+        hours: Summaries that the server has not acknowledged yet: (message id, pack, row).
         lag_s: Largest lag since it was last reset to None [s].
-        blocks: Taken here, as are ``samples``.
-        faults: Blocks that were skipped because of an internal error.
-        due_s: When a checkpoint is to be written, of a monotonic clock [s].
-        trouble: What does not work now; empty: nothing.
+        blocks, samples: Number of blocks and samples processed by this lease.
+        faults: Number of blocks skipped because of an internal error.
+        due_s: Monotonic clock at which the next checkpoint is due [s].
+        trouble: Present error in words; empty without one.
     """
 
     def __init__(
@@ -77,16 +77,16 @@ class PartitionLease:
         nc: Client,
         number: int,
         table: Table,
-        keeping: CheckpointStore,
+        checkpoints: CheckpointStore,
         inbox: str,
-        turn: asyncio.Lock,
+        step_lock: asyncio.Lock,
         *,
         partitions: int,
         is_busy: Callable[[], bool],
     ) -> None:
         self._partitions, self._is_busy, self._budget = partitions, is_busy, CpuBudget()
-        self._nc, self.number, self._table, self._keeping = nc, number, table, keeping
-        self._turn = turn
+        self._nc, self.number, self._table, self._checkpoints = nc, number, table, checkpoints
+        self._step_lock = step_lock
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
         self.claim: Claim | None = None
@@ -94,63 +94,63 @@ class PartitionLease:
         self.lag_s: float | None = None
         self.blocks = self.samples = self.faults = 0
         self.trouble, self.due_s = "", 0.0
-        self._pin = 0  # sequence that confirmed the claim
-        self._whole = False  # nothing is missing between the state and the last message given
-        self._lost = self._silent = False
-        self._ask_s = time.monotonic() + SILENCE_S  # when silence is to be looked into
-        self._news, self._turns = asyncio.Event(), asyncio.Event()
-        self._changing = asyncio.Lock()  # of state and claim
-        self._sending = asyncio.Lock()
+        self._pin = 0  # number of the pin under which the claim was last confirmed
+        self._is_gapless = False  # the state includes all messages before the last delivered one
+        self._pin_lapsed = self._silent = False
+        self._search_s = time.monotonic() + SILENCE_S  # when the stream is next searched for further messages
+        self._wake_up, self._wake_up_deferred = asyncio.Event(), asyncio.Event()
+        self._state_lock = asyncio.Lock()  # of ``partition`` and ``claim``
+        self._hours_lock = asyncio.Lock()
 
     @property
     def last_checkpoint(self) -> CheckpointInfo | None:
-        """The last checkpoint."""
+        """Last checkpoint; None without one."""
         return self.claim.pointer.kept[0] if self.claim and self.claim.pointer.kept else None
 
     @property
     def is_owned(self) -> bool:
-        """True if this worker owns the partition, by its own knowledge."""
+        """True if this worker owns the partition as far as it knows."""
         return self.partition is not None and self.claim is not None
 
     def receive(self, message: Msg) -> None:
-        """Take what the server sends for this partition."""
+        """Process a message or status from the server."""
         if self.consumer.receive(message):
-            self._lost, self._ask_s = True, time.monotonic() + SILENCE_S
-        self._news.set()
+            self._pin_lapsed, self._search_s = True, time.monotonic() + SILENCE_S
+        self._wake_up.set()
 
     def check_silence(self) -> None:
-        """Look into silence, if there was enough of it; to be called now and then."""
-        if time.monotonic() >= self._ask_s:
+        """Have the stream searched after silence, and deferred packs checked; to be called about once a second."""
+        if time.monotonic() >= self._search_s:
             self._silent = True
-            self._news.set()
-        self._turns.set()
+            self._wake_up.set()
+        self._wake_up_deferred.set()
 
     async def run(self) -> None:
-        """Take messages for ever."""
+        """Process messages until cancelled."""
         await until_first_ends(self._run(), self._run_deferred())
 
     async def _run(self) -> None:
         while True:
-            self._news.clear()
-            if self._lost:
-                await self._try(self._look)
-            given = await self.consumer.take()
-            if given is not None:
-                await self._take(given)
-                self._ask_s = time.monotonic() + SILENCE_S
+            self._wake_up.clear()
+            if self._pin_lapsed:
+                await self._try(self._check_ownership)
+            delivered = await self.consumer.take()
+            if delivered is not None:
+                await self._take(delivered)
+                self._search_s = time.monotonic() + SILENCE_S
             elif self._silent:
-                self._silent, self._ask_s = False, time.monotonic() + SILENCE_S
-                await self._try(self._read_unseen_messages)
+                self._silent, self._search_s = False, time.monotonic() + SILENCE_S
+                await self._try(self._read_undelivered)
             else:
-                await self._news.wait()
+                await self._wake_up.wait()
 
     async def save(self) -> None:
-        """Write a checkpoint, unless the last one is as new.
+        """Write a checkpoint if the state has changed since the last one.
 
         Raises:
-            nats.errors.Error: The server rejects it, or does not respond in time: the last one remains valid.
+            nats.errors.Error: The server rejects it, or does not respond in time; the last checkpoint remains valid.
         """
-        async with self._changing:
+        async with self._state_lock:
             partition, claim = self.partition, self.claim
             if partition is None or claim is None:
                 return
@@ -162,28 +162,29 @@ class PartitionLease:
                 return
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
             try:
-                await self.send_hours()  # no worker makes the summaries of saved samples again
-                self.claim = await self._keeping.write(claim, snapshot.sequence, snapshot.chunks())
+                # The next owner does not compute the summaries of saved samples again, therefore they are sent first.
+                await self.send_hours()
+                self.claim = await self._checkpoints.write(claim, snapshot.sequence, snapshot.chunks())
             except FencedError as error:
-                self._fenced(error)
+                self._drop_ownership(error)
             except BaseException:
                 partition.deferred.is_saved = False
                 raise
 
     async def send_hours(self) -> None:
-        """Have the stream of summaries keep those that wait.
+        """Publish the waiting summaries and await the server's acknowledgment.
 
         Raises:
-            nats.errors.Error: It does not, or not all of them: they still wait.
+            nats.errors.Error: Some were not acknowledged; they remain in ``hours``.
         """
         js = self._nc.jetstream()
 
         async def send(message_id: str, pack: str, row: bytes) -> None:
             await js.publish(subjects.hours(pack), row, headers={"Nats-Msg-Id": message_id})
 
-        async with self._sending:
+        async with self._hours_lock:
             while self.hours:
-                rows = list(islice(self.hours, HOURS_AT_ONCE))
+                rows = list(islice(self.hours, MAX_PENDING_HOURS))
                 await asyncio.gather(*(send(*row) for row in rows))
                 for row in rows:
                     if self.hours and self.hours[0] is row:
@@ -193,43 +194,47 @@ class PartitionLease:
         """Write a checkpoint and release the partition; ``run`` has ended."""
         try:
             await self.save()
-        except TROUBLES as error:
+        except RETRYABLE_ERRORS as error:
             log.warning(
-                "given back without a checkpoint: who has it next reads the stream from the last one",
+                "released without a new checkpoint: the next owner reads the stream from the last one",
                 partition=self.number,
                 reason=error_text(error),
             )
         try:
             await self.consumer.unpin()
-        except TROUBLES as error:
-            log.warning("not given back: that takes its time", partition=self.number, reason=error_text(error))
+        except RETRYABLE_ERRORS as error:
+            log.warning(
+                "not released: the server's pin expires after some seconds",
+                partition=self.number,
+                reason=error_text(error),
+            )
 
     def settings_changed(self, pack: str) -> None:
-        """Handle new settings of a pack, or a pack that became known."""
+        """Handle a changed or new row of the table of packs."""
         if self.partition:
             self.partition.settings_changed(pack)
-            self._turns.set()
+            self._wake_up_deferred.set()
 
     async def _run_deferred(self) -> None:
-        """Take deferred messages for ever, one of each pack at a time."""
+        """Process deferred messages until cancelled, one of each pack at a time."""
         while True:
-            self._turns.clear()
+            self._wake_up_deferred.clear()
             while self.partition and (found := self.partition.deferred.next(self._is_due)):
                 if not await self._try(partial(self._take_deferred, self.partition, *found)):
                     await asyncio.sleep(RETRY_S)
-            await self._turns.wait()
+            await self._wake_up_deferred.wait()
 
     def _is_due(self, pack: str) -> bool:
-        """Return whether a deferred pack may resume: within its budget, or while no other pack needs the processor."""
+        """Return True if a deferred pack is known and within its budget, or if no other pack needs the processor."""
         is_known = self.partition is not None and self.partition.is_known(pack)
         return is_known and not (self._budget.is_exhausted(pack) and self._is_busy())
 
     async def _take_deferred(self, partition: Partition, pack: str, span: Span) -> None:
-        """Take the next deferred message of a pack."""
+        """Process the next deferred message of a pack."""
         js, subject = self._nc.jetstream(), subjects.kept(self.number, pack)
         try:
             message = await js.get_msg(subjects.RAW_STREAM, span.first, subject, next=True)
-        except NotFoundError:  # the stream has dropped them; the edge is asked to resend with its next block
+        except NotFoundError:  # the stream has dropped them; the reply to the edge's next block requests them again
             partition.deferred.advance(pack, span.last)
             return
         data, sequence = message.data or b"", message.seq or 0
@@ -240,59 +245,59 @@ class PartitionLease:
         self._count(data)
         await self._publish(await self._step(pack, sequence, take))
 
-    async def _take(self, given: DeliveredMessage) -> None:
-        """Process a message after those before it; return when it is done or the partition is lost."""
-        while not await self._try(lambda: self._go_on_to(given)):
+    async def _take(self, delivered: DeliveredMessage) -> None:
+        """Process a delivered message after all earlier ones; return when that is done or the pin is lost."""
+        while not await self._try(lambda: self._process_before(delivered)):
             await asyncio.sleep(RETRY_S)
             if not self.consumer.pinned:
-                self._whole = False
+                self._is_gapless = False
                 return
         partition = self.partition
-        if partition is None or given.sequence <= partition.sequence:
+        if partition is None or delivered.sequence <= partition.sequence:
             return
-        await self._publish(await self._take_or_defer(partition, given.pack, given.data, given.sequence))
+        await self._publish(await self._take_or_defer(partition, delivered.pack, delivered.data, delivered.sequence))
 
-    async def _go_on_to(self, given: DeliveredMessage) -> None:
-        """Have the state of all messages before one that was given."""
+    async def _process_before(self, delivered: DeliveredMessage) -> None:
+        """Bring the state up to the message before a delivered one."""
         partition = self.partition
-        if given.pin != self._pin or partition is None:
-            self._whole = False
-            async with self._changing:
+        if delivered.pin != self._pin or partition is None:
+            self._is_gapless = False
+            async with self._state_lock:
                 partition = await self._take_over()
-            self._pin = given.pin
-        if not (self._whole and given.follows):
-            self._whole = False
-            await self._catch_up(partition, given.sequence)
-            self._whole = True
+            self._pin = delivered.pin
+        if not (self._is_gapless and delivered.follows):
+            self._is_gapless = False
+            await self._catch_up(partition, delivered.sequence)
+            self._is_gapless = True
 
-    async def _read_unseen_messages(self) -> None:
-        """Have the state of all messages that the stream has, without being given any."""
+    async def _read_undelivered(self) -> None:
+        """Bring the state up to the end of the stream after silence, unless another worker is pinned."""
         if not self.consumer.pinned and await self.consumer.is_pinned():
-            await self._look()
+            await self._check_ownership()
             return
-        async with self._changing:
+        async with self._state_lock:
             partition = await self._take_over()
         js, subject = self._nc.jetstream(), subjects.kept(self.number)
         try:
             await js.get_msg(subjects.RAW_STREAM, partition.sequence + 1, subject, next=True)
         except NotFoundError:
-            self._ask_s = time.monotonic() + LATER_S
+            self._search_s = time.monotonic() + IDLE_SILENCE_S
         else:
             await self._catch_up(partition, (await js.get_last_msg(subjects.RAW_STREAM, subject)).seq or 0)
 
     async def _take_over(self) -> Partition:
-        """Load the state of a claimed partition, possibly an old one."""
-        await self._confirm()
+        """Claim the partition if necessary and return its state, possibly of an old checkpoint."""
+        await self._confirm_claim()
         partition = self.partition
         if partition is None:
-            claim = await self._keeping.claim(self.number)
-            partition = await self._restored(claim)
+            claim = await self._checkpoints.claim(self.number)
+            partition = await self._restore(claim)
             self.partition, self.claim = partition, claim
-            self._turns.set()
+            self._wake_up_deferred.set()
         last = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
         if partition.sequence > last:
             log.warning(
-                "the stream ends before the checkpoint: it was made anew or has lost its end; it is read from its beginning",
+                "the stream ends before the checkpoint, because it was recreated or has lost its end: reading it from its beginning",
                 partition=self.number,
                 stream=last,
                 checkpoint=partition.sequence,
@@ -301,14 +306,15 @@ class PartitionLease:
             partition.deferred.clear()
         return partition
 
-    async def _restored(self, claim: Claim) -> Partition:
-        async with aclosing(self._keeping.load(claim)) as checkpoints:
+    async def _restore(self, claim: Claim) -> Partition:
+        """Return the partition of the newest usable checkpoint; an empty one without a checkpoint."""
+        async with aclosing(self._checkpoints.load(claim)) as checkpoints:
             async for kept, data in checkpoints:
                 try:
                     partition = Partition.restore(self.number, self._table, data)
                 except ValueError as error:
                     log.warning(
-                        "a checkpoint cannot be used: going on from what was before",
+                        "a checkpoint cannot be used: continuing from an earlier one, or from the stream",
                         partition=self.number,
                         object=kept.object,
                         reason=str(error),
@@ -320,7 +326,7 @@ class PartitionLease:
         return Partition(self.number, self._table)
 
     async def _catch_up(self, partition: Partition, sequence: int) -> None:
-        """Take what the stream has up to a message. Only the last publication of each pack is sent."""
+        """Process the stream up to a message. Only the last messages of each pack are published."""
         if partition.sequence >= sequence:
             return
         latest: dict[str, BlockResult] = {}
@@ -329,87 +335,89 @@ class PartitionLease:
         async with aclosing(messages):
             async for message in messages:
                 pack = message.subject.rpartition(".")[2]
-                taken = await self._take_or_defer(partition, pack, message.data, message.sequence)
-                latest[pack] = _later(latest.get(pack), taken)
-        for taken in latest.values():
-            await self._publish(taken)
+                result = await self._take_or_defer(partition, pack, message.data, message.sequence)
+                latest[pack] = _merge(latest.get(pack), result)
+        for result in latest.values():
+            await self._publish(result)
 
     async def _take_or_defer(self, partition: Partition, pack: str, data: bytes, sequence: int) -> BlockResult:
-        """Take a message, or defer it if its pack has to wait."""
+        """Process a message, or defer it if its pack has exhausted its budget or has deferred messages."""
         if subjects.partition_of(pack, self._partitions) != self.number:
-            return partition.refuse(pack, sequence)
+            return partition.reject_misplaced(pack, sequence)
         if pack in partition.deferred or self._budget.is_exhausted(pack):
             await asyncio.sleep(0)
             partition.defer(pack, sequence)
-            self._turns.set()
+            self._wake_up_deferred.set()
             return BlockResult(pack)
-        taken = await self._step(pack, sequence, partial(partition.take, pack, data, sequence))
+        result = await self._step(pack, sequence, partial(partition.take, pack, data, sequence))
         if pack not in partition.deferred:
             self._count(data)
-        return taken
+        return result
 
     async def _step(self, pack: str, sequence: int, take: Callable[[], BlockResult]) -> BlockResult:
-        """Take a message when no other block is stepped; the time that it needs is charged to its pack."""
-        async with self._turn:
+        """Process a message while no other block is processed, and charge the processor time to its pack."""
+        async with self._step_lock:
             await asyncio.sleep(0)
             begin_s = time.thread_time()
             try:
-                taken = take()
+                result = take()
             except Exception:  # an internal error with one pack, which would otherwise end one worker after another
-                log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
-                taken = BlockResult(pack, failed=1)
+                log.exception("a block is skipped", partition=self.number, pack=pack, sequence=sequence)
+                result = BlockResult(pack, failed=1)
             self._budget.charge(pack, time.thread_time() - begin_s)
-        self._note(taken)
-        return taken
+        self._record_result(result)
+        return result
 
     def _count(self, data: bytes) -> None:
+        """Count the block and its samples, and update the lag."""
         samples, arrival_s = peek_header(data)
         self.blocks += 1
         self.samples += samples
         self.lag_s = max(self.lag_s or 0.0, time.time() - arrival_s)
 
-    def _note(self, taken: BlockResult) -> None:
-        self.faults += taken.failed
-        self.hours.extend((message_id, taken.pack, row) for message_id, row in taken.hours)
+    def _record_result(self, result: BlockResult) -> None:
+        self.faults += result.failed
+        self.hours.extend((message_id, result.pack, row) for message_id, row in result.hours)
 
-    async def _publish(self, taken: BlockResult) -> None:
-        """Publish what a message brought for edges and pages, unless the server is away: the next brings the like."""
+    async def _publish(self, result: BlockResult) -> None:
+        """Publish reply and estimates of a result. Without a connection they are dropped, because later ones replace them."""
         if not self._nc.is_connected:
             return
-        if taken.awaits is not None:
-            await self._nc.publish(subjects.awaits(taken.pack), taken.awaits.model_dump_json().encode())
-        for topic, payload in (("state", taken.state), ("parameters", taken.parameters)):
+        if result.reply is not None:
+            await self._nc.publish(subjects.awaits(result.pack), result.reply.model_dump_json().encode())
+        for topic, payload in (("state", result.state), ("parameters", result.parameters)):
             if payload is not None:
-                await self._nc.publish(subjects.published(taken.pack, topic), payload)
+                await self._nc.publish(subjects.published(result.pack, topic), payload)
 
-    async def _look(self) -> None:
-        """Check after a lapse of the pin whether another worker owns the partition now."""
-        async with self._changing:
-            await self._confirm()
-        self._lost = False
+    async def _check_ownership(self) -> None:
+        """Check the ownership after the pin has lapsed."""
+        async with self._state_lock:
+            await self._confirm_claim()
+        self._pin_lapsed = False
 
-    async def _confirm(self) -> None:
-        """Check that this worker's claim still holds; ``_changing`` is held."""
+    async def _confirm_claim(self) -> None:
+        """Confirm this worker's claim, if any; the caller holds ``_state_lock``."""
         if self.claim:
             try:
-                self.claim = await self._keeping.confirm_claim(self.claim)
+                self.claim = await self._checkpoints.confirm_claim(self.claim)
             except FencedError as error:
-                self._fenced(error)
+                self._drop_ownership(error)
 
-    def _fenced(self, error: FencedError) -> None:
+    def _drop_ownership(self, error: FencedError) -> None:
+        """Drop state and claim, because another worker has claimed the partition."""
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
         self.partition = self.claim = None
-        self._pin, self._whole = 0, False
+        self._pin, self._is_gapless = 0, False
         self.hours.clear()  # the owner of the partition computes them from the last checkpoint on
 
-    async def _try(self, what: Callable[[], Awaitable[None]]) -> bool:
-        """Return True if the server did it; log the reason if not."""
+    async def _try(self, action: Callable[[], Awaitable[None]]) -> bool:
+        """Return True if ``action`` succeeded; log the error if it failed."""
         try:
-            await what()
+            await action()
         except FencedError as error:
-            self._fenced(error)
+            self._drop_ownership(error)
             return False
-        except TROUBLES as error:
+        except RETRYABLE_ERRORS as error:
             if (text := error_text(error)) != self.trouble:
                 log.warning("waiting for the server", partition=self.number, reason=text)
             self.trouble = text
@@ -418,12 +426,12 @@ class PartitionLease:
         return True
 
 
-def _later(before: BlockResult | None, taken: BlockResult) -> BlockResult:
-    """Merge two successive results of one pack into one."""
+def _merge(before: BlockResult | None, result: BlockResult) -> BlockResult:
+    """Merge two successive results of one pack: the newest of each message."""
     if before is None:
-        return taken
-    return taken._replace(
-        awaits=taken.awaits or before.awaits,
-        state=taken.state or before.state,
-        parameters=taken.parameters or before.parameters,
+        return result
+    return result._replace(
+        reply=result.reply or before.reply,
+        state=result.state or before.state,
+        parameters=result.parameters or before.parameters,
     )

@@ -1,8 +1,8 @@
-"""Messages of one partition, from the durable consumer that the server pins to one worker at a time (ADR-42).
+"""Consumer of one partition: a durable consumer that the server pins to one worker at a time (ADR-42).
 
 Measured with nats-server 2.15.1: a pin lasts ``streams.PIN_S`` from the last *request* that names it, with or without deliveries.
-Therefore requests are renewed each ``RENEW_S`` and expire later than that, so that two or three are pending. A request without a
-pin waits while another pin lasts. A request with an expired pin gets status 423.
+Therefore a request is sent each ``RENEW_S``; because it expires later than that, two or three requests are pending. A request
+without a pin waits while another pin lasts. A request with an expired pin gets status 423.
 """
 
 import json
@@ -14,131 +14,136 @@ from nats.aio.msg import Msg
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.fleet.nats.streams import ANSWER_S, GROUP, PIN_S, consumer
+from bms_estimator.fleet.nats.streams import GROUP, PIN_S, RESPONSE_TIMEOUT_S, consumer
 
 RENEW_S = PIN_S / 4.0
-"""Interval of requests [s]: the loop may be late by three of them without losing a pin."""
+"""Interval of requests [s]. A pin survives if the event loop is late by three intervals."""
 EXPIRES_S = 2.5 * RENEW_S
 """Expiry of a request [s]."""
 BATCH = 32
-"""Number of messages in a request, unless as many wait here."""
+"""Number of messages in a request, and limit of waiting messages above which only one is requested."""
 PIN_HEADER, STATUS_HEADER = "Nats-Pin-Id", "Status"
 WRONG_PIN = "423"
-QUIET = frozenset({"404", "408", "409"})
-"""A request that has ended: without a message, in time, or since the consumer's leader changed. The next is on its way."""
+"""Status of a request with an expired pin."""
+EXPECTED_STATUSES = frozenset({"404", "408", "409"})
+"""Statuses of a request that ended without messages, by its expiry or by a new leader of the consumer. The next request follows."""
 
 
 class DeliveredMessage(NamedTuple):
-    """A message of the stream."""
+    """Message of the stream, delivered to this worker."""
 
     pack: str
     data: bytes
     sequence: int
     """Sequence number in the stream."""
     pin: int
-    """Number of times that this consumer has been pinned to this worker."""
+    """Number of pins that this worker had received with this message."""
     follows: bool
-    """True if it follows the last delivered one directly: no other message of the partition lies between."""
+    """True if no other message of the partition lies between this one and the last delivered one."""
 
 
 class PinnedConsumer:
-    """Requests messages of a partition and holds them until they are taken.
+    """Requests messages of a partition and queues them until they are processed.
 
     Args:
-        nc: Connected.
+        nc: Connection of the tenant.
         partition: Number of the partition.
-        inbox: Subject for the server's responses, to which it adds one token; its messages go to ``receive``.
+        inbox: Prefix of the subject for responses; one token is added. The caller passes its messages to ``receive``.
 
     Attributes:
-        waiting: Messages not taken yet.
-        trouble: Why the last request failed; empty: it did not.
+        waiting: Queued messages.
+        trouble: Error of the last request; empty without one.
     """
 
     def __init__(self, nc: Client, partition: int, inbox: str) -> None:
         self._nc, self._inbox = nc, inbox
-        self._next = f"$JS.API.CONSUMER.MSG.NEXT.{subjects.RAW_STREAM}.{consumer(partition)}"
-        self._info = f"$JS.API.CONSUMER.INFO.{subjects.RAW_STREAM}.{consumer(partition)}"
-        self._unpin = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
+        self._next_subject = f"$JS.API.CONSUMER.MSG.NEXT.{subjects.RAW_STREAM}.{consumer(partition)}"
+        self._info_subject = f"$JS.API.CONSUMER.INFO.{subjects.RAW_STREAM}.{consumer(partition)}"
+        self._unpin_subject = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
         self.waiting: deque[DeliveredMessage] = deque()
         self.trouble = ""
         self._pin = ""
-        self._pins = 0
-        self._last = -1  # the consumer's own number of the last message
-        self._taken = 0  # since the last request
+        self._pin_count = 0
+        self._last = -1  # consumer sequence number of the last message
+        self._taken_since_request = 0  # messages since the last request
 
     @property
     def pinned(self) -> bool:
-        """True if this worker is pinned, by its own knowledge."""
+        """True if the consumer is pinned to this worker as far as it knows."""
         return bool(self._pin)
 
     async def is_pinned(self) -> bool:
-        """Return True if the server has pinned it to any worker.
+        """Return True if the server has pinned the consumer to any worker.
 
         Raises:
             StreamError: The consumer does not exist.
-            nats.errors.Error: The server does not answer.
+            nats.errors.Error: The server does not respond.
         """
-        answer = json.loads((await self._nc.request(self._info, timeout=ANSWER_S)).data)
-        if "error" in answer:
-            raise StreamError(f"the server tells nothing of a partition: {answer['error'].get('description', '')}")
-        return any(group.get("pinned_client_id") for group in answer.get("priority_groups") or ())
+        response = json.loads((await self._nc.request(self._info_subject, timeout=RESPONSE_TIMEOUT_S)).data)
+        if "error" in response:
+            raise StreamError(
+                f"the server does not describe the consumer of a partition: {response['error'].get('description', '')}"
+            )
+        return any(group.get("pinned_client_id") for group in response.get("priority_groups") or ())
 
     async def renew(self) -> None:
-        """Ask again; to be called each ``RENEW_S``. With enough waiting for one more only, which keeps the pin."""
-        await self._ask(BATCH if len(self.waiting) < BATCH else 1)
+        """Send a request; to be called each ``RENEW_S``. If many messages wait, only one is requested, to keep the pin."""
+        await self._request(BATCH if len(self.waiting) < BATCH else 1)
 
     async def take(self) -> DeliveredMessage | None:
-        """Return the next message; None without one."""
+        """Return the next queued message; None without one."""
         if not self.waiting:
             return None
-        self._taken += 1
-        if self._taken >= BATCH // 2 and len(self.waiting) < BATCH:
-            await self._ask(self._taken)
+        self._taken_since_request += 1
+        if self._taken_since_request >= BATCH // 2 and len(self.waiting) < BATCH:
+            await self._request(self._taken_since_request)
         return self.waiting.popleft()
 
     def receive(self, message: Msg) -> bool:
-        """Take what the server sends. Whether this ended our pin."""
+        """Process a message or status from the server. Return True if the status ends this worker's pin."""
         headers = message.headers or {}
         status = headers.get(STATUS_HEADER)
         if status is None:
             self._add(message, headers.get(PIN_HEADER, ""))
             return False
         if status != WRONG_PIN:
-            self.trouble = "" if status in QUIET else f"status {status} {headers.get('Description', '')}".strip()
+            self.trouble = (
+                "" if status in EXPECTED_STATUSES else f"status {status} {headers.get('Description', '')}".strip()
+            )
             return False
-        lost = self.pinned and message.subject.rpartition(".")[2] == str(self._pins)
+        lost = self.pinned and message.subject.rpartition(".")[2] == str(self._pin_count)
         if lost:
             self._pin = ""
-            self.waiting.clear()  # they are delivered again, here or elsewhere
+            self.waiting.clear()  # the server delivers them again to the next pinned worker
         return lost
 
     async def unpin(self) -> None:
-        """Release the partition to any worker that requests it."""
+        """Release the pin, so that another worker can get it at once."""
         pin, self._pin = self._pin, ""
         self.waiting.clear()
         if pin:
-            await self._nc.request(self._unpin, json.dumps({"group": GROUP}).encode(), timeout=PIN_S)
+            await self._nc.request(self._unpin_subject, json.dumps({"group": GROUP}).encode(), timeout=PIN_S)
 
-    async def _ask(self, batch: int) -> None:
+    async def _request(self, batch: int) -> None:
         request: dict[str, str | int] = {"batch": batch, "expires": round(1e9 * EXPIRES_S), "group": GROUP}
         if self._pin:
             request["id"] = self._pin
-        self._taken = 0
-        await self._nc.publish(self._next, json.dumps(request).encode(), f"{self._inbox}.{self._pins}")
+        self._taken_since_request = 0
+        await self._nc.publish(self._next_subject, json.dumps(request).encode(), f"{self._inbox}.{self._pin_count}")
 
     def _add(self, message: Msg, pin: str) -> None:
-        stream_sequence, consumer_sequence = sequences(message.reply)
+        stream_sequence, consumer_sequence = parse_sequences(message.reply)
         if pin != self._pin:
-            self._pin, self._pins = pin, self._pins + 1
+            self._pin, self._pin_count = pin, self._pin_count + 1
         self.trouble = ""
         follows = consumer_sequence == self._last + 1
         self._last = consumer_sequence
         pack = message.subject.rpartition(".")[2]
-        self.waiting.append(DeliveredMessage(pack, message.data, stream_sequence, self._pins, follows))
+        self.waiting.append(DeliveredMessage(pack, message.data, stream_sequence, self._pin_count, follows))
 
 
-def sequences(reply: str) -> tuple[int, int]:
-    """Return a message's sequence number in its stream, and its gapless one in the consumer.
+def parse_sequences(reply: str) -> tuple[int, int]:
+    """Return a message's sequence numbers in its stream and in its consumer; the latter has no gaps.
 
     Args:
         reply: Acknowledgment subject (ADR-15): 9 tokens, or 11 and more with the server's domain.

@@ -1,4 +1,4 @@
-"""A worker: as many partitions as are its share of what there is, on one connection."""
+"""Worker: processes its share of the partitions on one connection."""
 
 import asyncio
 import resource
@@ -15,12 +15,12 @@ from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
-from bms_estimator.fleet.nats.connection import connect, error_text, part
+from bms_estimator.fleet.nats.connection import close, connect, error_text
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.membership import Membership
-from bms_estimator.fleet.worker.partition_lease import RETRY_S, TROUBLES, PartitionLease
+from bms_estimator.fleet.worker.partition_lease import RETRY_S, RETRYABLE_ERRORS, PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import SystemdNotifier
@@ -28,14 +28,14 @@ from bms_estimator.process.tasks import end, until_first_ends
 
 CHECKPOINT_S = 300.0
 """Default interval between two checkpoints of a partition [s]."""
-LISTEN_S = 0.5
-"""Time of listening to other workers before partitions are claimed [s]: they answer a new worker at once."""
-LOOK_S = 0.5
+DISCOVERY_S = 0.5
+"""Time for discovering other workers before partitions are claimed [s]: they answer a new worker's heartbeat at once."""
+CHECK_S = 0.5
 """Interval between two checks for a due checkpoint or waiting summaries [s]."""
 MAX_UNKNOWN = 20
-"""Packs that a heartbeat names."""
-AT_ONCE = 8
-"""Partitions that are given back at the same time."""
+"""Maximum number of unknown packs that a heartbeat names."""
+MAX_RELEASES = 8
+"""Maximum number of partitions that are saved and released at the same time."""
 
 log = structlog.get_logger(__name__)
 
@@ -45,7 +45,7 @@ class Options:
     """Options of a worker.
 
     Attributes:
-        servers: As ``connect`` has them, like ``creds`` and ``ca``.
+        servers, creds, ca: Arguments of ``connect``.
         name: Name of the worker.
         checkpoint_s: Interval between checkpoints of a partition [s].
     """
@@ -58,7 +58,7 @@ class Options:
 
 
 async def work(options: Options, stop: asyncio.Event) -> None:
-    """Work until ``stop`` is set; then save checkpoints and release the partitions.
+    """Run a worker until ``stop`` is set; then save checkpoints and release the partitions.
 
     Raises:
         UserError: An option cannot be used, or the server has closed the connection permanently.
@@ -78,53 +78,58 @@ async def work(options: Options, stop: asyncio.Event) -> None:
 
 
 async def _start(options: Options, notifier: SystemdNotifier) -> "Worker":
-    """Connect, and find the streams; tried until it works."""
+    """Connect and create a worker; repeat until the server has the streams."""
     nc = await connect(options.servers, options.name, creds=options.creds, ca=options.ca)
-    said = ""
+    last_reason = ""
     while True:
         try:
-            return await _found(nc, options, notifier)
-        except (*TROUBLES, UserError) as error:
+            return await _create_worker(nc, options, notifier)
+        except (*RETRYABLE_ERRORS, UserError) as error:
             _check(nc, options)
-            if (text := error_text(error)) != said:
+            if (text := error_text(error)) != last_reason:
                 log.warning("waiting for the server", reason=text)
-            said = text
+            last_reason = text
         await asyncio.sleep(RETRY_S)
 
 
 def _check(nc: Client, options: Options) -> None:
-    """Check that the connection can be restored.
+    """Check that the connection is open or will be restored.
 
     Raises:
-        UserError: The server has closed it permanently.
+        UserError: The server has closed the connection permanently.
     """
     if nc.is_closed:
-        raise UserError(f"the server {options.servers} has closed the connection: look at --creds")
+        raise UserError(f"the server {options.servers} has closed the connection: check --creds")
 
 
-async def _found(nc: Client, options: Options, notifier: SystemdNotifier) -> "Worker":
+async def _create_worker(nc: Client, options: Options, notifier: SystemdNotifier) -> "Worker":
+    """Open the buckets, read the table of packs and return a worker.
+
+    Raises:
+        UserError: A stream is missing.
+    """
     partitions = await partitions_of(nc)
     if partitions is None:
-        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: make it with `bms-estimator fleet serve`")
+        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
     js = nc.jetstream()
     checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
     states = await js.object_store(subjects.STATES_BUCKET)
     bucket = PackBucket(nc)
     await bucket.refresh()
-    keeping = CheckpointStore(nc, options.name, checkpoints, states)
-    return Worker(nc, options, partitions, keeping, bucket, notifier)
+    store = CheckpointStore(nc, options.name, checkpoints, states)
+    return Worker(nc, options, partitions, store, bucket, notifier)
 
 
 class Worker:
-    """The partitions of one process.
+    """Worker process with its partitions.
 
     Args:
-        nc: Connected.
+        nc: Connection of the tenant.
         options: Options of the worker.
         partitions: Total number of partitions.
-        keeping: Store of the checkpoints.
-        bucket: The table of packs.
-        notifier: Is notified that the worker is ready and alive.
+        checkpoints: Store of the checkpoints.
+        bucket: Table of packs.
+        notifier: Notifies systemd that the worker is ready, alive or stopping.
     """
 
     def __init__(
@@ -132,90 +137,91 @@ class Worker:
         nc: Client,
         options: Options,
         partitions: int,
-        keeping: CheckpointStore,
+        checkpoints: CheckpointStore,
         bucket: PackBucket,
         notifier: SystemdNotifier,
     ) -> None:
         self._nc, self._options, self._partitions = nc, options, partitions
-        self._keeping, self._bucket, self._notifier = keeping, bucket, notifier
+        self._checkpoints, self._bucket, self._notifier = checkpoints, bucket, notifier
         self._members = Membership(options.name)
         self._inbox = nc.new_inbox()
-        self._held: dict[int, tuple[PartitionLease, asyncio.Task[None]]] = {}
-        self._returning: dict[int, asyncio.Task[None]] = {}
+        self._lease_tasks: dict[int, tuple[PartitionLease, asyncio.Task[None]]] = {}
+        self._releases: dict[int, asyncio.Task[None]] = {}
         self._changed: asyncio.Queue[set[str]] = asyncio.Queue()
         self._started_s = time.time()
         self._renewed_s = time.monotonic()
-        self._blocks = self._samples = self._faults = 0  # of partitions that were given back
+        self._blocks = self._samples = self._faults = 0  # of released partitions
         self._leaving = False
-        self._turn = asyncio.Lock()
-        self._few = asyncio.Semaphore(AT_ONCE)
-        self._told: set[str] = set()
+        self._step_lock = asyncio.Lock()
+        self._release_slots = asyncio.Semaphore(MAX_RELEASES)
+        self._reported_unknown: set[str] = set()
 
     async def run(self) -> None:
-        """Run until it is cancelled.
+        """Claim and process partitions until cancelled.
 
         Raises:
             UserError: The server has closed the connection permanently.
         """
         await self._nc.subscribe(subjects.worker(), cb=self._receive_heartbeat)
         await self._nc.subscribe(f"{self._inbox}.*.*", cb=self._receive)
-        await self._beat()
-        await asyncio.sleep(LISTEN_S)
+        await self._send_heartbeat()
+        await asyncio.sleep(DISCOVERY_S)
         self._notifier.ready(self._options.name)
         log.info("ready", worker=self._options.name, partitions=self._partitions)
         await until_first_ends(
-            _each(HEARTBEAT_S, self._beat),
-            _each(RENEW_S, self._renew),
-            _each(LOOK_S, self._save),
-            _each(LOOK_S, self._send_hours),
+            _repeat(HEARTBEAT_S, self._send_heartbeat),
+            _repeat(RENEW_S, self._renew),
+            _repeat(CHECK_S, self._save),
+            _repeat(CHECK_S, self._send_hours),
             self._bucket.follow(self._changed.put_nowait),
-            self._settle(),
+            self._apply_table_changes(),
         )
 
     async def end(self) -> None:
-        """Keep all states, give the partitions back, and close the connection."""
+        """Save checkpoints, release the partitions, and close the connection."""
         self._leaving = True
-        await self._beat()  # others ask for the partitions from now on
+        await self._send_heartbeat()  # with ``leaving``, so that other workers request the partitions from now on
         if not self._nc.is_connected:
-            log.warning("the server is away: who has the partitions next reads the stream from the last checkpoints")
-        for number in list(self._held):
-            self._give_back(number)
-        renewing = asyncio.ensure_future(_each(RENEW_S, self._ask_all))
-        await asyncio.gather(*self._returning.values())
+            log.warning(
+                "no connection to the server: the next owners of the partitions read the stream from the last checkpoints"
+            )
+        for number in list(self._lease_tasks):
+            self._start_release(number)
+        renewing = asyncio.ensure_future(_repeat(RENEW_S, self._send_requests))
+        await asyncio.gather(*self._releases.values())
         await end(renewing)
-        await part(self._nc)
+        await close(self._nc)
 
     @property
-    def _holdings(self) -> list[PartitionLease]:
-        return [holding for holding, _ in self._held.values()]
+    def _leases(self) -> list[PartitionLease]:
+        return [lease for lease, _ in self._lease_tasks.values()]
 
     async def _receive_heartbeat(self, message: Msg) -> None:
+        """Process another worker's heartbeat; answer the first one of a new worker."""
         try:
-            heard = Heartbeat.model_validate_json(message.data)
+            heartbeat = Heartbeat.model_validate_json(message.data)
         except ValidationError as error:
-            log.warning(
-                "this is no heartbeat of a worker", subject=message.subject, reason=str(error.errors()[0]["msg"])
-            )
+            log.warning("invalid heartbeat of a worker", subject=message.subject, reason=str(error.errors()[0]["msg"]))
             return
-        if heard.id == self._options.name and heard.started_s != self._started_s and not heard.leaving:
-            log.warning("another worker has the same name: give each its own with --name", worker=heard.id)
+        if heartbeat.id == self._options.name and heartbeat.started_s != self._started_s and not heartbeat.leaving:
+            log.warning("another worker has the same name: give each worker a different --name", worker=heartbeat.id)
         now_s = time.monotonic()
-        if self._members.on_heartbeat(heard.id, now_s, leaving=heard.leaving):
-            log.info("another worker", worker=heard.id)
-            await self._beat()
+        if self._members.on_heartbeat(heartbeat.id, now_s, leaving=heartbeat.leaving):
+            log.info("new worker", worker=heartbeat.id)
+            await self._send_heartbeat()
 
     async def _receive(self, message: Msg) -> None:
-        """Messages arrive on the stream's subject, p.<partition>.raw.<pack>.
+        """Pass a message or status to the lease of its partition.
 
-        Statuses on the inbox, <inbox>.<partition>.<pin>.
+        Messages arrive on the stream's subject p.<partition>.raw.<pack>, statuses on <inbox>.<partition>.<pin>.
         """
         tokens = message.subject.split(".")
-        found = self._held.get(int(tokens[-2] if message.subject.startswith(self._inbox) else tokens[1]))
-        if found:
-            found[0].receive(message)
+        entry = self._lease_tasks.get(int(tokens[-2] if message.subject.startswith(self._inbox) else tokens[1]))
+        if entry:
+            entry[0].receive(message)
 
-    async def _beat(self) -> None:
-        """Publish the heartbeat."""
+    async def _send_heartbeat(self) -> None:
+        """Publish the heartbeat and the unknown packs, and notify systemd."""
         if self._nc.is_connected:
             heartbeat = self._heartbeat()
             await self._nc.publish(subjects.worker(self._options.name), heartbeat.model_dump_json().encode())
@@ -223,131 +229,135 @@ class Worker:
         self._notifier.alive(self._options.name)
 
     async def _publish_unknown(self) -> None:
-        """Publish once for each unknown pack that the table lacks it, with the reason."""
-        unknown = {pack for holding in self._holdings if holding.partition for pack in holding.partition.unknown}
-        for pack in unknown - self._told:
-            why = self._bucket.packs.reason(pack)
-            log.warning("unknown pack: its blocks are held", pack=pack, reason=why)
-            await self._nc.publish(subjects.unknown(pack), why.encode())
-        self._told = unknown
+        """Publish the reason for each pack that has become unknown."""
+        unknown = {pack for lease in self._leases if lease.partition for pack in lease.partition.unknown}
+        for pack in unknown - self._reported_unknown:
+            reason = self._bucket.packs.reason(pack)
+            log.warning("unknown pack: its blocks are deferred", pack=pack, reason=reason)
+            await self._nc.publish(subjects.unknown(pack), reason.encode())
+        self._reported_unknown = unknown
 
     async def _renew(self) -> None:
-        """Claim assigned partitions, release others, and request more messages."""
+        """Claim assigned partitions, release the others, and request more messages."""
         _check(self._nc, self._options)
         now_s = time.monotonic()
         if not self._nc.is_connected or now_s > self._renewed_s + DEAD_S / 2.0:
-            self._members.extend_all(now_s)  # no other worker could be received
+            self._members.extend_all(now_s)  # no heartbeat could be received
         self._renewed_s = now_s
         share = self._members.share(self._partitions, now_s)
-        for number in self._held.keys() - share:
-            self._give_back(number)
-        for number in sorted(share - self._held.keys()):
-            self._try_for(number, now_s)
-        for task in [*self._returning.values(), *(task for _, task in self._held.values())]:
+        for number in self._lease_tasks.keys() - share:
+            self._start_release(number)
+        for number in sorted(share - self._lease_tasks.keys()):
+            self._start_lease(number, now_s)
+        for task in [*self._releases.values(), *(task for _, task in self._lease_tasks.values())]:
             if task.done() and not task.cancelled():
-                task.result()  # our own fault; unnoticed it would leave the partition without an owner
-        await self._ask_all()
+                task.result()  # an internal error must end the process; otherwise the partition would have no owner
+        await self._send_requests()
         if self._nc.is_connected:
-            for holding in self._holdings:
-                holding.check_silence()
+            for lease in self._leases:
+                lease.check_silence()
 
-    async def _ask_all(self) -> None:
+    async def _send_requests(self) -> None:
         if self._nc.is_connected:
-            for holding in self._holdings:
-                await holding.consumer.renew()
+            for lease in self._leases:
+                await lease.consumer.renew()
 
-    def _try_for(self, number: int, now_s: float) -> None:
-        holding = PartitionLease(
+    def _start_lease(self, number: int, now_s: float) -> None:
+        lease = PartitionLease(
             self._nc,
             number,
             self._bucket.packs,
-            self._keeping,
+            self._checkpoints,
             self._inbox,
-            self._turn,
+            self._step_lock,
             partitions=self._partitions,
-            is_busy=lambda: any(each.consumer.waiting for each in self._holdings),
+            is_busy=lambda: any(each.consumer.waiting for each in self._leases),
         )
-        holding.due_s = now_s + self._options.checkpoint_s * (number + 1) / self._partitions
-        self._held[number] = holding, asyncio.create_task(holding.run())
+        lease.due_s = now_s + self._options.checkpoint_s * (number + 1) / self._partitions
+        self._lease_tasks[number] = lease, asyncio.create_task(lease.run())
 
-    def _give_back(self, number: int) -> None:
-        if number not in self._returning:
-            self._returning[number] = asyncio.create_task(self._return(*self._held[number]))
+    def _start_release(self, number: int) -> None:
+        if number not in self._releases:
+            self._releases[number] = asyncio.create_task(self._release(*self._lease_tasks[number]))
 
-    async def _return(self, holding: PartitionLease, task: asyncio.Task[None]) -> None:
+    async def _release(self, lease: PartitionLease, task: asyncio.Task[None]) -> None:
         await end(task)
-        async with self._few:
+        async with self._release_slots:
             if self._nc.is_connected:
-                await holding.release()
-        self._blocks, self._samples = self._blocks + holding.blocks, self._samples + holding.samples
-        self._faults += holding.faults
-        del self._held[holding.number], self._returning[holding.number]
+                await lease.release()
+        self._blocks, self._samples = self._blocks + lease.blocks, self._samples + lease.samples
+        self._faults += lease.faults
+        del self._lease_tasks[lease.number], self._releases[lease.number]
 
     async def _save(self) -> None:
-        """Write the checkpoints that are due."""
-        for holding in sorted(self._holdings, key=lambda each: each.due_s):
+        """Write the due checkpoints."""
+        for lease in sorted(self._leases, key=lambda each: each.due_s):
             now_s = time.monotonic()
-            if holding.due_s <= now_s and self._nc.is_connected:
-                holding.due_s = now_s + self._options.checkpoint_s
-                await self._try(holding, holding.save)
+            if lease.due_s <= now_s and self._nc.is_connected:
+                lease.due_s = now_s + self._options.checkpoint_s
+                await self._try(lease, lease.save)
 
     async def _send_hours(self) -> None:
-        for holding in self._holdings:
-            if holding.hours and self._nc.is_connected:
-                await self._try(holding, holding.send_hours)
+        for lease in self._leases:
+            if lease.hours and self._nc.is_connected:
+                await self._try(lease, lease.send_hours)
 
-    async def _try(self, holding: PartitionLease, what: Callable[[], Awaitable[None]]) -> None:
+    async def _try(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
         try:
-            await what()
-        except TROUBLES as error:
-            log.warning("the server does not keep what it is given", partition=holding.number, reason=error_text(error))
+            await action()
+        except RETRYABLE_ERRORS as error:
+            log.warning(
+                "a checkpoint or summary could not be stored; trying again",
+                partition=lease.number,
+                reason=error_text(error),
+            )
 
-    async def _settle(self) -> None:
-        """Notify partitions of packs with changed settings or newly known packs."""
+    async def _apply_table_changes(self) -> None:
+        """Notify partitions of changed and new rows of the table of packs."""
         while True:
             for pack in await self._changed.get():
-                held = self._held.get(subjects.partition_of(pack, self._partitions))
-                if held:
-                    held[0].settings_changed(pack)
+                entry = self._lease_tasks.get(subjects.partition_of(pack, self._partitions))
+                if entry:
+                    entry[0].settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
-        holdings = [holding for holding in self._holdings if holding.is_owned]
+        leases = [lease for lease in self._leases if lease.is_owned]
         counters, unknown = Counter[str](), list[str]()
-        for holding in holdings:
-            if holding.partition:
-                counters.update(holding.partition.counters)
-                unknown += holding.partition.unknown
-        lags = [holding.lag_s for holding in holdings if holding.lag_s is not None]
-        for holding in holdings:
-            holding.lag_s = None
+        for lease in leases:
+            if lease.partition:
+                counters.update(lease.partition.counters)
+                unknown += lease.partition.unknown
+        lags = [lease.lag_s for lease in leases if lease.lag_s is not None]
+        for lease in leases:
+            lease.lag_s = None
         usage = resource.getrusage(resource.RUSAGE_SELF)
-        ages = [time.time() - kept.made_s for holding in holdings if (kept := holding.last_checkpoint)]
+        ages = [time.time() - checkpoint.made_s for lease in leases if (checkpoint := lease.last_checkpoint)]
         return Heartbeat(
             id=self._options.name,
             started_s=self._started_s,
             leaving=self._leaving,
-            partitions=tuple(holding.number for holding in holdings),
+            partitions=tuple(lease.number for lease in leases),
             packs=counters["packs"],
-            blocks=self._blocks + sum(holding.blocks for holding in self._holdings),
-            samples=self._samples + sum(holding.samples for holding in self._holdings),
-            faults=self._faults + sum(holding.faults for holding in self._holdings),
+            blocks=self._blocks + sum(lease.blocks for lease in self._leases),
+            samples=self._samples + sum(lease.samples for lease in self._leases),
+            faults=self._faults + sum(lease.faults for lease in self._leases),
             lag_s=max(lags, default=None),
             counters=dict(counters),
             unknown_count=len(unknown),
             unknown=tuple(sorted(unknown)[:MAX_UNKNOWN]),
-            waiting=sum(len(holding.consumer.waiting) for holding in self._holdings),
-            hours_waiting=sum(len(holding.hours) for holding in self._holdings),
+            waiting=sum(len(lease.consumer.waiting) for lease in self._leases),
+            hours_waiting=sum(len(lease.hours) for lease in self._leases),
             checkpoint_age_s=max(ages, default=None),
             cpu_s=usage.ru_utime + usage.ru_stime,
             rss_mib=_rss_mib(),
-            trouble=next((holding.trouble for holding in self._holdings if holding.trouble), self._bucket.fault),
+            trouble=next((lease.trouble for lease in self._leases if lease.trouble), self._bucket.fault),
         )
 
 
-async def _each(period_s: float, what: Callable[[], Awaitable[None]]) -> None:
-    """Do it again and again; missed calls are not repeated."""
+async def _repeat(period_s: float, action: Callable[[], Awaitable[None]]) -> None:
+    """Call ``action`` periodically until cancelled; missed calls are not made up for."""
     while True:
-        await what()
+        await action()
         await asyncio.sleep(period_s)
 
 

@@ -1,4 +1,4 @@
-"""What a pack has sent, put together: in order, each block once."""
+"""Capture of a pack's blocks: in order, each block once."""
 
 import numpy as np
 import pytest
@@ -24,44 +24,44 @@ def block(number, store=STORE, first_s=None):
     return encode(Block(store, number, 1, store * 1e-9 + rows["time_s"][-1], rows))
 
 
-def captured(*blocks, **span):
-    found = BlockCapture(**span)
+def make_capture(*blocks, **span):
+    capture = BlockCapture(**span)
     for data in blocks:
-        found.add(data)
-    return found
+        capture.add(data)
+    return capture
 
 
-def rows(found):
-    return np.concatenate([*found.samples(), np.zeros(0, dtype=SAMPLE)])
+def rows(capture):
+    return np.concatenate([*capture.samples(), np.zeros(0, dtype=SAMPLE)])
 
 
-def test_resends_and_gaps_leave_each_block_once_in_its_order():
-    found = captured(block(1), block(2), block(5), block(3), block(4), block(5), block(4))
-    assert (rows(found) == samples(60.0, 300)).all()
-    assert (found.blocks, found.again, found.damaged, found.missing) == (5, 2, 0, [])
+def test_resent_and_late_blocks_appear_once_in_order():
+    capture = make_capture(block(1), block(2), block(5), block(3), block(4), block(5), block(4))
+    assert (rows(capture) == samples(60.0, 300)).all()
+    assert (capture.blocks, capture.again, capture.damaged, capture.missing) == (5, 2, 0, [])
 
 
-def test_what_is_missing_and_damaged_is_told():
-    found = captured(b"", block(1)[:-1], block(1), block(4), block(9))
-    assert (found.damaged, found.missing) == (2, [(2, 3), (5, 8)])
+def test_missing_and_damaged_blocks_are_counted():
+    capture = make_capture(b"", block(1)[:-1], block(1), block(4), block(9))
+    assert (capture.damaged, capture.missing) == (2, [(2, 3), (5, 8)])
 
 
-def test_a_span_is_cut_by_the_sample():
-    found = captured(*map(block, range(1, 10)), since_s=STORE * 1e-9 + 130.0, until_s=STORE * 1e-9 + 200.0)
-    assert rows(found)["time_s"].tolist() == list(range(130, 200))
-    assert found.blocks == 2
+def test_time_span_is_cut_at_samples():
+    capture = make_capture(*map(block, range(1, 10)), since_s=STORE * 1e-9 + 130.0, until_s=STORE * 1e-9 + 200.0)
+    assert rows(capture)["time_s"].tolist() == list(range(130, 200))
+    assert capture.blocks == 2
 
 
 @pytest.mark.parametrize(("later_s", "first_s"), [(1000.0, 1060.0), (10.0, 179.0)])
-def test_time_goes_on_by_the_wall_clock_into_another_store_and_never_back(later_s, first_s):
+def test_time_continues_by_the_wall_clock_and_never_steps_back(later_s, first_s):
     other = STORE + round(later_s * 1e9)
-    found = captured(block(1), block(2), block(1, other), block(3))
-    time_s = rows(found)["time_s"]
+    capture = make_capture(block(1), block(2), block(1, other), block(3))
+    time_s = rows(capture)["time_s"]
     assert (time_s.size, time_s[119], time_s[120]) == (180, 179.0, first_s)
-    assert found.again == 1, "a block of the store that is over"
+    assert capture.again == 1, "a block of the former store"
     assert (np.diff(time_s) >= 0.0).all()
 
 
-def test_nothing_is_nothing():
-    assert rows(captured()).size == 0
-    assert np.isnan(captured().span_s).all()
+def test_empty_capture():
+    assert rows(make_capture()).size == 0
+    assert np.isnan(make_capture().span_s).all()

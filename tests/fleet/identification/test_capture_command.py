@@ -1,4 +1,4 @@
-"""``fleet capture`` of blocks that came by MQTT to the real server."""
+"""``fleet capture`` of blocks sent by MQTT to the real server."""
 
 import asyncio
 from datetime import UTC, datetime
@@ -11,15 +11,15 @@ import pytest
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.sources.captures.replay import load_capture
 from tests.command_line import run
-from tests.fleet.engine import running
 from tests.fleet.identification.test_block_capture import STORE, block, samples
+from tests.fleet.nats_cluster import running
 from tests.patience import LONG_S
 
 
-async def send(engine):
-    async with await nats.connect(engine.url) as nc:
+async def send(cluster):
+    async with await nats.connect(cluster.url) as nc:
         await make_streams(nc)
-    async with aiomqtt.Client("127.0.0.1", engine.mqtt_port, timeout=LONG_S) as client:
+    async with aiomqtt.Client("127.0.0.1", cluster.mqtt_port, timeout=LONG_S) as client:
         for number in (1, 2, 4, 3, 4, 6):
             await client.publish("raw/house", block(number), qos=1)
             await client.publish("raw/other", block(number), qos=1)
@@ -27,17 +27,17 @@ async def send(engine):
 
 
 @pytest.fixture(scope="module")
-def engine(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("engine")) as engine:
-        asyncio.run(send(engine))
-        yield engine
+def cluster(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("cluster")) as cluster:
+        asyncio.run(send(cluster))
+        yield cluster
 
 
 @pytest.mark.parametrize("name", ["out.parquet", "out.csv.gz"])
-def test_a_capture_holds_each_block_once_in_order(engine, tmp_path, capsys, name):
+def test_capture_has_each_block_once_in_order(cluster, tmp_path, capsys, name):
     out = tmp_path / name
-    code, said, err = run(capsys, "fleet", "capture", "house", out, "--server", engine.url)
-    assert (code, said) == (
+    code, stdout, err = run(capsys, "fleet", "capture", "house", out, "--server", cluster.url)
+    assert (code, stdout) == (
         0,
         f"{out}: 300 samples in 5 blocks of house, 2023-11-14T22:14:20.000Z to 2023-11-14T22:20:19.000Z\n",
     )
@@ -49,17 +49,17 @@ def test_a_capture_holds_each_block_once_in_order(engine, tmp_path, capsys, name
     read = load_capture(out)
     for column in ("time_s", "current_a", "voltage_v", "temperature_c"):
         assert (read[column] == expected[column]).all()
-    assert "exists already" in run(capsys, "fleet", "capture", "house", out, "--server", engine.url)[2]
+    assert "exists already" in run(capsys, "fleet", "capture", "house", out, "--server", cluster.url)[2]
 
 
-def test_a_span_is_cut_and_what_is_not_kept_is_said(engine, tmp_path, capsys):
+def test_time_span_is_cut_and_missing_data_are_reported(cluster, tmp_path, capsys):
     out = tmp_path / "out.csv"
     first = datetime.fromtimestamp(STORE * 1e-9 - 3600.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     last = datetime.fromtimestamp(STORE * 1e-9 + 100.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    asked = ["fleet", "capture", "house", out, "--from", first, "--to", last, "--server", engine.url]
-    code, said, err = run(capsys, *asked)
-    assert (code, said.startswith(f"{out}: 40 samples in 1 blocks of house")) == (0, True)
+    arguments = ["fleet", "capture", "house", out, "--from", first, "--to", last, "--server", cluster.url]
+    code, stdout, err = run(capsys, *arguments)
+    assert (code, stdout.startswith(f"{out}: 40 samples in 1 blocks of house")) == (0, True)
     assert "the stored samples begin at 2023-11-14T22:14:20.000Z" in err
-    code, _, err = run(capsys, "fleet", "capture", "nobody", tmp_path / "no.csv", "--server", engine.url)
+    code, _, err = run(capsys, "fleet", "capture", "nobody", tmp_path / "no.csv", "--server", cluster.url)
     assert (code, "nobody: the server has no samples of it in this period" in err) == (2, True)
-    assert "must end in" in run(capsys, "fleet", "capture", "house", tmp_path / "no.xls", "--server", engine.url)[2]
+    assert "must end in" in run(capsys, "fleet", "capture", "house", tmp_path / "no.xls", "--server", cluster.url)[2]

@@ -1,4 +1,4 @@
-"""``fleet identify``: packs' samples out of the real server's stream, their new cells back to it."""
+"""``fleet identify``: samples from the stream of the real server, new cells uploaded to it."""
 
 import asyncio
 import csv
@@ -14,14 +14,14 @@ from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import put
 from bms_estimator.fleet.packs.pack_row import stored
 from tests.command_line import run
-from tests.fleet.engine import running
 from tests.fleet.identification.test_reidentify import KIND, WRONG, pack_samples
+from tests.fleet.nats_cluster import running
 
 STORE = 1_700_000_000 * 10**9
 
 
 async def fill(url):
-    samples = pack_samples(8, rests=False)  # as a drive
+    samples = pack_samples(8, rests=False)  # a driving load without rests
     async with await nats.connect(url) as nc:
         await make_streams(nc, partitions=1)
         await put(nc, CELLS_BUCKET, {"own": WRONG.encode()})
@@ -37,20 +37,20 @@ async def fill(url):
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("engine"), partitions=1) as engine:
-        asyncio.run(fill(engine.url))
-        yield engine.url
+    with running(tmp_path_factory.mktemp("cluster"), partitions=1) as cluster:
+        asyncio.run(fill(cluster.url))
+        yield cluster.url
 
 
-def test_packs_are_identified_and_the_better_cells_put(url, tmp_path, capsys):
-    listed, out = tmp_path / "list.csv", tmp_path / "identified"
-    listed.write_text("rank,pack\n1,young\n2,silent\n3,wrong\n4,house\n")
-    asked = [
+def test_better_cells_are_written_and_uploaded(url, tmp_path, capsys):
+    pack_list, out = tmp_path / "list.csv", tmp_path / "identified"
+    pack_list.write_text("rank,pack\n1,young\n2,silent\n3,wrong\n4,house\n")
+    command = [
         "fleet",
         "identify",
         "house",
         "--from-file",
-        listed,
+        pack_list,
         "--out",
         out,
         "--put",
@@ -59,9 +59,9 @@ def test_packs_are_identified_and_the_better_cells_put(url, tmp_path, capsys):
         "--server",
         url,
     ]
-    code, said, err = run(capsys, *asked)
+    code, message, err = run(capsys, *command)
     assert (code, err) == (0, "")
-    assert "1 of 4 packs have a better cell" in said
+    assert "1 of 4 packs have a better cell" in message
     with (out / "results.csv").open() as file:
         rows = {row["pack"]: row for row in csv.DictReader(file)}
     assert rows["house"]["better"] == "True"
@@ -74,17 +74,17 @@ def test_packs_are_identified_and_the_better_cells_put(url, tmp_path, capsys):
     settings, model = load_pack(tmp_path / "shown" / "pack.toml")
     assert (settings.pack.cell, settings.pack.capacity_ah) == ("of-house.toml", None)
     assert model.cell.capacity_ah == pytest.approx(KIND.parallel * float(rows["house"]["capacity_ah"]))
-    assert "results.csv: exists already" in run(capsys, *asked)[2]
+    assert "results.csv: exists already" in run(capsys, *command)[2]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ([], "name at least one pack, or give --from-file LIST"),
         (["house", "nobody"], "nobody: not in the table of packs"),
         (["--from-file", "/nowhere"], "--from-file /nowhere: cannot be read"),
     ],
 )
-def test_what_cannot_be_asked_is_said(url, tmp_path, capsys, arguments, said):
+def test_errors_of_arguments(url, tmp_path, capsys, arguments, message):
     code, _, err = run(capsys, "fleet", "identify", *arguments, "--out", tmp_path / "out", "--server", url)
-    assert (code, said in err) == (2, True)
+    assert (code, message in err) == (2, True)

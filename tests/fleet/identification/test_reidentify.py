@@ -1,4 +1,4 @@
-"""A pack identified anew from what it has sent: better than before, or why not."""
+"""Re-identification of a pack from its samples."""
 
 import numpy as np
 import pytest
@@ -15,14 +15,14 @@ KIND = PackSpec(
     cell="own", series=SERIES, parallel=PARALLEL, voltage_resolution_v=0.01, current_resolution_a=0.01, period_s=5.0
 )
 WRONG = cell_text(wrong_start(1.3, 0.8))
-EVERY = 5
-"""Seconds between two samples: so a fifth of the work."""
-FADED = 0.88
-"""Of the capacity that the cell file has."""
+PERIOD_S = 5
+"""Interval between two samples [s]; at 1 s the test would take five times as long."""
+CAPACITY_FADE = 0.88
+"""True capacity divided by that of the cell file."""
 
 
 def cycles(hours, *, rests, seed=1):
-    """Current of one cell [A]: down in steps to SOC 0.25, up to 0.93, over and over."""
+    """Return the current of one cell [A]: repeated cycles from SOC 0.93 in steps to 0.25."""
     rng = np.random.default_rng(seed)
     capacity_as, soc, parts = 3600.0 * TRUTH.cell.capacity_ah, 0.95, [np.zeros(600)]
     while sum(map(len, parts)) < 3600 * hours:
@@ -33,17 +33,19 @@ def cycles(hours, *, rests, seed=1):
         charge_s = int((0.93 - soc) * capacity_as / 2.0)
         soc += 2.0 * charge_s / capacity_as
         parts += [np.full(charge_s, -2.0), np.zeros(1200 if rests else 0)]
-    return FADED * np.concatenate(parts)[: 3600 * hours]
+    return CAPACITY_FADE * np.concatenate(parts)[: 3600 * hours]
 
 
 def pack_samples(hours, *, rests=True):
-    """What a pack of faded cells sends."""
-    faded = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": FADED * 3.0})})
-    samples = capture(cycles(hours, rests=rests), cell=faded, soc=0.95)
+    """Return the samples of a pack of aged cells."""
+    aged = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": CAPACITY_FADE * 3.0})})
+    samples = capture(cycles(hours, rests=rests), cell=aged, soc=0.95)
     samples["voltage_v"] *= SERIES
     samples["current_a"] *= PARALLEL
-    samples["temperature_c"] = 25.0  # the simulated cell does not warm itself: without a sensor it would be taken to
-    return samples[::EVERY]
+    samples["temperature_c"] = (
+        25.0  # without a sensor self-heating would be estimated, which the simulated cell does not have
+    )
+    return samples[::PERIOD_S]
 
 
 @pytest.fixture(scope="module")
@@ -51,23 +53,23 @@ def samples():
     return pack_samples(10)
 
 
-def test_a_pack_that_has_aged_gets_a_better_cell(samples):
-    found = reidentify("house", samples, KIND, WRONG)
-    assert found.reason == ""
-    assert found.rms_v < 0.3 * found.rms_before_v
-    assert found.capacity_before_ah == pytest.approx(3.0)
-    assert abs(found.capacity_ah - FADED * 3.0) < 2.0 * found.capacity_std_ah
-    cell = parse_toml(found.cell_file, CellModel, "new")
+def test_aged_pack_gets_a_better_cell(samples):
+    result = reidentify("house", samples, KIND, WRONG)
+    assert result.reason == ""
+    assert result.rms_v < 0.3 * result.rms_before_v
+    assert result.capacity_before_ah == pytest.approx(3.0)
+    assert abs(result.capacity_ah - CAPACITY_FADE * 3.0) < 2.0 * result.capacity_std_ah
+    cell = parse_toml(result.cell_file, CellModel, "new")
     assert (cell.cell.name, cell.cell.series_count) == ("of-house", 1)
-    assert cell.cell.capacity_ah == pytest.approx(found.capacity_ah)
-    assert found.r_s_ohm == pytest.approx(TRUTH.a[13] * np.exp(-0.5 * TRUTH.a[14]) + TRUTH.a[15], rel=0.05)
+    assert cell.cell.capacity_ah == pytest.approx(result.capacity_ah)
+    assert result.r_s_ohm == pytest.approx(TRUTH.a[13] * np.exp(-0.5 * TRUTH.a[14]) + TRUTH.a[15], rel=0.05)
 
 
-def test_what_is_no_better_is_not_taken(samples):
-    right = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": FADED * 3.0})})
-    found = reidentify("house", samples, KIND, cell_text(right))
-    assert (found.cell_file, found.reason) == ("", "not better than the cell that it has")
-    assert found.rms_v > 0.97 * found.rms_before_v
+def test_cell_that_is_not_better_is_not_used(samples):
+    right = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": CAPACITY_FADE * 3.0})})
+    result = reidentify("house", samples, KIND, cell_text(right))
+    assert (result.cell_file, result.reason) == ("", "not better than the present cell")
+    assert result.rms_v > 0.97 * result.rms_before_v
 
 
 @pytest.mark.parametrize(
@@ -75,24 +77,24 @@ def test_what_is_no_better_is_not_taken(samples):
     [
         (lambda s: s[: 720 * 3], KIND, "3.0 h of samples: at least 6 h are needed"),
         (lambda s: s[:0], KIND, "0.0 h of samples"),
-        (lambda s: s[::20], KIND, "0.00 capacities were moved"),
+        (lambda s: s[::20], KIND, "0.00 capacities were charged"),
         (lambda s: s[:60], PackSpec(cell="pem_30w"), "pem_30w is a fuel cell"),
-        (lambda s: s, KIND.model_copy(update={"series": 7}), "no sample is one that this cell can have"),
+        (lambda s: s, KIND.model_copy(update={"series": 7}), "no sample is plausible for this cell"),
         (lambda s: s, PackSpec(cell="nowhere"), "nowhere: no cell file of this name was loaded"),
     ],
 )
-def test_why_a_pack_cannot_be_identified_is_said(samples, change, kind, reason):
+def test_reason_without_a_new_cell(samples, change, kind, reason):
     text = WRONG if kind.cell == "own" else None
-    found = reidentify("house", change(samples), kind, text)
-    assert (found.cell_file, found.reason[: len(reason)]) == ("", reason)
+    result = reidentify("house", change(samples), kind, text)
+    assert (result.cell_file, result.reason[: len(reason)]) == ("", reason)
 
 
-def test_resting_for_days_tells_nothing(samples):
+def test_rest_is_not_enough(samples):
     resting = samples.copy()
     resting["current_a"] = 0.0
-    assert "capacities were moved" in reidentify("house", resting, KIND, WRONG).reason
+    assert "capacities were charged" in reidentify("house", resting, KIND, WRONG).reason
 
 
-def test_gaps_and_steps_back_in_time_do_no_harm(samples):
+def test_gaps_and_time_steps_back(samples):
     holes = np.concatenate([samples[:1800], samples[1860:3000], samples[2900:4000], samples[4200:]])
     assert reidentify("house", holes, KIND, WRONG).cell_file

@@ -1,4 +1,4 @@
-"""Connections of a fleet's services to a real server that shows a wrong certificate, reads nothing, or is gone."""
+"""Connection of a fleet service to a real server with a wrong certificate, one that does not read, or a killed one."""
 
 import asyncio
 import os
@@ -9,31 +9,31 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.fleet.nats import connection
-from bms_estimator.fleet.nats.connection import connect, part
+from bms_estimator.fleet.nats.connection import close, connect
 from bms_estimator.fleet.server.nats_config import Tls
-from tests.fleet.engine import running
+from tests.fleet.nats_cluster import running
 from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
 
-TOO_MUCH = 16 << 20
-"""More than all buffers between us and the server hold."""
+BUFFERS_BYTES = 16 << 20
+"""More than the capacity of all buffers between client and server [bytes]."""
 
 
 class Links:
-    """What ``connect`` says of the connection."""
+    """Link changes reported by ``connect``."""
 
     def __init__(self) -> None:
-        self._said = asyncio.Queue[str | None]()
+        self._changes = asyncio.Queue[str | None]()
 
-    def __call__(self, trouble: str | None) -> None:
-        self._said.put_nowait(trouble)
+    def __call__(self, reason: str | None) -> None:
+        self._changes.put_nowait(reason)
 
     async def until(self, wanted: str | None) -> None:
-        """What begins so, or that there is a connection."""
+        """Wait for a reason with this beginning, or (None) for a restored connection."""
         async with asyncio.timeout(LONG_S):
             while True:
-                said = await self._said.get()
-                if said is wanted or (said and wanted and said.startswith(wanted)):
+                reason = await self._changes.get()
+                if reason is wanted or (reason and wanted and reason.startswith(wanted)):
                     return
 
 
@@ -42,58 +42,56 @@ def signed_by(authority: Authority) -> Tls:
     return Tls(certificate, key)
 
 
-async def test_a_certificate_that_is_mended_lets_in_who_has_waited(
+async def test_waiting_client_connects_once_the_certificate_is_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection, "CLOSING_S", 0.2)
+    monkeypatch.setattr(connection, "CLOSE_TIMEOUT_S", 0.2)
     for name in ("ours", "other"):
         (tmp_path / name).mkdir()
     ours, other = Authority(tmp_path / "ours"), Authority(tmp_path / "other")
-    said = Links()
-    with running(tmp_path, tls=signed_by(other)) as engine:
-        where = f"tls://{engine.nodes[0].nats}"
-        connecting = asyncio.create_task(connect(where, "x", ca=ours.certificate, linked=said))
+    links = Links()
+    with running(tmp_path, tls=signed_by(other)) as cluster:
+        url = f"tls://{cluster.nodes[0].nats}"
+        connecting = asyncio.create_task(connect(url, "x", ca=ours.certificate, on_link_change=links))
         for _ in range(3):
-            await said.until("its certificate is of nobody whom we trust")
-        engine.kill(0)
-        engine.nodes = [replace(engine.nodes[0], tls=signed_by(ours))]
-        engine.start(0)
+            await links.until("the server's certificate is not trusted")
+        cluster.kill(0)
+        cluster.nodes = [replace(cluster.nodes[0], tls=signed_by(ours))]
+        cluster.start(0)
         async with asyncio.timeout(LONG_S):
             nc = await connecting
         assert nc.is_connected
-        await part(nc)
+        await close(nc)
 
 
-async def test_a_server_that_reads_nothing_is_left_and_come_back_to(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_reconnects_to_a_server_that_stopped_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "PING_S", 1)
-    said = Links()
-    with running(tmp_path) as engine:
-        nc = await connect(engine.url, "x", linked=said)
-        os.kill(engine.pid(0), signal.SIGSTOP)
-        saying = asyncio.create_task(_say(nc, TOO_MUCH))
-        await said.until("the server is lost")
-        os.kill(engine.pid(0), signal.SIGCONT)
-        await said.until(None)
-        saying.cancel()
-        await asyncio.wait([saying])
+    links = Links()
+    with running(tmp_path) as cluster:
+        nc = await connect(cluster.url, "x", on_link_change=links)
+        os.kill(cluster.pid(0), signal.SIGSTOP)
+        publishing = asyncio.create_task(_publish(nc, BUFFERS_BYTES))
+        await links.until("the connection is lost")
+        os.kill(cluster.pid(0), signal.SIGCONT)
+        await links.until(None)
+        publishing.cancel()
+        await asyncio.wait([publishing])
         await nc.flush()
-        await part(nc)
+        await close(nc)
         assert nc.is_closed
 
 
-async def test_a_connection_is_parted_from_though_the_server_is_gone_and_something_waits(tmp_path: Path) -> None:
-    said = Links()
-    with running(tmp_path) as engine:
-        nc = await connect(engine.url, "x", linked=said)
-        engine.kill(0)
-        await said.until("the server is lost")
+async def test_closes_with_unsent_messages_after_the_server_was_killed(tmp_path: Path) -> None:
+    links = Links()
+    with running(tmp_path) as cluster:
+        nc = await connect(cluster.url, "x", on_link_change=links)
+        cluster.kill(0)
+        await links.until("the connection is lost")
         await nc.publish("a.b", b"c")
-        await part(nc)
+        await close(nc)
         assert nc.is_closed
 
 
-async def _say(nc, size: int) -> None:
+async def _publish(nc, size: int) -> None:
     for _ in range(size >> 16):
         await nc.publish("a.b", bytes(1 << 16))

@@ -1,4 +1,4 @@
-"""Streams on the real server: made once, the same when asked for again."""
+"""Streams on the real server: created once, unchanged by a repeated call."""
 
 from pathlib import Path
 
@@ -8,12 +8,12 @@ import pytest
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams, partitions_of
 from bms_estimator.model.errors import UserError
-from tests.fleet.engine import running
+from tests.fleet.nats_cluster import running
 
 
-async def test_streams_are_made_once_and_keep_their_partitions(tmp_path: Path) -> None:
-    with running(tmp_path, partitions=8) as engine:
-        nc = await nats.connect(engine.url)
+async def test_streams_are_created_once_and_keep_their_partitions(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=8) as cluster:
+        nc = await nats.connect(cluster.url)
         js = nc.jetstream()
         assert await partitions_of(nc) is None
         await make_streams(nc, partitions=8)
@@ -26,14 +26,14 @@ async def test_streams_are_made_once_and_keep_their_partitions(tmp_path: Path) -
         assert (await (await js.key_value(subjects.PACKS_BUCKET)).get("a")).value == b"1"
         assert (await (await js.object_store(subjects.STATES_BUCKET)).get("p1.1")).data == b"2"
         assert await partitions_of(nc) == 8
-        with pytest.raises(UserError, match="has 8 partitions, and 64 are asked for"):
+        with pytest.raises(UserError, match="has 8 partitions, but 64 are configured"):
             await make_streams(nc)
         await nc.close()
 
 
-async def test_no_room_is_said(tmp_path: Path) -> None:
-    with running(tmp_path) as engine:
-        nc = await nats.connect(engine.url)
-        with pytest.raises(UserError, match="refuses the stream RAW: insufficient storage"):
+async def test_missing_disk_space_is_reported(tmp_path: Path) -> None:
+    with running(tmp_path) as cluster:
+        nc = await nats.connect(cluster.url)
+        with pytest.raises(UserError, match="rejects the stream RAW: insufficient storage"):
             await make_streams(nc, raw_bytes=1 << 50)
         await nc.close()

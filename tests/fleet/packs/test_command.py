@@ -12,34 +12,34 @@ from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from tests.command_line import run
-from tests.fleet.engine import running
+from tests.fleet.nats_cluster import running
 from tests.free_port import free_port
 
 TABLE = "pack,cell,capacity_ah,series,protocol\nboat,own.toml,,2,\nhouse,lfp,280.0,16,jk\n"
 
 
-async def connected(url, work):
+async def with_connection(url, work):
     async with await nats.connect(url) as nc:
         await work(nc)
 
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("engine")) as engine:
-        asyncio.run(connected(engine.url, lambda nc: make_streams(nc, partitions=1)))
-        yield engine.url
+    with running(tmp_path_factory.mktemp("cluster")) as cluster:
+        asyncio.run(with_connection(cluster.url, lambda nc: make_streams(nc, partitions=1)))
+        yield cluster.url
 
 
 @pytest.fixture
 def table(url, tmp_path):
-    asyncio.run(connected(url, lambda nc: write_bucket(nc, PACKS_BUCKET, {}, remove=True)))
+    asyncio.run(with_connection(url, lambda nc: write_bucket(nc, PACKS_BUCKET, {}, remove=True)))
     (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
     path = tmp_path / "packs.csv"
     path.write_text(TABLE)
     return path
 
 
-def test_a_table_is_loaded_listed_and_loaded_again(url, table, capsys):
+def test_table_round_trip(url, table, capsys):
     code, out, err = run(capsys, "fleet", "packs", "load", table, "--server", url)
     assert (code, err) == (0, "")
     assert out.startswith(f"{table}: 2 packs of 2 kinds: 2 new")
@@ -53,12 +53,12 @@ def test_a_table_is_loaded_listed_and_loaded_again(url, table, capsys):
     )
 
 
-def test_rows_go_when_asked_and_by_name(url, table, capsys):
+def test_rows_are_removed_on_request_and_by_name(url, table, capsys):
     run(capsys, "fleet", "packs", "load", table, "--server", url)
     less = table.with_name("less.csv")
     less.write_text("pack,cell\nshed,ncr18650\n")
-    said = run(capsys, "fleet", "packs", "load", less, "--server", url)[1]
-    assert said == f"{less}: 1 packs of 1 kinds: 1 new, 2 not in the table (--remove removes them)\n"
+    out = run(capsys, "fleet", "packs", "load", less, "--server", url)[1]
+    assert out == f"{less}: 1 packs of 1 kinds: 1 new, 2 not in the table (--remove removes them)\n"
     assert run(capsys, "fleet", "packs", "load", less, "--remove", "--server", url)[1].endswith(
         "1 unchanged, 2 removed\n"
     )
@@ -68,7 +68,7 @@ def test_rows_go_when_asked_and_by_name(url, table, capsys):
     assert run(capsys, "fleet", "packs", "list", "--server", url)[1] == "pack\n"
 
 
-def test_a_pack_is_shown_as_a_pack_file_that_replay_reads(url, table, tmp_path, capsys):
+def test_show_writes_a_pack_file_that_replay_reads(url, table, tmp_path, capsys):
     run(capsys, "fleet", "packs", "load", table, "--server", url)
     code, out, err = run(capsys, "fleet", "packs", "show", "house", "--server", url)
     assert (code, err) == (0, "")
@@ -80,8 +80,10 @@ def test_a_pack_is_shown_as_a_pack_file_that_replay_reads(url, table, tmp_path, 
     assert (settings.pack.name, model.cell.series_count) == ("boat", 2)
 
 
-def test_a_wrong_row_is_said_and_the_others_listed(url, table, capsys):
-    asyncio.run(connected(url, lambda nc: write_bucket(nc, PACKS_BUCKET, {"a": b"{", "b": b'{"cell":"ncr18650"}'})))
+def test_wrong_row_is_reported_and_the_others_are_listed(url, table, capsys):
+    asyncio.run(
+        with_connection(url, lambda nc: write_bucket(nc, PACKS_BUCKET, {"a": b"{", "b": b'{"cell":"ncr18650"}'}))
+    )
     code, out, err = run(capsys, "fleet", "packs", "list", "--server", url)
     assert (code, out) == (0, "pack,cell\nb,ncr18650\n")
     assert err.startswith("warning: a: its row is wrong: Invalid JSON")
@@ -89,7 +91,7 @@ def test_a_wrong_row_is_said_and_the_others_listed(url, table, capsys):
     assert (code, err.startswith("error: a: its row is wrong: ")) == (2, True)
 
 
-def test_what_cannot_be_used_is_said_before_anything_is_written(url, table, capsys):
+def test_errors_are_reported_before_anything_is_written(url, table, capsys):
     table.write_text("pack,cell\nhouse,lfp\n")
     code, _, err = run(capsys, "fleet", "packs", "load", table, "--server", url)
     assert (code, f"{table}: line 2: lfp is a generic cell: give its capacity" in err) == (2, True)
@@ -98,7 +100,7 @@ def test_what_cannot_be_used_is_said_before_anything_is_written(url, table, caps
     code, _, err = run(capsys, "fleet", "packs", "load", table, "--server", f"nats://127.0.0.1:{port}")
     assert (code, err) == (
         2,
-        f"error: --server nats://127.0.0.1:{port}: nobody listens there\n",
+        f"error: --server nats://127.0.0.1:{port}: connection refused: no server listens on this address\n",
     )
     code, _, err = run(capsys, "fleet", "packs", "list", "--creds", table.with_name("no"), "--server", url)
     assert (code, "cannot be read" in err) == (2, True)

@@ -1,4 +1,4 @@
-"""The table of packs: what is read, and what is said of what cannot be."""
+"""Table of packs: reading, writing and error texts."""
 
 import pytest
 
@@ -24,7 +24,7 @@ def table(tmp_path):
     return write
 
 
-def wrong(path):
+def error_of(path):
     with pytest.raises(UserError) as caught:
         read_table(path)
     return str(caught.value).replace(f"{path}: ", "")
@@ -33,7 +33,7 @@ def wrong(path):
 @pytest.mark.parametrize("separator", [",", ";"])
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_packs_are_read_with_either_separator_and_a_byte_order_mark(table, separator, encoding, end):
+def test_separators_line_ends_and_byte_order_mark(table, separator, encoding, end):
     text = "pack,cell,capacity_ah,series\nhouse,lfp,100,16\n\n boat , nmc ,1.5e2,\n"
     read = read_table(table(text.replace(",", separator).replace("\n", end), encoding))
     assert {name: line.kind for name, line in read.packs.items()} == {
@@ -44,14 +44,14 @@ def test_packs_are_read_with_either_separator_and_a_byte_order_mark(table, separ
 
 
 @pytest.mark.parametrize(
-    ("row", "said"),
+    ("row", "message"),
     [
         ("a b,lfp,1,1", "line 2, column pack = 'a b': must be 1 to 64 letters, digits, _ and -"),
         (",lfp,1,1", "line 2, column pack = ''"),
-        ("house,,1,1", "line 2, column cell: is empty; give lfp, nmc"),
+        ("house,,1,1", "line 2, column cell is empty; it must be generic chemistry lfp, nmc"),
         ("house,../x,1,1", "line 2, column cell = '../x': String should match pattern"),
         ("house,x.toml,1,1", "line 2, column cell = 'x.toml': no such file beside the table"),
-        ("house,lfp,-6.6,1", "line 2, column capacity_ah = '-6.6': Input should be greater than 0 (what one"),
+        ("house,lfp,-6.6,1", "line 2, column capacity_ah = '-6.6': Input should be greater than 0 (capacity of one"),
         ("house,lfp,1e999,1", "line 2, column capacity_ah = '1e999'"),
         ("house,lfp,nan,1", "line 2, column capacity_ah = 'nan': must be a number"),
         ("house,lfp,1,1.5", "line 2, column series = '1.5'"),
@@ -59,41 +59,41 @@ def test_packs_are_read_with_either_separator_and_a_byte_order_mark(table, separ
         ("house,lfp,1_0,1", "line 2, column capacity_ah = '1_0': must be a number"),
         ('house,lfp,"1,5",1', "line 2, column capacity_ah = '1,5': must be a number, with a point and not a comma"),
         ("house,lfp,1", "line 2, 3 values in 4 columns; give one for each, empty for the default"),
-        (f"{ROW}\n{ROW}", "line 3, column pack = 'house': is on line 2 already; take one away"),
+        (f"{ROW}\n{ROW}", "line 3, column pack = 'house': is already on line 2; remove one of them"),
         ('house,"lfp,1,1', "a quote that is opened must be closed"),
         ("", "no row below the line of column names"),
     ],
 )
-def test_what_is_wrong_is_said_with_line_and_column(table, row, said):
-    assert said in wrong(table(f"pack,cell,capacity_ah,series\n{row}\n"))
+def test_errors_name_line_and_column(table, row, message):
+    assert message in error_of(table(f"pack,cell,capacity_ah,series\n{row}\n"))
 
 
 @pytest.mark.parametrize(
-    ("header", "said"),
+    ("header", "message"),
     [
         ("pack,cell,capacity", "line 1: column 'capacity' is unknown; is capacity_ah meant?"),
         ("pack,cell,zzz", f"line 1: column 'zzz' is unknown; there are {', '.join(COLUMNS)}"),
-        ("pack,cell,cell", "line 1: column cell is there twice"),
-        ("pack,series", "line 1: no column cell; there must be one"),
-        ("", "line 1: no column pack"),
+        ("pack,cell,cell", "line 1: column cell is repeated"),
+        ("pack,series", "line 1: column cell is missing"),
+        ("", "line 1: column pack is missing"),
     ],
 )
-def test_wrong_columns_are_said(table, header, said):
-    assert said in wrong(table(f"{header}\n{ROW}\n"))
+def test_errors_of_columns(table, header, message):
+    assert message in error_of(table(f"{header}\n{ROW}\n"))
 
 
-def test_a_table_in_another_encoding_or_none_is_said(table, tmp_path):
-    assert "not UTF-8 (byte 15); save it as CSV in UTF-8" in wrong(table("pack,cell\nhouseé,lfp\n", "latin-1"))
-    assert "cannot be read: No such file" in wrong(tmp_path / "none.csv")
+def test_errors_of_the_file(table, tmp_path):
+    assert "not UTF-8 (byte 15); save it as CSV in UTF-8" in error_of(table("pack,cell\nhouseé,lfp\n", "latin-1"))
+    assert "cannot be read: No such file" in error_of(tmp_path / "none.csv")
 
 
-def test_of_many_errors_the_first_are_shown(table):
-    lines = wrong(table("pack,cell\n" + "a b,lfp\n" * 100)).splitlines()
+def test_number_of_errors_is_limited(table):
+    lines = error_of(table("pack,cell\n" + "a b,lfp\n" * 100)).splitlines()
     assert len(lines) == 21
     assert lines[-1] == "and 80 more"
 
 
-def test_a_cell_file_beside_the_table_is_found_under_its_name(table, tmp_path):
+def test_cell_file_beside_the_table(table, tmp_path):
     (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
     path = table("pack,cell\nhouse,own.toml\n")
     read = read_table(path)
@@ -104,13 +104,13 @@ def test_a_cell_file_beside_the_table_is_found_under_its_name(table, tmp_path):
         check_models(path, read, {})
 
 
-def test_a_kind_without_a_cell_is_said_once(table):
+def test_kind_without_a_cell_is_reported_once(table):
     path = table("pack,cell\na,lfp\nb,lfp\nc,ncr18650\n")
-    with pytest.raises(UserError, match="line 2, and 1 more of its kind: lfp is a generic cell: give its capacity"):
+    with pytest.raises(UserError, match="line 2, and 1 more like this: lfp is a generic cell: give its capacity"):
         check_models(path, read_table(path), {})
 
 
-def test_settings_are_those_of_a_pack_file_with_the_same_values():
+def test_settings_of_a_row():
     row = PackRow(pack="house", cell="lfp", capacity_ah=280.0, series=16, protocol="jk", current_dead_band_a=0.2)
     settings = settings_of(row)
     assert (settings.pack.name, settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == (
@@ -123,24 +123,24 @@ def test_settings_are_those_of_a_pack_file_with_the_same_values():
     assert settings.sampling.current_dead_band_a == 0.2
 
 
-def test_all_cells_of_the_package_can_be_named():
+def test_all_shipped_cells_are_valid():
     for name in known_cells():
         assert PackSpec(cell=name).cell == name
 
 
-def test_a_table_is_written_as_it_is_read(table):
+def test_table_round_trip(table):
     kinds = {"b": LFP, "a": PackSpec(cell="ncr18650", protocol="jbd")}
     read = read_table(table("".join(table_lines(kinds))))
     assert {name: line.kind for name, line in read.packs.items()} == kinds
 
 
 def test_packs_of_one_kind_share_settings_and_model():
-    known = PackRegistry()
+    registry = PackRegistry()
     for i in range(1000):
-        known.set_row(f"p{i}", stored(LFP.model_copy(update={"series": 14 + i % 5})))
-    made = [known(f"p{i}") for i in range(1000)]
-    assert len({id(one) for one in made}) == 5
-    settings, model = made[0]
+        registry.set_row(f"p{i}", stored(LFP.model_copy(update={"series": 14 + i % 5})))
+    entries = [registry(f"p{i}") for i in range(1000)]
+    assert len({id(one) for one in entries}) == 5
+    settings, model = entries[0]
     assert model.cell.series_count == settings.pack.series == 14
 
 
@@ -159,32 +159,32 @@ def test_packs_of_one_kind_share_settings_and_model():
         (b'{"cell":"pem_30w","capacity_ah":1}', "pem_30w is a fuel cell, which has no capacity"),
         (b'{"cell":"lfp","capacity_ah":1,"initial_soc":2}', "its row is wrong: initial_soc: "),
         (b"\xff\xfe", "its row is wrong: "),
-        (b'{"cell":"ncr18650","voltage_noise_v":1e300}', "no estimator can be made of its values: "),
+        (b'{"cell":"ncr18650","voltage_noise_v":1e300}', "its values allow no estimator: "),
     ],
 )
-def test_whatever_is_wrong_makes_a_pack_unknown_with_the_reason(data, reason):
-    known = PackRegistry()
-    known.set_cell("broken", b"= 1")
-    known.set_row("house", data)
-    assert known("house") is None or reason == ""
-    assert known.reason("house").startswith(reason)
+def test_invalid_row_makes_a_pack_unknown_with_a_reason(data, reason):
+    registry = PackRegistry()
+    registry.set_cell("broken", b"= 1")
+    registry.set_row("house", data)
+    assert registry("house") is None or reason == ""
+    assert registry.reason("house").startswith(reason)
 
 
-def test_a_pack_becomes_known_with_its_row_and_its_cell():
-    known = PackRegistry()
-    assert known("house") is None
-    assert known.reason("house") == UNKNOWN_PACK
-    assert known.set_row("house", stored(PackSpec(cell="own", series=2)))
-    assert not known.set_row("house", stored(PackSpec(cell="own", series=2)))
-    assert known("house") is None
-    assert known.set_cell("own", cell_text(load_cell("ncr18650")).encode())
-    assert known.made_of({"own", "other"}) == {"house"}
-    assert known.made_of({"other"}) == known.made_of(()) == set()
-    assert known.reason("house") == ""
-    assert known("house")[1].cell.series_count == 2
-    assert known.set_cell("own", None)
-    assert not known.set_cell("own", None)
-    assert known("house") is None
-    assert known.set_row("house", None)
-    assert known.reason("house") == UNKNOWN_PACK
-    assert not known.set_row("house", None)
+def test_pack_becomes_known_with_its_row_and_cell():
+    registry = PackRegistry()
+    assert registry("house") is None
+    assert registry.reason("house") == UNKNOWN_PACK
+    assert registry.set_row("house", stored(PackSpec(cell="own", series=2)))
+    assert not registry.set_row("house", stored(PackSpec(cell="own", series=2)))
+    assert registry("house") is None
+    assert registry.set_cell("own", cell_text(load_cell("ncr18650")).encode())
+    assert registry.packs_using({"own", "other"}) == {"house"}
+    assert registry.packs_using({"other"}) == registry.packs_using(()) == set()
+    assert registry.reason("house") == ""
+    assert registry("house")[1].cell.series_count == 2
+    assert registry.set_cell("own", None)
+    assert not registry.set_cell("own", None)
+    assert registry("house") is None
+    assert registry.set_row("house", None)
+    assert registry.reason("house") == UNKNOWN_PACK
+    assert not registry.set_row("house", None)

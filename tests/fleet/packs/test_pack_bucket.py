@@ -1,4 +1,4 @@
-"""The table of packs on the real server, and what a worker sees of it."""
+"""Table of packs on the real server, as a worker reads it."""
 
 import asyncio
 
@@ -12,28 +12,28 @@ from bms_estimator.fleet.packs.pack_bucket import PackBucket, Written, read_buck
 from bms_estimator.fleet.packs.pack_row import PackSpec, stored
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
-from tests.fleet.engine import connected, running
+from tests.fleet.nats_cluster import connected, running
 from tests.patience import LONG_S
 
 LFP = stored(PackSpec(cell="lfp", capacity_ah=100.0, series=16))
 
 
 @pytest.fixture(scope="module")
-def engine(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("engine")) as engine:
-        yield engine
+def cluster(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("cluster")) as cluster:
+        yield cluster
 
 
 @pytest.fixture
-async def nc(engine):
-    async with await connected(engine.url) as nc:
+async def nc(cluster):
+    async with await connected(cluster.url) as nc:
         await make_streams(nc, partitions=1)
         for bucket in (PACKS_BUCKET, CELLS_BUCKET):
             await write_bucket(nc, bucket, {}, remove=True)
         yield nc
 
 
-async def test_only_what_differs_is_written_and_rows_go_only_when_asked(nc):
+async def test_only_differences_are_written_and_rows_are_removed_on_request(nc):
     values = {f"p{i}": LFP for i in range(2 * BATCH + 5)}
     assert await write_bucket(nc, PACKS_BUCKET, values) == Written(len(values), 0, 0, 0, 0)
     assert await read_bucket(nc, PACKS_BUCKET) == values
@@ -47,7 +47,7 @@ async def test_only_what_differs_is_written_and_rows_go_only_when_asked(nc):
     assert (await read_bucket(nc, PACKS_BUCKET)).keys() == {"p0", "p1"}
 
 
-async def test_a_worker_sees_all_rows_and_then_what_changes(nc):
+async def test_refresh_returns_all_rows_and_then_changes(nc):
     await write_bucket(nc, PACKS_BUCKET, {"a": LFP, "b": b"{broken", "c": stored(PackSpec(cell="own"))})
     bucket = PackBucket(nc)
     assert await bucket.refresh() >= {"a", "b", "c"}
@@ -66,41 +66,41 @@ async def test_a_worker_sees_all_rows_and_then_what_changes(nc):
     assert bucket.packs("b")
 
 
-async def test_what_changed_is_told_though_the_table_is_lost_meanwhile_and_made_anew(nc):
+async def test_changes_are_reported_after_the_table_was_recreated(nc):
     await write_bucket(nc, PACKS_BUCKET, {"a": stored(PackSpec(cell="own")), "b": LFP, "c": LFP})
     bucket = PackBucket(nc)
     await bucket.refresh()
     await nc.jetstream().delete_stream(f"KV_{PACKS_BUCKET}")
     await write_bucket(nc, CELLS_BUCKET, {"own": cell_text(load_cell("ncr18650")).encode()})
-    with pytest.raises(StreamError, match="KV_packs: the server lacks"):
+    with pytest.raises(StreamError, match="KV_packs: a stream is missing"):
         await bucket.refresh()
     await make_streams(nc, partitions=1)
-    await write_bucket(nc, PACKS_BUCKET, {"b": b"{broken"})  # of a number that there was
+    await write_bucket(nc, PACKS_BUCKET, {"b": b"{broken"})  # with a sequence number that was read before
     assert await bucket.refresh() == {"a", "b"}
     assert bucket.packs("a")
     assert bucket.packs("b") is None
 
 
-async def test_following_goes_on_where_the_server_was_killed(engine, nc):
-    news = asyncio.Queue()
+async def test_follow_continues_after_the_server_was_killed(cluster, nc):
+    changes = asyncio.Queue()
     bucket = PackBucket(nc)
     await bucket.refresh()
-    follower = asyncio.create_task(bucket.follow(news.put_nowait))
+    follower = asyncio.create_task(bucket.follow(changes.put_nowait))
     try:
         await write_bucket(nc, PACKS_BUCKET, {"a": LFP})
-        assert await asyncio.wait_for(news.get(), LONG_S) == {"a"}
-        engine.kill(0)
-        engine.start(0)
-        async with await nats.connect(engine.url) as other:
+        assert await asyncio.wait_for(changes.get(), LONG_S) == {"a"}
+        cluster.kill(0)
+        cluster.start(0)
+        async with await nats.connect(cluster.url) as other:
             await write_bucket(other, PACKS_BUCKET, {"b": LFP})
-        assert await asyncio.wait_for(news.get(), LONG_S) == {"b"}
+        assert await asyncio.wait_for(changes.get(), LONG_S) == {"b"}
         assert bucket.packs("b")
     finally:
         follower.cancel()
 
 
-async def test_a_server_without_streams_is_said(tmp_path):
-    with running(tmp_path) as engine:
-        async with await nats.connect(engine.url) as nc:
-            with pytest.raises(StreamError, match="refuses to read KV_packs"):
+async def test_server_without_streams_raises(tmp_path):
+    with running(tmp_path) as cluster:
+        async with await nats.connect(cluster.url) as nc:
+            with pytest.raises(StreamError, match="rejects reading KV_packs"):
                 await read_bucket(nc, PACKS_BUCKET)

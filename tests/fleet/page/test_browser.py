@@ -1,4 +1,4 @@
-"""The page of a fleet in a real Chromium, of what is published over the real nats-server."""
+"""Fleet page in a real Chromium, with messages from the real nats-server."""
 
 import asyncio
 import contextlib
@@ -26,9 +26,9 @@ from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.page import PageSettings
-from tests.fleet.engine import Engine, connected, running
-from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
-from tests.fleet.many_packs import HOME, VAN, Pack, beat, load, publish, state
+from tests.fleet.hour_rows import BEGIN, FIRST_STD, capacities, write_fleet
+from tests.fleet.nats_cluster import NatsCluster, connected, running
+from tests.fleet.published_states import HOME, VAN, Pack, load, publish, publish_heartbeat, state
 from tests.free_port import free_port
 from tests.page.chromium import Tab, chromium, tab
 from tests.page.house import starting
@@ -41,28 +41,28 @@ module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 PARTITIONS = 8
 STEP_S = 0.05
 MAX_BYTES = 60_000
-"""Of all that a browser is given."""
+"""Maximum total size of the served files [bytes]."""
 PACKS = [
     Pack("home-1", HOME, state(soc=0.653, soc_std=0.012, stability_margin=0.6)),
     Pack("home-2", HOME, state(soc=0.041, soc_std=0.02, stability_margin=-0.013)),
     Pack("van-1", VAN, state(soc=0.9, soc_std=0.071, stability_margin=0.8)),
 ]
 LISTED_ONLY = Pack("van-2", VAN, b"")
-NASTY = "<img/src=x>"
+MARKUP_NAME = "<img/src=x>"
 
 
 class Fleet(NamedTuple):
-    """All that runs."""
+    """Running server, its connection, and the page."""
 
-    engine: Engine
+    cluster: NatsCluster
     nc: Client
     url: str
-    """Of the page."""
+    """URL of the page."""
 
 
 @pytest.fixture(scope="module")
-def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
-    with running(tmp_path_factory.mktemp("engine"), partitions=PARTITIONS) as started:
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsCluster]:
+    with running(tmp_path_factory.mktemp("cluster"), partitions=PARTITIONS) as started:
         yield started
 
 
@@ -74,7 +74,7 @@ async def browser() -> AsyncIterator[Browser]:
 
 @pytest.fixture(scope="module")
 def hours(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve packs that lose 6 % of their capacity in a year, but one that has half the capacity of the others."""
+    """Folder with hours of twelve packs that lose 6 % of their capacity in a year; one has half the others' capacity."""
     folder, rng = tmp_path_factory.mktemp("hours"), np.random.default_rng(1)
     truth = np.full((12, 1), -0.02) - 0.06 * np.arange(30) / 365.25
     truth[0] -= 0.7
@@ -89,55 +89,57 @@ def hours(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @module_fixture
-async def fleet(engine: Engine, hours: Path) -> AsyncIterator[Fleet]:
-    nc = await connected(engine.url)
+async def fleet(cluster: NatsCluster, hours: Path) -> AsyncIterator[Fleet]:
+    nc = await connected(cluster.url)
     await make_streams(nc, partitions=PARTITIONS)
     await load(nc, [*PACKS, LISTED_ONLY])
     settings = PageSettings(listen="127.0.0.1:0")
-    async with fleet_page(Server(engine.url), settings, hours, step_s=STEP_S) as url:
+    async with fleet_page(Server(cluster.url), settings, hours, step_s=STEP_S) as url:
         working = asyncio.create_task(work(nc))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(packs, "ALIVE_S", math.inf)  # however long it lasts, van-2 is not heard, but not silent
-            yield Fleet(engine, nc, url)
+            patch.setattr(packs, "ALIVE_S", math.inf)  # van-2 has no state, but must not become silent
+            yield Fleet(cluster, nc, url)
         working.cancel()
         await asyncio.gather(working, return_exceptions=True)
     await nc.close()
 
 
 async def work(nc: Client) -> None:
-    """Two workers hold all partitions but the last; packs are heard, one of them is unknown."""
+    """Publish as two workers with all partitions except one, and states of packs, one of them unknown."""
     blocks = 0
     while True:
         with contextlib.suppress(nats.errors.Error, OSError):
             blocks += 1
-            await beat(nc, "alpha", range(4), packs=2, blocks=blocks, samples=60 * blocks, lag_s=0.42, unknown_count=1)
-            await beat(nc, "beta", range(4, PARTITIONS - 1), packs=1, lag_s=0.1, trouble="no checkpoint")
+            await publish_heartbeat(
+                nc, "alpha", range(4), packs=2, blocks=blocks, samples=60 * blocks, lag_s=0.42, unknown_count=1
+            )
+            await publish_heartbeat(nc, "beta", range(4, PARTITIONS - 1), packs=1, lag_s=0.1, trouble="no checkpoint")
             for pack in PACKS:
                 await publish(nc, pack.name, pack.state)
-            await nc.publish(subjects.unknown(NASTY), b"no <b>row</b>")
+            await nc.publish(subjects.unknown(MARKUP_NAME), b"no <b>row</b>")
             await nc.publish(subjects.hours("van-1"), json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
             await nc.publish("bms.home-1.parameters", ONE.parameters.model_dump_json().encode())
         await asyncio.sleep(0.1)
 
 
 @contextlib.asynccontextmanager
-async def looking(browser: Browser, fleet: Fleet, at: str = "") -> AsyncIterator[Tab]:
-    async with tab(browser, f"{fleet.url}{at}") as opened:
-        await opened.until_status("live")
-        await opened.until_text("known", "of 4")
-        await opened.until_text("alive", "3")
-        yield opened
+async def open_page(browser: Browser, fleet: Fleet, at: str = "") -> AsyncIterator[Tab]:
+    async with tab(browser, f"{fleet.url}{at}") as browser_tab:
+        await browser_tab.until_status("live")
+        await browser_tab.until_text("known", "of 4")
+        await browser_tab.until_text("alive", "3")
+        yield browser_tab
 
 
 @in_module
-async def test_the_fleet_is_seen_at_a_glance(browser: Browser, fleet: Fleet) -> None:
-    async with looking(browser, fleet) as opened:
-        await opened.until_text("partitions", "of 8")
-        await opened.until_text("attention", "3")
-        await opened.until_text("held", "7")
-        await opened.until_text("unheld", "unheld: 7")
-        await opened.until_text("lag", "0.4 s")
-        page = opened.page
+async def test_overview(browser: Browser, fleet: Fleet) -> None:
+    async with open_page(browser, fleet) as browser_tab:
+        await browser_tab.until_text("partitions", "of 8")
+        await browser_tab.until_text("attention", "3")
+        await browser_tab.until_text("held", "7")
+        await browser_tab.until_text("unheld", "unheld: 7")
+        await browser_tab.until_text("lag", "0.4 s")
+        page = browser_tab.page
         await page.locator('[data-q="silent"]', has_text="1 not heard yet").wait_for()
         await page.get_by_role("img", name="8 partitions: 7 held by nobody").wait_for()
         await page.get_by_role(
@@ -152,115 +154,115 @@ async def test_the_fleet_is_seen_at_a_glance(browser: Browser, fleet: Fleet) -> 
         )
         await page.get_by_role("button", name="ncr18650 14s10p").click()
         await page.get_by_role("img", name="State of charge: 1 pack 90 to 95 %").wait_for()
-        await opened.until(
+        await browser_tab.until(
             "texts => texts.every((text) => document.getElementById('workers').innerText.includes(text))",
             ["alpha\t4\t2\t0.4 s", "no checkpoint"],
         )
-        assert opened.errors == []
-        assert all(url.startswith(fleet.url) for url in opened.requests), opened.requests
+        assert browser_tab.errors == []
+        assert all(url.startswith(fleet.url) for url in browser_tab.requests), browser_tab.requests
 
 
 @in_module
-async def test_who_needs_attention_is_ranked_and_names_are_no_markup(browser: Browser, fleet: Fleet) -> None:
-    async with looking(browser, fleet) as opened:
-        page = opened.page
-        wanted = [
-            "home-2 Small margin stability margin −1.3 % Low SOC SOC 4.1 %",  # noqa: RUF001 - as shown
+async def test_packs_with_concerns_are_ranked_and_names_are_escaped(browser: Browser, fleet: Fleet) -> None:
+    async with open_page(browser, fleet) as browser_tab:
+        page = browser_tab.page
+        expected = [
+            "home-2 Small margin stability margin −1.3 % Low SOC SOC 4.1 %",  # noqa: RUF001 - as overview
             "van-1 Suspected offset Uncertain SOC known to ± 14.2 %",
-            f"{NASTY} Unknown its blocks are held: no <b>row</b>",
+            f"{MARKUP_NAME} Unknown its blocks are held: no <b>row</b>",
         ]
         rows: list[str] = []
-        with contextlib.suppress(TimeoutError):  # a pack's reasons come one after the other
+        with contextlib.suppress(TimeoutError):  # the concerns of a pack arrive one after the other
             async with asyncio.timeout(LONG_S):
-                while rows != wanted:
+                while rows != expected:
                     rows = [" ".join(text.split()) for text in await page.locator("#concerns tr").all_inner_texts()]
                     await asyncio.sleep(STEP_S)
-        assert rows == wanted
+        assert rows == expected
         assert await page.locator("#concerns img").count() == 0
         await page.locator("[data-count=soc]").click()
         first = page.locator("#concerns tr").first
-        await opened.until("() => document.querySelector('#concerns th').textContent === 'home-2'")
-        assert await page.locator("#concerns tr").count() == 3  # the lowest, whether or not they need attention
+        await browser_tab.until("() => document.querySelector('#concerns th').textContent === 'home-2'")
+        assert await page.locator("#concerns tr").count() == 3  # the lowest values, also without a concern
         assert await page.locator("#concerns tr.mild").count() == 2
         assert "SOC 4.1 %" in await first.inner_text()
-        assert opened.errors == []
+        assert browser_tab.errors == []
 
 
 @in_module
-async def test_a_pack_is_found_by_how_its_name_begins_with_the_keyboard_alone(browser: Browser, fleet: Fleet) -> None:
-    async with looking(browser, fleet) as opened:
-        page = opened.page
+async def test_search_by_prefix_with_the_keyboard(browser: Browser, fleet: Fleet) -> None:
+    async with open_page(browser, fleet) as browser_tab:
+        page = browser_tab.page
         await page.keyboard.press("Tab")
         await page.keyboard.type("home")
-        await opened.until("() => document.querySelectorAll('#found button').length === 2")
+        await browser_tab.until("() => document.querySelectorAll('#found button').length === 2")
         await page.keyboard.press("ArrowDown")
         await page.keyboard.press("Enter")
         await page.get_by_role("dialog", name="home-1").wait_for()
         await page.get_by_text("State of charge65.3 %").wait_for()
         assert page.url.endswith("#home-1")
-        heard = await page.inner_text("#packwhat")
-        assert heard.startswith("lfp 16s1p 280 Ah · heard")
-        await opened.until(
+        details = await page.inner_text("#packwhat")
+        assert details.startswith("lfp 16s1p 280 Ah · heard")
+        await browser_tab.until(
             "rows => document.querySelectorAll('#parameters tr').length === rows",
             len(ONE.parameters.elements) + len(ONE.parameters.state_of_health),
         )
         await page.keyboard.press("Escape")
         await page.get_by_role("dialog").wait_for(state="hidden")
-        await opened.until("() => location.hash === ''")
+        await browser_tab.until("() => location.hash === ''")
         await page.fill("#prefix", "nobody")
         await page.get_by_text("No pack's name begins so.").wait_for()
         await page.fill("#prefix", LISTED_ONLY.name)
         await page.locator("#found button").click()
         await page.get_by_text("ncr18650 14s10p · not heard yet since this page is served").wait_for()
-        assert opened.errors == []
+        assert browser_tab.errors == []
 
 
 @in_module
-async def test_what_the_hours_answer_is_seen(browser: Browser, fleet: Fleet) -> None:
-    async with looking(browser, fleet) as opened:
-        answers = opened.page.locator("#answers")
+async def test_query_results(browser: Browser, fleet: Fleet) -> None:
+    async with open_page(browser, fleet) as browser_tab:
+        answers = browser_tab.page.locator("#answers")
         text = await answers.locator("[data-answer=soh] tbody").inner_text()
         assert text.startswith("ncr18650 1s1p 3 Ah\t12\t")
         outlier = answers.locator("[data-answer=outliers] tbody tr")
         assert (await outlier.inner_text()).startswith("p0\tcapacity ratio\t")
         await outlier.get_by_role("button", name="p0").click()
-        await opened.page.get_by_role("dialog", name="p0").wait_for()
-        await opened.page.get_by_text("Nothing was heard of this pack yet").wait_for()
+        await browser_tab.page.get_by_role("dialog", name="p0").wait_for()
+        await browser_tab.page.get_by_text("Nothing was heard of this pack yet").wait_for()
         assert await answers.locator("[data-answer=honest]").count() == 1
-        assert [error for error in opened.errors if "404" not in error] == []
+        assert [error for error in browser_tab.errors if "404" not in error] == []
 
 
 @in_module
 async def test_nothing_is_wider_than_the_screen(browser: Browser, fleet: Fleet) -> None:
     wider = """width => [...document.querySelectorAll("body, header *, #fleet, .card, .card :not(.scroll *)")]
         .filter((e) => e.getBoundingClientRect().right > width + 0.5).map((e) => e.outerHTML.slice(0, 80))"""
-    async with looking(browser, fleet) as opened:
-        await opened.until("() => document.querySelectorAll('#concerns tr').length === 3")
+    async with open_page(browser, fleet) as browser_tab:
+        await browser_tab.until("() => document.querySelectorAll('#concerns tr').length === 3")
         for width, height in ((320, 600), (390, 844), (768, 1024), (1920, 1080)):
-            await opened.page.set_viewport_size({"width": width, "height": height})
-            assert await opened.page.evaluate(wider, width) == []
+            await browser_tab.page.set_viewport_size({"width": width, "height": height})
+            assert await browser_tab.page.evaluate(wider, width) == []
 
 
 @in_module
-async def test_it_is_stale_while_the_server_is_away_and_comes_back_by_itself(browser: Browser, fleet: Fleet) -> None:
-    async with looking(browser, fleet) as opened:
-        fleet.engine.kill(0)
-        await opened.until_status("stale since")
-        assert (await opened.page.inner_text("#why")).startswith(f"{fleet.engine.url}: ")
-        assert await opened.text("alive") == "3"
-        fleet.engine.start(0)
-        await opened.until_status("live")
-        await opened.until_text("alive", "3")
-        await opened.until_text("held", "7")
-        assert await opened.page.inner_text("#why") == ""
-        late = await nats.connect(fleet.engine.url)  # a connection that was cut may take its time
+async def test_page_is_stale_without_the_server_and_reconnects(browser: Browser, fleet: Fleet) -> None:
+    async with open_page(browser, fleet) as browser_tab:
+        fleet.cluster.kill(0)
+        await browser_tab.until_status("stale since")
+        assert (await browser_tab.page.inner_text("#why")).startswith(f"{fleet.cluster.url}: ")
+        assert await browser_tab.text("alive") == "3"
+        fleet.cluster.start(0)
+        await browser_tab.until_status("live")
+        await browser_tab.until_text("alive", "3")
+        await browser_tab.until_text("held", "7")
+        assert await browser_tab.page.inner_text("#why") == ""
+        late = await nats.connect(fleet.cluster.url)  # the old connection may still be reconnecting
         await load(late, [Pack("late-1", HOME, b"")])
         await late.close()
-        await opened.until_text("known", "of 5")
+        await browser_tab.until_text("known", "of 5")
 
 
 @in_module
-async def test_it_is_answered_under_names_of_ours_alone(fleet: Fleet) -> None:
+async def test_foreign_host_names_are_rejected(fleet: Fleet) -> None:
     async with aiohttp.ClientSession(fleet.url) as session:
         for path in (*FILES, "/events", "/packs?prefix=h", "/pack?name=home-1"):
             async with session.get(path, headers={"Host": "evil.example.org"}) as response:
@@ -273,7 +275,7 @@ async def test_it_is_answered_under_names_of_ours_alone(fleet: Fleet) -> None:
                 assert await response.read() == file.read_bytes()
 
 
-def test_all_that_a_browser_is_given_is_small_and_comes_from_here() -> None:
+def test_served_files_are_small_and_refer_to_no_other_host() -> None:
     assert {file.path for file in FILES.values()} >= set(STATIC.iterdir())
     assert sum(file.path.stat().st_size for file in FILES.values()) <= MAX_BYTES
     own = [path.read_text() for path in STATIC.iterdir()]
@@ -281,9 +283,9 @@ def test_all_that_a_browser_is_given_is_small_and_comes_from_here() -> None:
 
 
 @in_module
-async def test_the_command_serves_until_it_is_told_to_end(fleet: Fleet, tmp_path: Path) -> None:
+async def test_command_serves_until_sigterm(fleet: Fleet, tmp_path: Path) -> None:
     port = free_port()
-    arguments = ("--server", fleet.engine.url, "--listen", f"127.0.0.1:{port}", "--no-browser")
+    arguments = ("--server", fleet.cluster.url, "--listen", f"127.0.0.1:{port}", "--no-browser")
     process = await starting(tmp_path, "fleet", "page", *arguments, port=port)
     async with aiohttp.ClientSession() as session, session.get(f"http://127.0.0.1:{port}/") as response:
         assert response.status == 200
@@ -292,75 +294,73 @@ async def test_the_command_serves_until_it_is_told_to_end(fleet: Fleet, tmp_path
 
 
 @in_module
-async def test_credentials_that_are_not_there_are_said() -> None:
+async def test_missing_credentials_raise() -> None:
     with pytest.raises(UserError, match=r"--creds no\.creds: cannot be read: No such file"):
         FleetFeed(Server("nats://127.0.0.1:1", Path("no.creds")), FleetView(1, 0.0), lambda _: None)
 
 
 @in_module
-async def test_a_server_that_is_not_there_is_said_and_waited_for() -> None:
-    said = asyncio.Queue[str | None]()
+async def test_unreachable_server_is_reported_and_retried() -> None:
+    changes = asyncio.Queue[str | None]()
     url = f"nats://127.0.0.1:{free_port()}"
-    async with FleetFeed(Server(url), FleetView(1, 0.0), said.put_nowait):
-        assert await said.get() == f"{url}: not reached yet"
-        assert await said.get() == f"{url}: nobody listens there"
+    async with FleetFeed(Server(url), FleetView(1, 0.0), changes.put_nowait):
+        assert await changes.get() == f"{url}: not reached yet"
+        assert await changes.get() == f"{url}: connection refused: no server listens on this address"
 
 
 @in_module
-async def test_it_ends_though_the_library_swallows_that_it_is_cancelled(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, swallowed = asyncio.Event(), asyncio.Event()
+async def test_ends_although_the_library_swallows_a_cancellation(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    refreshing, swallowed = asyncio.Event(), asyncio.Event()
 
     async def refresh(_: PackBucket) -> set[str]:
-        asked.set()
+        refreshing.set()
         try:
             await asyncio.Event().wait()
-        except asyncio.CancelledError:  # as wait_for of Python 3.11 does when the answer comes at that moment
+        except asyncio.CancelledError:  # as wait_for of Python 3.11 does if the response arrives at that moment
             swallowed.set()
         return set()
 
     monkeypatch.setattr(PackBucket, "refresh", refresh)
     async with (
         asyncio.timeout(LONG_S),
-        FleetFeed(Server(fleet.engine.url), FleetView(PARTITIONS, 0.0), lambda _: None),
+        FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), lambda _: None),
     ):
-        await asked.wait()
+        await refreshing.wait()
     assert swallowed.is_set()
 
 
 @in_module
-async def test_why_nothing_more_is_heard_is_said(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = asyncio.Queue[str | None]()
+async def test_end_of_the_feed_is_reported(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    changes = asyncio.Queue[str | None]()
 
-    async def until(wanted: str) -> None:
+    async def until(expected: str) -> None:
         async with asyncio.timeout(LONG_S):
-            while wanted not in (await said.get() or ""):
+            while expected not in (await changes.get() or ""):
                 pass
 
     async def refresh(_: PackBucket) -> set[str]:
         raise KeyError
 
-    async with FleetFeed(Server(fleet.engine.url), FleetView(PARTITIONS, 0.0), said.put_nowait) as feed:
-        while await said.get() is not None:
+    async with FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), changes.put_nowait) as feed:
+        while await changes.get() is not None:
             pass
         assert feed._nc
-        await feed._nc.close()  # as it is when the server puts somebody out
-        await until("the server has closed the connection: look at --creds")
+        await feed._nc.close()  # as after the server has closed the connection permanently
+        await until("the server has closed the connection: check --creds")
     monkeypatch.setattr(PackBucket, "refresh", refresh)
-    async with FleetFeed(Server(fleet.engine.url), FleetView(PARTITIONS, 0.0), said.put_nowait):
-        await until("a fault of the page")
+    async with FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), changes.put_nowait):
+        await until("internal error of the page")
 
 
 @in_module
-async def test_what_the_last_hour_said_before_the_page_was_there_is_read(fleet: Fleet) -> None:
+async def test_summaries_before_the_start_are_read(fleet: Fleet) -> None:
     hour = json.dumps({"suspects": int(InputFault.OCV)}).encode()
-    late = await nats.connect(fleet.engine.url)
+    late = await nats.connect(fleet.cluster.url)
     await late.jetstream(timeout=LONG_S).publish(subjects.hours("early-1"), hour)
     await late.close()
     view = FleetView(1, 0.0)
-    async with FleetFeed(Server(fleet.engine.url), view, lambda _: None), asyncio.timeout(LONG_S):
-        while not (view.packs.find("early") and view.workers.partitions == PARTITIONS):  # noqa: ASYNC110 - nobody tells
+    async with FleetFeed(Server(fleet.cluster.url), view, lambda _: None), asyncio.timeout(LONG_S):
+        while not (view.packs.find("early") and view.workers.partitions == PARTITIONS):  # noqa: ASYNC110 - the view has no notifications
             await asyncio.sleep(0.01)
-    shown = view.picture(0.0, 0.0)
-    assert ["early-1", "ocv"] in shown["concerns"]["suspects"]["packs"]
+    overview = view.overview(0.0, 0.0)
+    assert ["early-1", "ocv"] in overview["concerns"]["suspects"]["packs"]

@@ -1,4 +1,4 @@
-"""Hours from the real server into Parquet files: none lost, few files, each readable."""
+"""Collector from the real server to Parquet files: no row is lost, and files are merged."""
 
 import asyncio
 import contextlib
@@ -12,26 +12,33 @@ import pytest
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.queries.collector import Collector, only_collector
-from bms_estimator.fleet.queries.parquet_files import MANY, UNFINISHED, compact, sound_files, to_compact, write
+from bms_estimator.fleet.queries.parquet_files import (
+    MAX_FILES_PER_DAY,
+    UNFINISHED,
+    compact,
+    complete_files,
+    to_compact,
+    write,
+)
 from bms_estimator.model.errors import UserError
 from tests.command_line import PROGRAM
-from tests.fleet.engine import running
-from tests.fleet.fleets import an_hour
+from tests.fleet.hour_rows import make_hour
+from tests.fleet.nats_cluster import running
 from tests.patience import LONG_S
 
 MIDNIGHT = 490_000 // 24 * 24
 
 
 @pytest.fixture(scope="module")
-def engine(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("engine"), partitions=1) as engine:
-        yield engine
+def cluster(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("cluster"), partitions=1) as cluster:
+        yield cluster
 
 
 @pytest.fixture
-async def nc(engine):
-    """Connected, with an empty stream of hours."""
-    nc = await nats.connect(engine.url)
+async def nc(cluster):
+    """Connection to a server with an empty stream of hours."""
+    nc = await nats.connect(cluster.url)
     await make_streams(nc, partitions=1)
     await nc.jetstream().purge_stream(subjects.HOURS_STREAM)
     yield nc
@@ -45,14 +52,14 @@ async def publish(nc, rows):
 
 
 def rows_of(folder: Path):
-    with duckdb.connect() as base:
-        files = [str(file) for day in folder.glob("date=*") for file in sound_files(day)]
-        return base.read_parquet(files).fetchall() if files else []
+    with duckdb.connect() as database:
+        files = [str(file) for day in folder.glob("date=*") for file in complete_files(day)]
+        return database.read_parquet(files).fetchall() if files else []
 
 
 async def until(condition):
     async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - of files and of another process
+        while not condition():  # noqa: ASYNC110 - files and other processes send no notification
             await asyncio.sleep(0.02)
 
 
@@ -67,22 +74,22 @@ async def collecting(collector):
         await task
 
 
-async def test_a_connection_that_is_closed_for_good_ends_it(engine, tmp_path):
-    nc = await nats.connect(engine.url)
+async def test_permanently_closed_connection_raises(cluster, tmp_path):
+    nc = await nats.connect(cluster.url)
     await make_streams(nc, partitions=1)
     await nc.close()
     with pytest.raises(UserError, match="closed the connection"):
         await Collector(nc, tmp_path).run(asyncio.Event())
 
 
-async def test_rows_come_into_the_folder_of_their_day_and_are_acknowledged(nc, tmp_path):
-    await publish(nc, [an_hour("a", MIDNIGHT - 1), an_hour("a", MIDNIGHT), an_hour("b", MIDNIGHT)])
+async def test_rows_are_written_by_day_and_acknowledged(nc, tmp_path):
+    await publish(nc, [make_hour("a", MIDNIGHT - 1), make_hour("a", MIDNIGHT), make_hour("b", MIDNIGHT)])
     collector = Collector(nc, tmp_path, period_s=0.0)
     async with collecting(collector):
         await until(lambda: collector.counters["rows"] == 3)
     assert sorted(day.name for day in tmp_path.iterdir()) == ["date=2025-11-23", "date=2025-11-24"]
     js, left = nc.jetstream(timeout=LONG_S), None
-    async with asyncio.timeout(LONG_S):  # the server takes acknowledgements when it comes to it
+    async with asyncio.timeout(LONG_S):  # the server processes acknowledgments asynchronously
         while left != (0, 0):
             info = await js.consumer_info(subjects.HOURS_STREAM, "collector")
             left = info.num_ack_pending, info.num_pending
@@ -92,16 +99,16 @@ async def test_what_waits_is_written_at_the_end_and_rubbish_is_said(nc, tmp_path
     collector = Collector(nc, tmp_path, period_s=3600.0)
     async with collecting(collector):
         await nc.publish(subjects.hours("x"), b"{}")
-        await publish(nc, [an_hour("a", MIDNIGHT)])
+        await publish(nc, [make_hour("a", MIDNIGHT)])
         await until(lambda: collector.counters["unreadable"] == 1 and collector._waiting)
         assert rows_of(tmp_path) == []
     assert len(rows_of(tmp_path)) == 1
 
 
-async def test_what_a_killed_one_had_not_acknowledged_comes_again(engine, nc, tmp_path):
-    """The real command, killed while rows wait and others are on the disk; another goes on."""
-    rows = [an_hour(f"p{n}", MIDNIGHT + hour) for hour in range(4) for n in range(500)]
-    command = PROGRAM, "fleet", "collect", "--server", engine.url, "--folder", tmp_path, "--period", "0"
+async def test_unacknowledged_rows_of_a_killed_collector_are_redelivered(cluster, nc, tmp_path):
+    """The command is killed with waiting and with written rows; another collector continues."""
+    rows = [make_hour(f"p{n}", MIDNIGHT + hour) for hour in range(4) for n in range(500)]
+    command = PROGRAM, "fleet", "collect", "--server", cluster.url, "--folder", tmp_path, "--period", "0"
     process = await asyncio.create_subprocess_exec(*command)
     await publish(nc, rows[:1000])
     await until(lambda: rows_of(tmp_path) or process.returncode is not None)
@@ -115,20 +122,20 @@ async def test_what_a_killed_one_had_not_acknowledged_comes_again(engine, nc, tm
         async with collecting(collector):
             await until(lambda: collector._subscription)
             config = (await nc.jetstream().consumer_info(subjects.HOURS_STREAM, "collector")).config
-            config.ack_wait = 0.5  # not after a minute, as the collector has it
+            config.ack_wait = 0.5  # shorter than the collector's minute
             await nc.jetstream().add_consumer(subjects.HOURS_STREAM, config)
             await until(lambda: len({row[:2] for row in rows_of(tmp_path)}) == len(rows))
 
 
-async def test_without_the_stream_it_is_said_who_makes_it(nc, tmp_path):
+async def test_missing_stream_raises(nc, tmp_path):
     await nc.jetstream().delete_stream(subjects.HOURS_STREAM)
-    with pytest.raises(UserError, match="no stream HOURS: `bms-estimator fleet serve` makes it"):
+    with pytest.raises(UserError, match="no stream HOURS: `bms-estimator fleet serve` creates it"):
         await Collector(nc, tmp_path).run(asyncio.Event())
 
 
-def test_a_day_becomes_one_file_when_it_is_over_or_has_many(tmp_path):
+def test_files_of_a_day_are_merged_after_its_end_or_if_many(tmp_path):
     for n in range(3):
-        write(tmp_path, [an_hour("b", MIDNIGHT), an_hour("a", MIDNIGHT + n)])
+        write(tmp_path, [make_hour("b", MIDNIGHT), make_hour("a", MIDNIGHT + n)])
     late_s = (MIDNIGHT + 27) * 3600.0
     assert to_compact(tmp_path, late_s - 7200.0) == []
     (day,) = to_compact(tmp_path, late_s)
@@ -136,18 +143,18 @@ def test_a_day_becomes_one_file_when_it_is_over_or_has_many(tmp_path):
     (day / "half.parquet").write_bytes(b"PAR1 and no more")
     compact(day)
     assert [row[:2] for row in rows_of(tmp_path)] == [("a", MIDNIGHT + n) for n in range(3)] + [("b", MIDNIGHT)]
-    assert len(sound_files(day)) == 1
+    assert len(complete_files(day)) == 1
     assert to_compact(tmp_path, late_s) == []
-    (late,) = write(tmp_path, [an_hour("c", MIDNIGHT)])
-    for n in range(MANY - 2):
+    (late,) = write(tmp_path, [make_hour("c", MIDNIGHT)])
+    for n in range(MAX_FILES_PER_DAY - 2):
         shutil.copy(late, day / f"batch-{n}.parquet")
     assert to_compact(tmp_path, late_s) == [day]
 
 
-async def test_a_disk_that_takes_nothing_loses_nothing(nc, tmp_path, monkeypatch):
+async def test_disk_error_loses_no_row(nc, tmp_path, monkeypatch):
     folder = tmp_path / "hours"
     folder.touch()  # a file where the folder should be
-    await publish(nc, [an_hour("a", MIDNIGHT)])
+    await publish(nc, [make_hour("a", MIDNIGHT)])
     collector = Collector(nc, folder, period_s=0.0)
     async with collecting(collector):
         await until(lambda: collector.counters["faults"])

@@ -1,4 +1,4 @@
-"""Questions to fleets that are made up: the truth is known, and so is how often an answer may be wrong."""
+"""Queries on simulated fleets with known true values and known error rates."""
 
 import numpy as np
 import pyarrow as pa
@@ -10,10 +10,10 @@ from bms_estimator.fleet.queries.parquet_files import SCHEMA, compact, write
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
-from tests.fleet.fleets import BEGIN, FIRST_STD, an_hour, capacities, states_of_charge, write_fleet
+from tests.fleet.hour_rows import BEGIN, FIRST_STD, capacities, make_hour, states_of_charge, write_fleet
 
 
-def test_what_the_filter_takes_for_granted_is_taken_here():
+def test_process_noise_equals_that_of_the_filter():
     assert (Noise.aged_soc, Noise.charge_error) == (AGED_SOC, CHARGE_ERROR)
 
 
@@ -22,12 +22,12 @@ PACKS, DAYS, PER_YEAR = 400, 60, -0.06
 
 @pytest.fixture(scope="module")
 def ageing(tmp_path_factory):
-    """Folder and true slopes of packs that lose 6 % in a year, each 2 % more or less."""
+    """Folder and true slopes of packs that lose 6 % in a year, with a spread of 2 %."""
     folder, rng = tmp_path_factory.mktemp("ageing"), np.random.default_rng(1)
     slopes = PER_YEAR + 0.02 * rng.standard_normal(PACKS)
     truth = -0.1 + slopes[:, None] * np.arange(DAYS) / 365.25
-    found, variance = capacities(rng, truth, 0.01, through=1.0)
-    ratio = np.exp(found)
+    estimates, variance = capacities(rng, truth, 0.01, through=1.0)
+    ratio = np.exp(estimates)
     write_fleet(
         folder, BEGIN + 24 * np.arange(DAYS) + 23, capacity_ratio=ratio, capacity_ratio_std=ratio * np.sqrt(variance),
         capacity_first_std=FIRST_STD, charge_out_ah=3.0,
@@ -35,14 +35,14 @@ def ageing(tmp_path_factory):
     return folder, slopes
 
 
-def test_trends_are_in_their_bands_as_often_as_is_said(ageing):
+def test_true_trends_are_within_their_95_percent_bands(ageing):
     folder, slopes = ageing
     packs = {row["pack"]: row for row in run_query(folder, "soh").records if row["pack"]}
     inside = [
         packs[f"p{n}"]["percent_per_year_low"] < 100 * slope < packs[f"p{n}"]["percent_per_year_high"]
         for n, slope in enumerate(slopes)
     ]
-    assert 0.93 < np.mean(inside) < 0.98  # 95 %; of 400 its std is 1.1 %
+    assert 0.93 < np.mean(inside) < 0.98  # 95 %; its std with 400 packs is 1.1 %
     level = np.exp(-0.1 + slopes * (DAYS - 1) / 365.25)
     within = [
         packs[f"p{n}"]["capacity_ratio_low"] < level[n] < packs[f"p{n}"]["capacity_ratio_high"] for n in range(PACKS)
@@ -50,7 +50,7 @@ def test_trends_are_in_their_bands_as_often_as_is_said(ageing):
     assert 0.93 < np.mean(within) < 0.98
 
 
-def test_a_type_has_a_trend_and_its_packs_spread(ageing):
+def test_trend_and_spread_of_a_type(ageing):
     (row,) = [row for row in run_query(ageing[0], "soh").records if not row["pack"]]
     assert (row["type"], row["packs"], row["days"]) == ("ncr18650 1s1p 3 Ah", PACKS, DAYS)
     assert row["percent_per_year_low"] < 100 * PER_YEAR < row["percent_per_year_high"]
@@ -58,13 +58,13 @@ def test_a_type_has_a_trend_and_its_packs_spread(ageing):
     assert row["percent_per_year_spread"] == pytest.approx(2.0, abs=0.7)
 
 
-def test_estimates_that_repeat_themselves_tell_nothing_of_a_trend(tmp_path):
-    """The filter learned once; for two months its estimate stays, surer than it was by nothing."""
+def test_repeated_estimates_give_no_trend(tmp_path):
+    """The filter has learned once; for two months its estimate does not change, and its variance does not fall."""
     days = 60
     variance = 0.02**2 * np.ones(days)
-    kept = np.exp(-1.0 / AGED_SOC) ** 2
+    retained = np.exp(-1.0 / AGED_SOC) ** 2
     for day in range(1, days):
-        variance[day] = kept * variance[day - 1] + (1.0 - kept) * FIRST_STD**2
+        variance[day] = retained * variance[day - 1] + (1.0 - retained) * FIRST_STD**2
     ratio = 0.9 * np.ones((3, days))
     write_fleet(
         tmp_path, BEGIN + 24 * np.arange(days), capacity_ratio=ratio, capacity_ratio_std=ratio * np.sqrt(variance),
@@ -73,131 +73,131 @@ def test_estimates_that_repeat_themselves_tell_nothing_of_a_trend(tmp_path):
     assert run_query(tmp_path, "soh").rows == []
 
 
-def test_outliers_are_found_and_who_knows_little_is_not_accused(tmp_path):
+def test_outliers_are_found_but_not_uncertain_packs(tmp_path):
     rng = np.random.default_rng(2)
     packs = 1000
     capacity, std = 0.9 + 0.02 * rng.standard_normal((packs, 1)), np.full((packs, 1), 0.01)
-    std[:300] = 0.08  # these know little, ...
-    found = capacity + std * rng.standard_normal((packs, 1))
-    found[:300] = 1.0  # ... and stay at the cell file
+    std[:300] = 0.08  # these have learned little, ...
+    estimates = capacity + std * rng.standard_normal((packs, 1))
+    estimates[:300] = 1.0  # ... and stay at the cell file
     r_s = np.exp(0.3 + 0.05 * rng.standard_normal((packs, 1)))
-    found[500], found[501], r_s[502] = 0.7, 1.1, 2.5
-    found[10], std[10] = 0.7, 0.3
+    estimates[500], estimates[501], r_s[502] = 0.7, 1.1, 2.5
+    estimates[10], std[10] = 0.7, 0.3
     write_fleet(
-        tmp_path, np.array([BEGIN]), capacity_ratio=found, capacity_ratio_std=std, capacity_first_std=FIRST_STD,
+        tmp_path, np.array([BEGIN]), capacity_ratio=estimates, capacity_ratio_std=std, capacity_first_std=FIRST_STD,
         r_s_ratio=r_s, r_s_ratio_std=0.02 * r_s, r_s_unlearned_s=10.0,
     )  # fmt: skip
-    answer = run_query(tmp_path, "outliers").records
-    assert {(row["pack"], row["quantity"]) for row in answer} == {
+    result = run_query(tmp_path, "outliers").records
+    assert {(row["pack"], row["quantity"]) for row in result} == {
         ("p500", "capacity_ratio"), ("p501", "capacity_ratio"), ("p502", "r_s_ratio"),
     }  # fmt: skip
-    assert [row["median_of_type"] for row in answer if row["pack"] == "p500"] == [pytest.approx(0.9, abs=0.005)]
-    assert [row["spread_of_type"] for row in answer if row["pack"] == "p500"] == [pytest.approx(0.02, abs=0.01)]
+    assert [row["median_of_type"] for row in result if row["pack"] == "p500"] == [pytest.approx(0.9, abs=0.005)]
+    assert [row["spread_of_type"] for row in result if row["pack"] == "p500"] == [pytest.approx(0.02, abs=0.01)]
 
 
-def test_a_type_of_few_packs_is_judged_by_nobody(tmp_path):
-    found = np.array([[0.9], [0.9], [0.9], [0.2]])
+def test_type_of_few_packs_has_no_outliers(tmp_path):
+    estimates = np.array([[0.9], [0.9], [0.9], [0.2]])
     write_fleet(
-        tmp_path, np.array([BEGIN]), capacity_ratio=found, capacity_ratio_std=0.01, capacity_first_std=FIRST_STD
+        tmp_path, np.array([BEGIN]), capacity_ratio=estimates, capacity_ratio_std=0.01, capacity_first_std=FIRST_STD
     )
     assert run_query(tmp_path, "outliers").rows == []
 
 
-def test_who_is_about_to_fail_is_found_in_time(tmp_path):
+def test_failing_packs_are_found(tmp_path):
     rng, days = np.random.default_rng(3), 60
     slopes = np.zeros(500)
     slopes[7] = -0.9  # reaches 0.8 from 0.9 in 48 days after two months
     truth = np.log(0.9) + slopes[:, None] * (np.arange(days) - days + 1) / 365.25
-    found, variance = capacities(rng, truth, 0.01, through=1.0)
+    estimates, variance = capacities(rng, truth, 0.01, through=1.0)
     r_s = 1.2 * np.exp(0.05 * rng.standard_normal((500, days)))
     r_s[8] *= np.exp(2.0 * (np.arange(days) - days + 1) / 365.25) * 1.3  # 1.56 now; 2.0 in 45 days
     margin = 0.3 + 0.05 * rng.standard_normal((500, days))
     margin[9] -= 0.27 * np.arange(days) / days  # 0.03 left, 7 days
     suspects = np.zeros((500, days), int)
     suspects[10, -4:] = InputFault.CAPACITY
-    suspects[11, :] = InputFault.OFFSET  # always was
+    suspects[11, :] = InputFault.OFFSET  # present from the beginning
     write_fleet(
-        tmp_path, BEGIN + 24 * np.arange(days), capacity_ratio=np.exp(found), charge_out_ah=3.0,
-        capacity_ratio_std=np.exp(found) * np.sqrt(variance), capacity_first_std=FIRST_STD, r_s_ratio=r_s,
+        tmp_path, BEGIN + 24 * np.arange(days), capacity_ratio=np.exp(estimates), charge_out_ah=3.0,
+        capacity_ratio_std=np.exp(estimates) * np.sqrt(variance), capacity_first_std=FIRST_STD, r_s_ratio=r_s,
         r_s_ratio_std=0.05 * r_s, r_s_unlearned_s=10.0, stability_margin_min=margin, suspects=suspects,
     )  # fmt: skip
-    answer = {row["pack"]: row for row in run_query(tmp_path, "failing").records}
-    assert {pack: row["quantity"] for pack, row in answer.items()} == {
+    result = {row["pack"]: row for row in run_query(tmp_path, "failing").records}
+    assert {pack: row["quantity"] for pack, row in result.items()} == {
         "p7": "capacity_ratio", "p8": "r_s_ratio", "p9": "stability_margin_min", "p10": "suspect: capacity",
     }  # fmt: skip
-    assert answer["p7"]["days_left_low"] < 48 < answer["p7"]["days_left_high"]
-    assert answer["p8"]["days_left_low"] < 45 < answer["p8"]["days_left_high"]
-    assert answer["p9"]["days_left_low"] < 7 < answer["p9"]["days_left_high"]
+    assert result["p7"]["days_left_low"] < 48 < result["p7"]["days_left_high"]
+    assert result["p8"]["days_left_low"] < 45 < result["p8"]["days_left_high"]
+    assert result["p9"]["days_left_low"] < 7 < result["p9"]["days_left_high"]
 
 
-@pytest.mark.parametrize(("told", "least", "most"), [(1.0, 0.94, 0.97), (0.5, 0.62, 0.8), (2.0, 0.99, 1.0)])
-def test_bands_are_honest_when_they_are_and_not_when_they_are_too_narrow(tmp_path, told, least, most):
+@pytest.mark.parametrize(("factor", "minimum", "maximum"), [(1.0, 0.94, 0.97), (0.5, 0.62, 0.8), (2.0, 0.99, 1.0)])
+def test_coverage_of_correct_narrow_and_wide_bands(tmp_path, factor, minimum, maximum):
     columns = states_of_charge(np.random.default_rng(4), 300, 96)
-    columns["soc_mean_std"] = told * columns["soc_mean_std"]
+    columns["soc_mean_std"] = factor * columns["soc_mean_std"]
     write_fleet(
         tmp_path, BEGIN + np.arange(96), capacity_ratio=1.0, capacity_ratio_std=1e-6, capacity_first_std=1e-6,
         current_offset_a=0.0, current_offset_std_a=1e-9, soc_capacity_correlation=0.0, soc_offset_correlation=0.0,
         capacity_offset_correlation=0.0, temperature_c=25.0, **columns,
     )  # fmt: skip
-    answer = run_query(tmp_path, "honest").records
-    whole, groups = answer[0], {(row["of"], row["which"]) for row in answer[1:]}
+    result = run_query(tmp_path, "honest").records
+    whole, groups = result[0], {(row["of"], row["which"]) for row in result[1:]}
     assert {("type", "ncr18650 1s1p 3 Ah"), ("temperature", "20 to 30 C"), ("age", "first day")} <= groups
-    assert least < whole["within_2_std"] < most
+    assert minimum < whole["within_2_std"] < maximum
     assert whole["low"] <= whole["within_2_std"] <= whole["high"]
     assert whole["high"] - whole["low"] < 0.1
-    assert whole["std_should_be_times"] == pytest.approx(1.0 / told, rel=0.2)
+    assert whole["std_should_be_times"] == pytest.approx(1.0 / factor, rel=0.2)
 
 
-def test_who_stopped_is_named_with_what_was_known_last(tmp_path):
-    write(tmp_path, [an_hour("lives", BEGIN + n) for n in range(30)])
-    write(tmp_path, [an_hour("stopped", BEGIN + n, soc=0.1 * n) for n in range(5)])
+def test_silent_pack_is_reported_with_its_last_values(tmp_path):
+    write(tmp_path, [make_hour("lives", BEGIN + n) for n in range(30)])
+    write(tmp_path, [make_hour("stopped", BEGIN + n, soc=0.1 * n) for n in range(5)])
     (row,) = run_query(tmp_path, "silent").records
     assert (row["pack"], row["hours_silent"], row["silent_since"]) == ("stopped", 25, "2025-11-24T05:00:00Z")
     assert row["soc"] == pytest.approx(0.4)
 
 
-def test_rows_that_came_twice_count_once_before_and_after_a_day_is_one_file(tmp_path):
-    rows = [an_hour("a", BEGIN + n) for n in range(24)]
+def test_duplicate_rows_count_once_before_and_after_a_merge(tmp_path):
+    rows = [make_hour("a", BEGIN + n) for n in range(24)]
     write(tmp_path, rows)
     write(tmp_path, rows[5:9])
     assert select(tmp_path, "SELECT count(*), min(time) FROM hours").rows == [(24, "2025-11-24T00:00:00Z")]
     (day,) = tmp_path.glob("date=*")
     compact(day)
-    write(tmp_path, [an_hour("a", BEGIN + 24)])
+    write(tmp_path, [make_hour("a", BEGIN + 24)])
     assert select(tmp_path, "SELECT count(*) AS n FROM hours").rows == [(25,)]
     assert select(tmp_path, "SELECT count(*) AS n FROM hours", days=1).rows == [(1,)]
 
 
-def test_files_of_a_version_that_knew_less_are_read(tmp_path):
-    write(tmp_path, [an_hour("a", BEGIN)])
+def test_files_of_an_earlier_version_are_read(tmp_path):
+    write(tmp_path, [make_hour("a", BEGIN)])
     (file,) = tmp_path.glob("*/*.parquet")
     pq.write_table(pq.read_table(file).drop_columns(["capacity_first_std", "r_s_ratio"]), file)
     for name in QUESTIONS:
         assert run_query(tmp_path, name).rows == []
     pq.write_table(pa.table({"x": [1]}), file)
-    with pytest.raises(UserError, match="no columns pack and hour"):
+    with pytest.raises(UserError, match="lack the columns pack and hour"):
         run_query(tmp_path, "soh")
 
 
-def test_what_cannot_be_answered_is_said(tmp_path):
-    with pytest.raises(UserError, match="no such question; there are soh, outliers"):
+def test_errors(tmp_path):
+    with pytest.raises(UserError, match="no such query; there are soh, outliers"):
         run_query(tmp_path, "nonsense")
     with pytest.raises(UserError, match="no such folder; `bms-estimator fleet collect"):
         run_query(tmp_path / "none", "soh")
-    with pytest.raises(UserError, match="no hours of packs in it yet"):
+    with pytest.raises(UserError, match="no hours yet"):
         run_query(tmp_path, "soh")
-    write(tmp_path, [an_hour("a", BEGIN)])
-    for query, why in (
+    write(tmp_path, [make_hour("a", BEGIN)])
+    for query, reason in (
         ("SELEC 1", "syntax error"), ("SELECT * FROM read_csv('/etc/passwd')", "disabled"),
         ("COPY hours TO 'x.csv'", "only SELECT"), ("SELECT nothing FROM hours", "nothing"),
     ):  # fmt: skip
-        with pytest.raises(UserError, match=f"sql: .*{why}"):
+        with pytest.raises(UserError, match=f"sql: .*{reason}"):
             select(tmp_path, query)
     (file,) = tmp_path.glob("*/*.parquet")
     file.write_bytes(file.read_bytes()[:-100])
-    with pytest.raises(UserError, match=r"batch-.*\.parquet: not a whole Parquet file"):
+    with pytest.raises(UserError, match=r"batch-.*\.parquet: an incomplete Parquet file"):
         run_query(tmp_path, "soh")
 
 
-def test_the_columns_are_those_of_the_row():
+def test_columns():
     assert {"pack", "hour", "soc", "suspects"} < set(SCHEMA.names)

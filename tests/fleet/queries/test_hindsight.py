@@ -1,4 +1,4 @@
-"""Hindsight beside the truth, on a real capture of the tests."""
+"""Coverage judged in hindsight, compared with the truth of a real capture."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ SLOT_S = 60.0
 
 @pytest.fixture(scope="module")
 def packs(data):
-    """A Nissan Leaf, entered at four places with an SOC wrong by 0.2 each way; truth is the charge counted from full."""
+    """Estimates of a Nissan Leaf from four starts, each with an SOC error of 0.2 and -0.2; the truth is counted from full."""
     cell, whole = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
     drawn_as = np.r_[0.0, np.cumsum(whole["current_a"][:-1] * np.diff(whole["time_s"]))]
     soc = 1.0 - drawn_as / (3600.0 * cell.cell.capacity_ah)
@@ -24,7 +24,7 @@ def packs(data):
     ]
 
 
-def test_a_real_cell_is_judged_in_hindsight_as_by_the_truth(packs, tmp_path):
+def test_coverage_in_hindsight_agrees_with_the_truth(packs, tmp_path):
     write(tmp_path, [known.hour for pack in packs for known in pack])
     (whole, *_) = run_query(tmp_path, "honest", limits=limits(SLOT_S)).records
     there = np.abs([x for pack in packs for x in judged(pack)]) <= 2.0
@@ -33,7 +33,7 @@ def test_a_real_cell_is_judged_in_hindsight_as_by_the_truth(packs, tmp_path):
     assert whole["low"] > 0.5
 
 
-def test_a_real_band_that_is_far_too_narrow_is_seen(packs, tmp_path):
+def test_too_narrow_band_is_detected(packs, tmp_path):
     narrow = [
         known.hour.model_copy(update={"soc_mean_std": (known.hour.soc_mean_std or 0.0) / 8.0})
         for pack in packs

@@ -1,4 +1,4 @@
-"""Attacks with the token of one edge on the real server: they cost nothing but that edge's own blocks."""
+"""Attacks with the token of one edge on the real server: they harm only that edge's own pack."""
 
 import asyncio
 import time
@@ -17,19 +17,19 @@ from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES, make_streams, pack_blocks
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.server.jwt_claims import Role
-from bms_estimator.fleet.worker.block_order import MAX_PASSED
+from bms_estimator.fleet.worker.block_order import MAX_EARLY_REPEATS
 from bms_estimator.fleet.worker.worker import Options, work
-from tests.fleet.engine import running
+from tests.fleet.nats_cluster import running
 from tests.fleet.tenant import Tenant, heavy_block, numbered, one_tenant
-from tests.fleet.workers import KIND, Heartbeats, block, end_states, know, until
+from tests.fleet.workers import KIND, Heartbeats, block, end_states, load_packs, until
 from tests.patience import LONG_S
 
 PARTITIONS = 4
 RAW_BYTES = 8 << 20
 FLOOD = 40
-"""Blocks, each of which costs a worker a tenth of a second."""
-OLD = "p.*.raw.*"
-"""Subject of ``RAW`` in the version before, where the server mapped what edges published."""
+"""Number of blocks, each of which takes a worker a tenth of a second."""
+FORMER_SUBJECT = "p.*.raw.*"
+"""Subject of ``RAW`` in the previous version, in which the server mapped the edges' subjects before storing."""
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def fleet(tmp_path: Path) -> Iterator[Tenant]:
 
 
 async def stored(nc: Client, last: bytes) -> dict[str, int]:
-    """Return the number of messages of each subject in ``RAW``, once the last that was sent is in it.
+    """Return the number of messages of each subject in ``RAW``, once the last sent message is in it.
 
     The server acknowledges an MQTT publish before the message is in the stream.
     """
@@ -55,10 +55,10 @@ async def stored(nc: Client, last: bytes) -> dict[str, int]:
 
 
 def subject(pack: str) -> str:
-    return subjects.kept(subjects.partition_of(pack, PARTITIONS), pack)
+    return subjects.counts(subjects.partition_of(pack, PARTITIONS), pack)
 
 
-async def test_invented_subjects_and_foreign_partitions_are_refused(fleet: Tenant) -> None:
+async def test_other_subjects_and_partitions_are_rejected(fleet: Tenant) -> None:
     reader = await fleet.program(Role.READER)
     async with fleet.edge("attacker") as edge:
         for partition in (*range(PARTITIONS), "x", "invented", "64"):
@@ -84,12 +84,12 @@ async def test_junk_evicts_no_block_of_another_pack(fleet: Tenant) -> None:
         for _ in range(2 * RAW_BYTES // len(junk)):
             await edge.publish("raw/attacker", junk, qos=1)
         await edge.publish("raw/attacker", b"last", qos=1)
-    kept = await stored(reader, b"last")
-    assert kept == {subject("honest"): 5, subject("attacker"): pack_blocks(RAW_BYTES)}
+    counts = await stored(reader, b"last")
+    assert counts == {subject("honest"): 5, subject("attacker"): pack_blocks(RAW_BYTES)}
     await reader.close()
 
 
-async def test_a_message_larger_than_a_block_is_not_stored(fleet: Tenant) -> None:
+async def test_too_large_message_is_not_stored(fleet: Tenant) -> None:
     reader = await fleet.program(Role.READER)
     async with fleet.edge("attacker") as edge:
         await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES + 1), qos=1)
@@ -98,27 +98,29 @@ async def test_a_message_larger_than_a_block_is_not_stored(fleet: Tenant) -> Non
     await reader.close()
 
 
-async def test_a_block_that_the_server_refuses_is_not_sent_for_ever(fleet: Tenant) -> None:
+async def test_rejected_block_counts_as_lost_after_some_resends(fleet: Tenant) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
     await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND})
-    answers = await reader.subscribe(subjects.published("p1", "state"))
+    states = await reader.subscribe(subjects.published("p1", "state"))
     await reader.flush()
-    async with Heartbeats(reader) as heard, worker(fleet), fleet.edge("p1") as edge:
+    async with Heartbeats(reader) as heartbeats, worker(fleet), fleet.edge("p1") as edge:
         await edge.publish("raw/p1", block("p1", 1), qos=1)
-        await answers.next_msg(LONG_S)
-        for _ in range(MAX_PASSED):  # as an edge that is asked for block 2 each time
+        await states.next_msg(LONG_S)
+        for _ in range(MAX_EARLY_REPEATS):  # as an edge does when block 2 is requested
             await edge.publish("raw/p1", bytes(MAX_BLOCK_BYTES + 1), qos=1)
             await edge.publish("raw/p1", block("p1", 3), qos=1)
-        await answers.next_msg(LONG_S)
-        await until_counted(heard, "lost_blocks", 1)
+        await states.next_msg(LONG_S)
+        await until_counted(heartbeats, "lost_blocks", 1)
     await admin.close()
     await reader.close()
 
 
-async def test_a_stream_of_the_version_before_takes_the_limits_and_keeps_its_blocks(tmp_path: Path) -> None:
-    with running(tmp_path) as engine:
-        nc = await nats.connect(engine.url)
-        await nc.jetstream().add_stream(name=subjects.RAW_STREAM, subjects=[OLD], metadata={"bms.partitions": "4"})
+async def test_stream_of_the_previous_version_is_updated_and_keeps_its_blocks(tmp_path: Path) -> None:
+    with running(tmp_path) as cluster:
+        nc = await nats.connect(cluster.url)
+        await nc.jetstream().add_stream(
+            name=subjects.RAW_STREAM, subjects=[FORMER_SUBJECT], metadata={"bms.partitions": "4"}
+        )
         await nc.jetstream().publish(subject("p1"), b"before")
         await make_streams(nc, partitions=PARTITIONS, raw_bytes=RAW_BYTES)
         await nc.jetstream().publish(subjects.raw("p1"), b"after")
@@ -128,9 +130,9 @@ async def test_a_stream_of_the_version_before_takes_the_limits_and_keeps_its_blo
 
 @asynccontextmanager
 async def worker(fleet: Tenant) -> AsyncIterator[None]:
-    """A worker that runs meanwhile."""
+    """Run a worker while the context lasts."""
     stop = asyncio.Event()
-    working = asyncio.create_task(work(Options(fleet.engine.url, "w", fleet.file(Role.WORKER)), stop))
+    working = asyncio.create_task(work(Options(fleet.cluster.url, "w", fleet.file(Role.WORKER)), stop))
     try:
         yield
     finally:
@@ -138,9 +140,9 @@ async def worker(fleet: Tenant) -> AsyncIterator[None]:
         await working
 
 
-async def until_counted(heard: Heartbeats, name: str, count: int) -> None:
+async def until_counted(heartbeats: Heartbeats, name: str, count: int) -> None:
     """Wait until the worker's counter has reached a value."""
-    await heard.until(lambda last: any(each.counters.get(name, 0) >= count for each in last.values()))
+    await heartbeats.until(lambda last: any(each.counters.get(name, 0) >= count for each in last.values()))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +152,7 @@ async def until_counted(heard: Heartbeats, name: str, count: int) -> None:
         (20_000, 3.0, "20000 samples in 3 s: at most 1000 a second, and 7000 more"),
     ],
 )
-async def test_715_kb_of_dense_blocks_are_refused_and_honest_packs_go_on(
+async def test_dense_blocks_are_rejected_and_other_packs_are_not_delayed(
     fleet: Tenant, samples: int, seconds: float, reason: str
 ) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
@@ -164,18 +166,18 @@ async def test_715_kb_of_dense_blocks_are_refused_and_honest_packs_go_on(
             await attacker.publish("raw/attacker", numbered(dense, number), qos=1)
         await honest.publish("raw/p1", block("p1", 1), qos=1)
     with capture_logs() as logs:
-        async with Heartbeats(reader) as heard, worker(fleet):
+        async with Heartbeats(reader) as heartbeats, worker(fleet):
             assert (await states.next_msg(LONG_S)).subject == subjects.published("p1", "state")
-            await until_counted(heard, "too_dense", count)
-    refused = [line for line in logs if line["event"] == "a block is refused"]
-    assert [(line["pack"], line["reason"]) for line in refused] == [("attacker", reason)]
+            await until_counted(heartbeats, "too_dense", count)
+    rejections = [line for line in logs if line["event"] == "a block is rejected"]
+    assert [(line["pack"], line["reason"]) for line in rejections] == [("attacker", reason)]
     await admin.close()
     await reader.close()
 
 
-async def test_a_flood_of_blocks_delays_its_own_pack_alone_and_loses_nothing(fleet: Tenant) -> None:
+async def test_flood_of_blocks_delays_only_its_own_pack(fleet: Tenant) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
-    known = await know(admin, ["p1", "attacker"])
+    registry = await load_packs(admin, ["p1", "attacker"])
     assert subject("p1").split(".")[1] == subject("attacker").split(".")[1]
     states = await reader.subscribe(subjects.published("*", "state"))
     await reader.flush()
@@ -189,14 +191,14 @@ async def test_a_flood_of_blocks_delays_its_own_pack_alone_and_loses_nothing(fle
         while (await states.next_msg(LONG_S)).subject != subjects.published("p1", "state"):
             before += 1
         assert before < FLOOD // 2
-    async with Heartbeats(reader) as heard, worker(fleet):  # goes on from the checkpoint of the one before
-        await until_counted(heard, "blocks", FLOOD + 1)
-        await until_counted(heard, "deferred", FLOOD // 2)
-    state = (await end_states(admin, known, PARTITIONS))[subjects.partition_of("attacker", PARTITIONS)].state(
+    async with Heartbeats(reader) as heartbeats, worker(fleet):  # continues from the checkpoint of the first worker
+        await until_counted(heartbeats, "blocks", FLOOD + 1)
+        await until_counted(heartbeats, "deferred", FLOOD // 2)
+    state = (await end_states(admin, registry, PARTITIONS))[subjects.partition_of("attacker", PARTITIONS)].state(
         "attacker"
     )
     assert state is not None
-    estimator = estimator_of(*(known("attacker") or ()))
+    estimator = estimator_of(*(registry("attacker") or ()))
     for _ in range(FLOOD):
         estimator.run(decode(heavy).samples)
     assert state["estimator"].tobytes() == estimator.record.tobytes()
@@ -204,17 +206,20 @@ async def test_a_flood_of_blocks_delays_its_own_pack_alone_and_loses_nothing(fle
     await reader.close()
 
 
-async def test_a_worker_refuses_a_block_in_the_wrong_partition(fleet: Tenant) -> None:
+async def test_worker_rejects_a_block_in_the_wrong_partition(fleet: Tenant) -> None:
     admin = await fleet.program(Role.ADMIN)
     await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND})
     wrong = (subjects.partition_of("p1", PARTITIONS) + 1) % PARTITIONS
-    await admin.jetstream().update_stream(  # as of the version before
-        name=subjects.RAW_STREAM, subjects=[OLD], metadata={"bms.partitions": str(PARTITIONS)}, allow_direct=True
+    await admin.jetstream().update_stream(  # as in the previous version
+        name=subjects.RAW_STREAM,
+        subjects=[FORMER_SUBJECT],
+        metadata={"bms.partitions": str(PARTITIONS)},
+        allow_direct=True,
     )
-    await admin.jetstream().publish(subjects.kept(wrong, "p1"), block("p1", 1))
+    await admin.jetstream().publish(subjects.counts(wrong, "p1"), block("p1", 1))
     with capture_logs() as logs:
         async with worker(fleet):
-            await until(lambda: [line for line in logs if line["event"] == "a block is refused"], lambda: logs)
-    (refused,) = [line for line in logs if line["event"] == "a block is refused"]
-    assert (refused["partition"], refused["reason"]) == (wrong, "the pack belongs to another partition")
+            await until(lambda: [line for line in logs if line["event"] == "a block is rejected"], lambda: logs)
+    (rejection,) = [line for line in logs if line["event"] == "a block is rejected"]
+    assert (rejection["partition"], rejection["reason"]) == (wrong, "the pack belongs to another partition")
     await admin.close()

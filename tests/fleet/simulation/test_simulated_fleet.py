@@ -1,4 +1,4 @@
-"""Simulated packs: blocks that follow from seed, pack and number alone, and a truth that an estimator finds."""
+"""Simulated packs: their blocks, their true SOC, and the block order of their edges."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def fleet(packs: int, seed: int = 1) -> SimulatedFleet:
     return SimulatedFleet(packs, seed=seed, begin_ns=BEGIN_NS)
 
 
-def test_a_block_is_the_same_whenever_and_with_whomever_it_is_made() -> None:
+def test_block_depends_only_on_seed_pack_and_number() -> None:
     many, one = np.array([0, 5, 6, 7]), np.array([6])
     arrival_s = np.full(4, 1.8e9)
     together = list(fleet(8).blocks(many, np.array([3, 1, 900, 2]), arrival_s))
@@ -30,7 +30,7 @@ def test_a_block_is_the_same_whenever_and_with_whomever_it_is_made() -> None:
     assert next(fleet(8, seed=2).blocks(one, np.array([900]), arrival_s[:1])) != alone
 
 
-def test_blocks_follow_on_one_another_without_a_gap_or_a_step() -> None:
+def test_successive_blocks_are_continuous() -> None:
     packs = np.arange(8)
     first, second = (fleet(8).samples(packs, np.full(8, number)) for number in (41, 42))
     time_s = np.concatenate((first["time_s"], second["time_s"]), axis=1)
@@ -40,33 +40,35 @@ def test_blocks_follow_on_one_another_without_a_gap_or_a_step() -> None:
     assert before == pytest.approx(after, abs=1e-8)
 
 
-def test_the_charge_that_flowed_is_that_of_the_true_soc() -> None:
-    some = fleet(len(KINDS))
+def test_charge_agrees_with_the_true_soc() -> None:
+    simulated = fleet(len(KINDS))
     packs, begin, end = np.arange(len(KINDS)), 7, 127
-    charge_as = sum(some.samples(packs, np.full(packs.size, n))["current_a"].sum(axis=1) for n in range(begin, end))
-    socs = [some.soc(packs, np.full(packs.size, (n - 1.0) * BLOCK_S)) for n in (begin, end)]
-    assert charge_as / some.truth.capacity_as == pytest.approx(socs[0] - socs[1], abs=2e-4)
+    charge_as = sum(
+        simulated.samples(packs, np.full(packs.size, n))["current_a"].sum(axis=1) for n in range(begin, end)
+    )
+    socs = [simulated.soc(packs, np.full(packs.size, (n - 1.0) * BLOCK_S)) for n in (begin, end)]
+    assert charge_as / simulated.truth.capacity_as == pytest.approx(socs[0] - socs[1], abs=2e-4)
 
 
-def test_an_estimator_that_is_told_the_table_finds_the_truth() -> None:
-    some = fleet(len(KINDS))
+def test_estimator_with_the_settings_of_the_table_finds_the_true_soc() -> None:
+    simulated = fleet(len(KINDS))
     within = []
     for pack, kind in enumerate(KINDS):
         cell = load_cell(kind.cell, kind.capacity_ah).pack(kind.series, kind.parallel)
         sampling = Sampling(kind.current_resolution_a, 0.0, 1.0)
         estimator = Estimator(cell, voltage_resolution_v=kind.voltage_resolution_v, sampling=sampling)
         for number in range(1, HOURS * 60 + 1):
-            samples = some.samples(np.array([pack]), np.array([number]))[0]
+            samples = simulated.samples(np.array([pack]), np.array([number]))[0]
             row = estimator.run(samples)[-1]
-            truth = some.soc(np.array([pack]), samples["time_s"][-1:])[0]
+            truth = simulated.soc(np.array([pack]), samples["time_s"][-1:])[0]
             within.append(abs(row["soc"] - truth) < 3.0 * row["soc_std"])
         assert row["soc"] == pytest.approx(truth, abs=0.1)
     assert np.mean(within) > 0.9
 
 
-def test_edges_send_each_block_once_when_it_is_complete_and_the_oldest_first() -> None:
-    some = fleet(50)
-    edges = SimulatedEdges(some, start_s=1000.0, speed=60.0)
+def test_edges_send_each_complete_block_once_oldest_first() -> None:
+    simulated = fleet(50)
+    edges = SimulatedEdges(simulated, start_s=1000.0, speed=60.0)
     assert edges.due(1000.9, 100).packs.size == 0
     late = edges.due(1003.0, 7)
     assert late.packs.size == 7
@@ -77,31 +79,32 @@ def test_edges_send_each_block_once_when_it_is_complete_and_the_oldest_first() -
     assert edges.again == 0
 
 
-def test_edges_send_again_from_the_block_that_a_worker_awaits() -> None:
-    some = fleet(2)
-    edges = SimulatedEdges(some, start_s=0.0, speed=60.0, last=4)
+def test_edges_resend_from_the_requested_block() -> None:
+    simulated = fleet(2)
+    edges = SimulatedEdges(simulated, start_s=0.0, speed=60.0, last=4)
     while edges.due(100.0, 10).packs.size:
         pass
     assert edges.done
     assert edges.sent == 8
-    store = int(some.store[1])
-    assert not edges.hear("someone-else", BlockRequest(store=store, number=2, resend=True), 0.0)
-    assert not edges.hear(some.names[1], BlockRequest(store=store + 1, number=2, resend=True), 0.0)
-    assert edges.hear(some.names[1], BlockRequest(store=store, number=3, resend=True), 0.0)
+    store = int(simulated.store[1])
+    assert not edges.receive_reply("someone-else", BlockRequest(store=store, number=2, resend=True), 0.0)
+    assert not edges.receive_reply(simulated.names[1], BlockRequest(store=store + 1, number=2, resend=True), 0.0)
+    assert edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), 0.0)
     assert not edges.done
     again = [edges.due(100.0, 10) for _ in range(3)]
     assert [list(zip(due.packs, due.numbers, strict=True)) for due in again] == [[(1, 3)], [(1, 4)], []]
     assert (edges.again, edges.resends, edges.safe[1]) == (2, 1, 3)
-    edges.hear(some.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S / 2.0)  # it has been sent
-    edges.hear(some.names[1], BlockRequest(store=store, number=2, resend=True), RESEND_S)  # said long ago: it is safe
+    # A request is ignored if its block was resent recently, or is confirmed.
+    edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S / 2.0)
+    edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=2, resend=True), RESEND_S)
     assert edges.done
-    edges.hear(some.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S)
+    edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S)
     assert not edges.done
 
 
-def test_an_edge_does_not_send_what_is_safe_already() -> None:
-    some = fleet(1)
-    edges = SimulatedEdges(some, start_s=0.0, speed=60.0)
-    edges.hear(some.names[0], BlockRequest(store=int(some.store[0]), number=40, resend=False), 0.0)
+def test_edge_does_not_send_confirmed_blocks() -> None:
+    simulated = fleet(1)
+    edges = SimulatedEdges(simulated, start_s=0.0, speed=60.0)
+    edges.receive_reply(simulated.names[0], BlockRequest(store=int(simulated.store[0]), number=40, resend=False), 0.0)
     assert edges.due(30.0, 10).packs.size == 0
     assert edges.due(41.0, 10).numbers.tolist() == [40]

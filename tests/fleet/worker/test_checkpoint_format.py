@@ -1,4 +1,4 @@
-"""The bytes of a partition: whole, damaged, and of another version."""
+"""Checkpoint format: intact, damaged, and of another version."""
 
 import json
 from dataclasses import replace
@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.fleet.worker import checkpoint_format
-from bms_estimator.fleet.worker.block_order import MAX_PASSED
+from bms_estimator.fleet.worker.block_order import MAX_EARLY_REPEATS
 from bms_estimator.fleet.worker.checkpoint_format import (
     CHUNK_BYTES,
-    PRESENT,
+    CURRENT_LAYOUT,
     CheckpointError,
     PartitionCheckpoint,
     PreviousLayoutState,
@@ -25,7 +25,7 @@ from bms_estimator.fleet.worker.pack_state import PACK_STATE, WorkRecord
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.payloads import Estimate
 from tests.estimator.simulated_cell import pulses
-from tests.fleet.an_edge import SAMPLES, Stream, blocks_of, deliver, table
+from tests.fleet.partition_stream import SAMPLES, Stream, blocks_of, deliver, table
 
 names = st.text(max_size=10)
 snapshots = st.builds(
@@ -41,16 +41,16 @@ snapshots = st.builds(
 )
 
 
-def whole(snapshot: PartitionCheckpoint) -> bytes:
+def to_bytes(snapshot: PartitionCheckpoint) -> bytes:
     return b"".join(snapshot.chunks())
 
 
 @given(snapshots)
-def test_all_that_a_snapshot_holds_comes_back(snapshot: PartitionCheckpoint) -> None:
-    assert read_checkpoint(whole(snapshot)) == snapshot
+def test_snapshot_round_trip(snapshot: PartitionCheckpoint) -> None:
+    assert read_checkpoint(to_bytes(snapshot)) == snapshot
 
 
-def test_many_packs_come_in_chunks() -> None:
+def test_many_packs_are_split_into_chunks() -> None:
     packs = {f"pack{n}": bytes([n % 256]) * 1000 for n in range(3000)}
     snapshot = PartitionCheckpoint(0, 9, packs=packs)
     chunks = list(snapshot.chunks())
@@ -61,8 +61,8 @@ def test_many_packs_come_in_chunks() -> None:
 
 @given(snapshots, st.data())
 @settings(max_examples=200)
-def test_whatever_is_damaged_is_said_and_no_other_exception(snapshot: PartitionCheckpoint, data) -> None:
-    good = whole(snapshot)
+def test_any_damage_raises_checkpoint_error(snapshot: PartitionCheckpoint, data) -> None:
+    good = to_bytes(snapshot)
     bad = bytearray(good)
     at = data.draw(st.integers(0, len(good) - 1))
     change = data.draw(st.sampled_from(["flip", "cut", "append", "drop"]))
@@ -78,47 +78,47 @@ def test_whatever_is_damaged_is_said_and_no_other_exception(snapshot: PartitionC
         read_checkpoint(bytes(bad))
 
 
-def test_no_byte_can_be_another_unseen() -> None:
-    good = whole(PartitionCheckpoint(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
+def test_any_changed_byte_is_detected() -> None:
+    good = to_bytes(PartitionCheckpoint(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
     for at in range(len(good)):
         with pytest.raises(CheckpointError):
             read_checkpoint(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
 
 
-def test_blocks_that_an_earlier_version_kept_are_read_from_the_stream_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_stored_by_an_earlier_version_are_read_from_the_stream_again(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [checkpoint_format._entry(0, "known", b"12345678"), checkpoint_format._entry(255, "unknown", b"block")]
     monkeypatch.setattr(PartitionCheckpoint, "_entries", lambda *_: iter(entries))
-    read = read_checkpoint(whole(PartitionCheckpoint(3, 7, packs={"known": b"", "unknown": b""})))
+    read = read_checkpoint(to_bytes(PartitionCheckpoint(3, 7, packs={"known": b"", "unknown": b""})))
     assert (read.packs, read.deferred) == ({"known": b"12345678"}, {"unknown": Span(1, 7)})
 
 
 @pytest.mark.parametrize("data", [b"", b"BMSFLEET", b"x" * 100])
-def test_bytes_that_are_no_checkpoint_are_refused(data: bytes) -> None:
+def test_other_bytes_are_rejected(data: bytes) -> None:
     with pytest.raises(CheckpointError, match="checkpoint"):
         Partition.restore(0, table, data)
 
 
-def test_one_of_another_partition_is_refused() -> None:
+def test_checkpoint_of_another_partition_is_rejected() -> None:
     with pytest.raises(CheckpointError, match="of partition 3, not of 4"):
-        Partition.restore(4, table, whole(PartitionCheckpoint(3, 0)))
+        Partition.restore(4, table, to_bytes(PartitionCheckpoint(3, 0)))
 
 
-def test_one_of_a_format_to_come_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_a_newer_format_names_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoint_format, "FORMAT", 2)
-    later = whole(PartitionCheckpoint(3, 0))
+    later = to_bytes(PartitionCheckpoint(3, 0))
     monkeypatch.undo()
     with pytest.raises(CheckpointError, match="is of format 2, this version reads 1: start the version that wrote it"):
         read_checkpoint(later)
 
 
-def test_a_layout_is_what_it_was_made_of() -> None:
-    dtype = dtype_of(PRESENT)
-    assert layout_of(dtype) == PRESENT
+def test_layout_round_trip() -> None:
+    dtype = dtype_of(CURRENT_LAYOUT)
+    assert layout_of(dtype) == CURRENT_LAYOUT
     assert dtype == PACK_STATE
 
 
 @pytest.mark.parametrize("layout", ["", "7", "[1]", '[["a","f8"]]', '[["a","O",[]]]', '[["a","<f8",[99999999]]]'])
-def test_a_layout_that_is_none_is_refused(layout: str) -> None:
+def test_invalid_layout_is_rejected(layout: str) -> None:
     with pytest.raises(ValueError, match=r".+"):
         dtype_of(layout)
 
@@ -128,77 +128,78 @@ def samples():
     return pulses(soc=0.9, hours=1.0)[0]
 
 
-class TestAnotherVersion:
-    """Knew no ``fit_age_s``, had a counter more, and its fields in another order."""
+class TestPreviousLayout:
+    """Layout without ``fit_age_s``, with an additional counter, and with another order of fields."""
 
     @pytest.fixture
     def before(self, samples):
-        """A partition of this version, and its bytes as the other version would have written them."""
+        """Return a partition of this version, and its checkpoint as the other version would have written it."""
         stream = Stream(Partition(5, table))
         deliver(stream, "a", blocks_of(samples[:3000]))
         state = stream.partition.state("a")
-        described = json.loads(PRESENT)
-        (estimator,) = (part for name, part, _ in described if name == "estimator")
+        layout = json.loads(CURRENT_LAYOUT)
+        (estimator,) = (part for name, part, _ in layout if name == "estimator")
         estimator[:] = [each for each in reversed(estimator) if each[0] != "fit_age_s"]
-        described[0][1].append(["once_known", "<i8", []])
-        dtype = np.dtype(checkpoint_format._fields(described))
-        bench = WorkRecord(dtype)
+        layout[0][1].append(["once_known", "<i8", []])
+        dtype = np.dtype(checkpoint_format._dtype_fields(layout))
+        work = WorkRecord(dtype)
         for part in dtype.names:
             for name in set(dtype[part].names) & set(PACK_STATE[part].names):
-                bench.record[part][name] = state[part][name]
-        bench.record["delivery"]["once_known"] = 7
-        former = PreviousLayoutState(layout_of(dtype), bench.take())
+                work.record[part][name] = state[part][name]
+        work.record["delivery"]["once_known"] = 7
+        former = PreviousLayoutState(layout_of(dtype), work.packed_bytes())
         snapshot = stream.partition.snapshot()
-        return stream, whole(replace(snapshot, packs={}, former={"a": former}))
+        return stream, to_bytes(replace(snapshot, packs={}, former={"a": former}))
 
-    def test_is_taken_over_by_the_names_of_its_fields_with_the_next_block(self, before, samples) -> None:
+    def test_next_block_migrates_the_record_by_field_names(self, before, samples) -> None:
         stream, data = before
-        went_on = stream.partition
-        took_over = Partition.restore(5, table, data)
+        same_version = stream.partition
+        other_version = Partition.restore(5, table, data)
         next_block = blocks_of(samples)[150]
-        sequence = took_over.sequence + 1
+        sequence = other_version.sequence + 1
         was, now = (
-            Estimate.model_validate_json(each.take("a", next_block, sequence).state) for each in (went_on, took_over)
+            Estimate.model_validate_json(each.take("a", next_block, sequence).state)
+            for each in (same_version, other_version)
         )
         assert now.soc == pytest.approx(was.soc, abs=0.005)
         assert now.soc_std < 0.05
         assert now.charge_out_ah == pytest.approx(was.charge_out_ah)
-        assert took_over.counters["taken_over"] == 1
-        assert took_over.snapshot().former == {}
+        assert other_version.counters["taken_over"] == 1
+        assert other_version.snapshot().former == {}
 
-    def test_stays_as_it_is_until_then(self, before, samples) -> None:
+    def test_record_stays_unchanged_until_a_block_is_processed(self, before, samples) -> None:
         _, data = before
         partition = Partition.restore(5, table, data)
         blocks = blocks_of(samples)
         assert partition.take("a", blocks[3], partition.sequence + 1).state is None
-        assert partition.take("a", blocks[155], partition.sequence + 1).awaits.number == 3000 // SAMPLES + 1
+        assert partition.take("a", blocks[155], partition.sequence + 1).reply.number == 3000 // SAMPLES + 1
         assert partition.counters["packs"] == 1
         assert partition.snapshot().former == read_checkpoint(data).former
-        again = Partition.restore(5, table, whole(partition.snapshot()))
+        again = Partition.restore(5, table, to_bytes(partition.snapshot()))
         assert again.take("a", blocks[150], again.sequence + 1).state
 
-    def test_goes_on_without_a_block_that_never_comes(self, before, samples) -> None:
+    def test_continues_after_a_lost_block(self, before, samples) -> None:
         _, data = before
         partition = Partition.restore(5, table, data)
         behind = blocks_of(samples)[151]
-        states = [partition.take("a", behind, partition.sequence + 1).state for _ in range(MAX_PASSED)]
-        assert [state is None for state in states] == (MAX_PASSED - 1) * [True] + [False]
+        states = [partition.take("a", behind, partition.sequence + 1).state for _ in range(MAX_EARLY_REPEATS)]
+        assert [state is None for state in states] == (MAX_EARLY_REPEATS - 1) * [True] + [False]
         assert partition.counters["lost_blocks"] == 1
         assert partition.snapshot().former == {}
 
-    def test_goes_on_where_the_block_behind_the_missing_one_is_refused(self, before, samples, monkeypatch) -> None:
+    def test_continues_after_a_lost_and_a_rejected_block(self, before, samples, monkeypatch) -> None:
         _, data = before
         partition = Partition.restore(5, table, data)
         behind, following = blocks_of(samples)[151:153]
-        with monkeypatch.context() as refusing:
-            refusing.setattr("bms_estimator.fleet.worker.partition.density_fault", lambda _: "too many samples")
-            for _ in range(MAX_PASSED):
+        with monkeypatch.context() as patched:
+            patched.setattr("bms_estimator.fleet.worker.partition.density_fault", lambda _: "too many samples")
+            for _ in range(MAX_EARLY_REPEATS):
                 partition.take("a", behind, partition.sequence + 1)
         assert partition.take("a", following, partition.sequence + 1).state
         assert (partition.counters["lost_blocks"], partition.counters["too_dense"]) == (1, 1)
 
-    def test_whose_bytes_are_none_of_its_layout_begins_anew(self, samples) -> None:
+    def test_invalid_record_is_reset(self, samples) -> None:
         former = PreviousLayoutState(layout_of(np.dtype([("x", "<f8")])), b"1234567")
-        partition = Partition.restore(5, table, whole(PartitionCheckpoint(5, 0, former={"a": former})))
+        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, former={"a": former})))
         assert partition.take("a", blocks_of(samples)[0], 1).state
         assert partition.counters["damaged_states"] == 1

@@ -14,19 +14,19 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.worker import Options, work
-from tests.fleet.engine import running
-from tests.fleet.workers import PERIOD_S, SAMPLES, block, end_states, estimated, know, send, until
+from tests.fleet.nats_cluster import running
+from tests.fleet.workers import PERIOD_S, SAMPLES, block, end_states, estimated, load_packs, send, until
 from tests.patience import LONG_S
 
 STATES = f"OBJ_{subjects.STATES_BUCKET}"
 CHUNKS = 300_000
-"""More than one message of the object store."""
+"""Size of a checkpoint [bytes], more than one message of the object store."""
 
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("engine"), partitions=2) as engine:
-        yield engine.url
+    with running(tmp_path_factory.mktemp("cluster"), partitions=2) as cluster:
+        yield cluster.url
 
 
 @pytest.fixture
@@ -36,18 +36,18 @@ async def nc(url) -> AsyncIterator[Client]:
         yield nc
 
 
-async def _keeping(nc: Client, worker: str) -> CheckpointStore:
+async def _checkpoint_store(nc: Client, worker: str) -> CheckpointStore:
     js = nc.jetstream()
     states = await js.object_store(subjects.STATES_BUCKET)
     return CheckpointStore(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
 
 
-async def _load(keeping: CheckpointStore, claim: Claim) -> list[bytes]:
-    return [data async for _, data in keeping.load(claim)]
+async def _load(store: CheckpointStore, claim: Claim) -> list[bytes]:
+    return [data async for _, data in store.load(claim)]
 
 
-async def _chunks(nc: Client, name: str) -> str:
-    """Subject of an object's pieces."""
+async def _chunk_subject(nc: Client, name: str) -> str:
+    """Return the subject of an object's chunks."""
     info = await (await nc.jetstream().object_store(subjects.STATES_BUCKET)).get_info(name)
     return f"$O.{subjects.STATES_BUCKET}.C.{info.nuid}"
 
@@ -60,30 +60,30 @@ async def _objects(nc: Client, partition: int) -> set[str]:
     }
 
 
-async def test_the_last_two_are_kept_and_a_damaged_one_is_said_and_left_out(nc):
-    keeping = await _keeping(nc, "a")
-    claim = await keeping.claim(7)
+async def test_last_two_are_stored_and_damaged_ones_are_logged_and_skipped(nc):
+    store = await _checkpoint_store(nc, "a")
+    claim = await store.claim(7)
     written = [bytes([i]) * CHUNKS for i in range(3)]
     for i, data in enumerate(written):
-        claim = await keeping.write(claim, i, iter([data[:1], b"", data[1:]]))
-    assert await _load(keeping, claim) == [written[2], written[1]]
+        claim = await store.write(claim, i, iter([data[:1], b"", data[1:]]))
+    assert await _load(store, claim) == [written[2], written[1]]
     newest, oldest = claim.pointer.kept
     assert await _objects(nc, 7) == {newest.object, oldest.object}
 
-    subject = await _chunks(nc, newest.object)
-    await nc.jetstream().purge_stream(STATES, subject=subject, keep=1)  # a piece is missing
+    subject = await _chunk_subject(nc, newest.object)
+    await nc.jetstream().purge_stream(STATES, subject=subject, keep=1)  # a chunk is missing
     with capture_logs() as logs:
-        assert await _load(keeping, claim) == [written[1]]
+        assert await _load(store, claim) == [written[1]]
     assert logs[0]["event"].startswith("a checkpoint is damaged")
     assert logs[0]["object"] == newest.object
-    subject = await _chunks(nc, oldest.object)
-    await nc.jetstream().purge_stream(STATES, subject=subject)  # all are, and others are there
+    subject = await _chunk_subject(nc, oldest.object)
+    await nc.jetstream().purge_stream(STATES, subject=subject)  # all chunks are replaced
     await nc.jetstream().publish(subject, b"x" * CHUNKS)
-    assert await _load(keeping, claim) == []
+    assert await _load(store, claim) == []
 
 
-async def test_who_lost_the_partition_cannot_write_and_leaves_nothing_behind(nc):
-    slow, quick = await _keeping(nc, "slow"), await _keeping(nc, "quick")
+async def test_fenced_worker_cannot_write_and_leaves_no_object(nc):
+    slow, quick = await _checkpoint_store(nc, "slow"), await _checkpoint_store(nc, "quick")
     claim = await slow.write(await slow.claim(8), 1, iter([b"1"]))
     theirs = await quick.claim(8)
     assert await quick.confirm_claim(theirs) == theirs
@@ -93,7 +93,7 @@ async def test_who_lost_the_partition_cannot_write_and_leaves_nothing_behind(nc)
         await slow.write(claim, 2, iter([b"2"]))
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
     assert await _load(quick, theirs) == [b"1"]
-    # killed between two pieces of an object
+    # A worker was killed between two chunks of an object.
     await nc.jetstream().publish(f"$O.{subjects.STATES_BUCKET}.C.{theirs.pointer.next}", b"3")
     assert await _load(slow, await slow.claim(8)) == [b"1"]
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
@@ -101,26 +101,26 @@ async def test_who_lost_the_partition_cannot_write_and_leaves_nothing_behind(nc)
     assert sum(".C.p8-" in subject for subject in left) == 1
 
 
-async def test_a_write_whose_answer_was_lost_is_known_to_be_ours(nc):
-    keeping, other = await _keeping(nc, "a"), await _keeping(nc, "b")
-    claim = await keeping.claim(9)
-    await keeping.write(claim, 1, iter([b"1"]))
-    written = await keeping.write(claim, 2, iter([b"2"]))  # as whoever has heard nothing of the first
-    assert await _load(keeping, written) == [b"2", b"1"]
+async def test_write_with_a_lost_response_is_recognized(nc):
+    store, other = await _checkpoint_store(nc, "a"), await _checkpoint_store(nc, "b")
+    claim = await store.claim(9)
+    await store.write(claim, 1, iter([b"1"]))
+    written = await store.write(claim, 2, iter([b"2"]))  # with the old claim, as after a lost response
+    assert await _load(store, written) == [b"2", b"1"]
     assert await _objects(nc, 9) == {kept.object for kept in written.pointer.kept}
-    await keeping.write(written, 3, iter([b"3"]))
+    await store.write(written, 3, iter([b"3"]))
     theirs = await other.claim(9)
     with pytest.raises(FencedError, match="b"):
-        await keeping.write(written, 4, iter([b"4"]))
+        await store.write(written, 4, iter([b"4"]))
     assert await _load(other, theirs) == [b"3", b"2"]
 
 
-async def test_a_worker_waits_for_streams_and_settings_and_goes_on_from_what_is_whole(tmp_path):
-    with running(tmp_path, partitions=1) as engine:
-        nc = await nats.connect(engine.url)
+async def test_worker_waits_for_streams_and_rows_and_continues_from_an_intact_checkpoint(tmp_path):
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await nats.connect(cluster.url)
         stop = asyncio.Event()
         with capture_logs() as logs:
-            working = asyncio.create_task(work(Options(engine.url, "w"), stop))
+            working = asyncio.create_task(work(Options(cluster.url, "w"), stop))
             await until(lambda: any("fleet serve" in line.get("reason", "") for line in logs), lambda: logs)
             await make_streams(nc, partitions=1)
             unknown = await nc.subscribe(subjects.unknown())
@@ -128,31 +128,31 @@ async def test_a_worker_waits_for_streams_and_settings_and_goes_on_from_what_is_
             message = await unknown.next_msg(LONG_S)
             assert (message.subject, b"not in the table" in message.data) == (subjects.unknown("p1"), True)
             states = await nc.subscribe(subjects.published("p1", "state"))
-            known = await know(nc, ["p1"])
-            await _until_block(states, 1)  # that was held
+            known = await load_packs(nc, ["p1"])
+            await _until_block(states, 1)  # deferred until the pack was known
             await send(nc, "p2", block("p2", 1))
             await unknown.next_msg(LONG_S)
             stop.set()
             await working
         late = await nc.subscribe(subjects.published("p2", "state"))
-        known = await know(nc, ["p1", "p2"])
+        known = await load_packs(nc, ["p1", "p2"])
         number = 1
         for damaged in (0, 1, 2):
             number += 1
-            keeping = await _keeping(nc, "test")
-            for kept in (await keeping.claim(0)).pointer.kept[:damaged]:
-                await nc.jetstream().purge_stream(STATES, subject=await _chunks(nc, kept.object))
+            store = await _checkpoint_store(nc, "test")
+            for kept in (await store.claim(0)).pointer.kept[:damaged]:
+                await nc.jetstream().purge_stream(STATES, subject=await _chunk_subject(nc, kept.object))
             stop = asyncio.Event()
             with capture_logs() as logs:
-                working = asyncio.create_task(work(Options(engine.url, "w"), stop))
+                working = asyncio.create_task(work(Options(cluster.url, "w"), stop))
                 await send(nc, "p1", block("p1", number))
                 await _until_block(states, number)
                 stop.set()
                 await working
-            # each is said again where the worker has to begin again
+            # a damaged checkpoint may be logged again when the worker is fenced and starts again
             assert len({line["object"] for line in logs if "is damaged" in line["event"]}) == damaged
             assert any("from its beginning" in line["event"] for line in logs) == (damaged == 2)
-        await _until_block(late, 1)  # though none came after it became known
+        await _until_block(late, 1)  # although no block arrived after the pack became known
         state = (await end_states(nc, known, 1))[0].state("p1")
         assert state is not None
         assert state["estimator"].tobytes() == estimated(known, "p1", number)
@@ -160,6 +160,6 @@ async def test_a_worker_waits_for_streams_and_settings_and_goes_on_from_what_is_
 
 
 async def _until_block(states: Subscription, number: int) -> None:
-    """Until the state after a block is published."""
+    """Wait until the state after a block is published."""
     while json.loads((await states.next_msg(LONG_S)).data)["board_time_s"] < PERIOD_S * (SAMPLES * number - 1):
         pass

@@ -1,16 +1,16 @@
-"""The budget of processor time of each pack."""
+"""Processor-time budget of each pack."""
 
 import pytest
 
 from bms_estimator.fleet.worker import cpu_budget
-from bms_estimator.fleet.worker.cpu_budget import BURST_S, MAX_CHARGE_S, SHARE, CpuBudget
+from bms_estimator.fleet.worker.cpu_budget import BURST_S, MAX_CHARGE_S, MAX_CPU_FRACTION, CpuBudget
 
-FULL = round(BURST_S / MAX_CHARGE_S) + 1
-"""Charges of the maximum that exhaust a budget."""
+CHARGES = round(BURST_S / MAX_CHARGE_S) + 1
+"""Number of maximum charges that exhaust a budget."""
 
 
 class Time:
-    """A clock that is set."""
+    """Manually set clock."""
 
     now_s = 0.0
 
@@ -18,19 +18,19 @@ class Time:
         return self.now_s
 
 
-def test_a_pack_that_has_used_its_time_waits_for_it_and_no_other_does() -> None:
+def test_only_the_pack_that_exhausted_its_budget_waits() -> None:
     time = Time()
     budget = CpuBudget(time)
-    for _ in range(FULL):
+    for _ in range(CHARGES):
         assert not budget.is_exhausted("flood")
         budget.charge("flood", 100.0)
     assert budget.is_exhausted("flood")
     assert not budget.is_exhausted("honest")
-    time.now_s = (FULL * MAX_CHARGE_S - BURST_S) / SHARE + 0.1
+    time.now_s = (CHARGES * MAX_CHARGE_S - BURST_S) / MAX_CPU_FRACTION + 0.1
     assert not budget.is_exhausted("flood")
 
 
-def test_a_source_of_1000_hz_stays_within_its_budget() -> None:
+def test_source_at_1000_hz_stays_within_its_budget() -> None:
     time = Time()
     budget = CpuBudget(time)
     for number in range(600):
@@ -46,4 +46,4 @@ def test_idle_packs_are_not_stored(monkeypatch: pytest.MonkeyPatch) -> None:
     for number in range(100):
         time.now_s += 1.0
         budget.charge(f"p{number}", 0.01)
-    assert len(budget._spent) <= 11
+    assert len(budget._levels) <= 11

@@ -1,4 +1,4 @@
-"""A worker and the server killed while edges send: no sample is lost or counted twice. ``make fleet-kills`` is the long one."""
+"""Worker and server killed while edges send: no sample is lost or counted twice. ``make fleet-kills`` runs longer."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from tests.benchmarks.fleet_kills import Plan, run
 pytestmark = pytest.mark.thorough
 
 
-def test_end_states_are_those_of_all_samples_whoever_is_killed() -> None:
+def test_kills_do_not_change_the_final_states() -> None:
     plan = Plan(nodes=1, kills=2, packs=8, seed=3, mean_s=0.2, partitions=4)
     outcome = run(plan)
     assert outcome.wrong == []

@@ -1,4 +1,4 @@
-"""Preparation before a worker connects, so that nothing delays it later."""
+"""Kernel warm-up before a worker connects."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ import sys
 from bms_estimator.fleet.worker import kernel_warm_up
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 
-KINDS = """
+COUNT_SIGNATURES = """
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.kernels import packed_record
 from bms_estimator.kernels.accumulators import charge_energy, hour, publish_window
@@ -16,16 +16,16 @@ print([len(kernel.signatures) for kernel in kernels])
 """
 
 
-def test_a_block_and_the_row_of_an_hour_go_through_it(monkeypatch) -> None:
-    made = []
+def test_warm_up_processes_a_block_and_an_hour(monkeypatch) -> None:
+    results = []
     take = kernel_warm_up.Partition.take
-    monkeypatch.setattr(kernel_warm_up.Partition, "take", lambda *args: made.append(take(*args)) or made[-1])
+    monkeypatch.setattr(kernel_warm_up.Partition, "take", lambda *args: results.append(take(*args)) or results[-1])
     load_fleet_kernels()
-    assert all(each.state and each.parameters for each in made)
-    assert len(made[-1].hours) == 1
+    assert all(each.state and each.parameters for each in results)
+    assert len(results[-1].hours) == 1
 
 
-def test_each_kernel_is_there_for_one_kind_of_arguments() -> None:
-    """In a separate process, because others here may have called them with other arrays."""
-    done = subprocess.run([sys.executable, "-c", KINDS], check=True, capture_output=True, text=True)
+def test_each_kernel_is_compiled_for_one_signature() -> None:
+    """Run in a separate process, because other tests may have called the kernels with other array types."""
+    done = subprocess.run([sys.executable, "-c", COUNT_SIGNATURES], check=True, capture_output=True, text=True)
     assert done.stdout == "[1, 1, 1, 1, 1]\n"

@@ -1,4 +1,4 @@
-"""A partition: after any event each pack's state equals that of one estimator over its samples."""
+"""Partition: after any event each pack's state equals that of one estimator run over its samples."""
 
 import json
 from dataclasses import replace
@@ -13,8 +13,8 @@ from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import estimator_of, new_estimator
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.worker import partition as partition_module
-from bms_estimator.fleet.worker.block_order import ASKED_EACH, MAX_PASSED, TOLD_EACH
-from bms_estimator.fleet.worker.block_processor import AT_ONCE, BlockProcessor
+from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, MAX_EARLY_REPEATS, REQUEST_EVERY
+from bms_estimator.fleet.worker.block_processor import MAX_PART_SAMPLES, BlockProcessor
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import load_any
@@ -23,7 +23,7 @@ from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.sources.captures.replay import Replay
 from tests.estimator.simulated_cell import pulses
-from tests.fleet.an_edge import CELL, SETTINGS, STORE, Stream, blocks_of, deliver, one_block, table
+from tests.fleet.partition_stream import CELL, SETTINGS, STORE, Stream, blocks_of, deliver, one_block, table
 
 HOUR_NS = 3600 * 10**9
 
@@ -38,37 +38,37 @@ def stream():
     return Stream(Partition(5, table))
 
 
-def estimated(samples):
+def record_of_one_run(samples):
     estimator = estimator_of(SETTINGS, CELL)
     estimator.run(samples)
     return estimator.record
 
 
-def assert_same(stream: Stream, pack: str, record) -> None:
+def assert_state_equals(stream: Stream, pack: str, record) -> None:
     state = stream.partition.state(pack)
     assert state is not None
     assert state["estimator"].tobytes() == record.tobytes()
 
 
-def test_duplicates_gaps_and_resends_over_a_restart_at_every_message_leave_what_one_run_leaves(stream, samples) -> None:
+def test_duplicates_gaps_and_resends_with_a_restart_at_every_message_give_the_state_of_one_run(stream, samples) -> None:
     blocks = blocks_of(samples[:1200])
     others = blocks_of(pulses(soc=0.7, hours=0.4, seed=2)[0])
     order = [1, 1, 2, 5, 6, 3, 4, 4, 2, 9, 10, 11, 12, 13, 14, 5, 6, 7]
-    for place, number in enumerate(order):
+    for index, number in enumerate(order):
         stream.send("a", blocks[number - 1])
-        stream.send("b", others[place])
+        stream.send("b", others[index])
         stream.take_over()
     deliver(stream, "a", blocks)
     stream.take_over()
-    assert_same(stream, "a", estimated(samples[:1200]))
-    assert_same(stream, "b", estimated(pulses(soc=0.7, hours=0.4, seed=2)[0][: 20 * len(order)]))
+    assert_state_equals(stream, "a", record_of_one_run(samples[:1200]))
+    assert_state_equals(stream, "b", record_of_one_run(pulses(soc=0.7, hours=0.4, seed=2)[0][: 20 * len(order)]))
     counters = stream.partition.counters
     assert counters["samples"] == 1200 + 20 * len(order)
     assert counters["lost_blocks"] == 0
     assert min(counters["resends"], counters["gaps"]) > 0
 
 
-class Recorded:
+class MemoryCapture:
     """A capture in memory."""
 
     fraction, implausible = 1.0, 0
@@ -80,18 +80,18 @@ class Recorded:
         yield self._samples
 
 
-async def test_the_end_state_is_that_of_a_replay(stream, samples) -> None:
+async def test_final_state_equals_that_of_a_replay(stream, samples) -> None:
     deliver(stream, "a", blocks_of(samples))
     replayed = new_estimator(SETTINGS, CELL)
-    async for block in Replay(Recorded(samples)):
+    async for block in Replay(MemoryCapture(samples)):
         replayed.run(block)
-    assert_same(stream, "a", replayed.record)
+    assert_state_equals(stream, "a", replayed.record)
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.integers(-6, 6), max_size=MAX_PASSED - 2), st.data())
-def test_any_order_of_delivery_leaves_the_same(steps, data) -> None:
-    """An edge that jumps back and ahead at will, and workers that go on from any earlier snapshot."""
+@given(st.lists(st.integers(-6, 6), max_size=MAX_EARLY_REPEATS - 2), st.data())
+def test_any_order_of_delivery_gives_the_same_state(steps, data) -> None:
+    """An edge sends blocks in any order, and a worker continues from any earlier snapshot."""
     rows = pulses(soc=0.6, hours=0.1)[0]
     blocks, stream = blocks_of(rows, size=30), Stream(Partition(5, table))
     number, snapshots = 1, [stream.partition.snapshot()]
@@ -100,7 +100,7 @@ def test_any_order_of_delivery_leaves_the_same(steps, data) -> None:
         stream.send("a", blocks[number - 1])
         snapshots.append(stream.partition.snapshot())
     deliver(stream, "a", blocks)
-    assert_same(stream, "a", estimated(rows))
+    assert_state_equals(stream, "a", record_of_one_run(rows))
     assert stream.partition.counters["samples"] == rows.size
     snapshot = data.draw(st.sampled_from(snapshots))
     again = Partition.restore(5, table, b"".join(snapshot.chunks()))
@@ -112,7 +112,7 @@ def test_any_order_of_delivery_leaves_the_same(steps, data) -> None:
     assert again.snapshot().packs == stream.partition.snapshot().packs
 
 
-def test_a_snapshot_is_as_it_was_whatever_comes_later(stream, samples) -> None:
+def test_later_blocks_do_not_change_a_snapshot(stream, samples) -> None:
     blocks = blocks_of(samples[:200])
     deliver(stream, "a", blocks[:5])
     stream.send("unknown", blocks[0])
@@ -123,7 +123,7 @@ def test_a_snapshot_is_as_it_was_whatever_comes_later(stream, samples) -> None:
     assert b"".join(snapshot.chunks()) == before
 
 
-def test_a_message_that_was_taken_is_not_taken_again(samples) -> None:
+def test_processed_message_is_not_processed_again(samples) -> None:
     partition = Partition(0, table)
     data = one_block(samples[:20], 1)
     assert partition.take("a", data, 7).state
@@ -132,31 +132,31 @@ def test_a_message_that_was_taken_is_not_taken_again(samples) -> None:
     assert partition.counters["repeated"] == 1
 
 
-class TestWhatAnEdgeIsTold:
-    def test_at_first_and_at_each_tenth_block_what_is_safe(self, stream, samples) -> None:
+class TestReplies:
+    def test_first_and_each_tenth_block_confirm_earlier_ones(self, stream, samples) -> None:
         blocks = blocks_of(samples[:600])
-        told = {number: stream.send("a", data).awaits for number, data in enumerate(blocks, 1)}
-        assert [number for number, awaits in told.items() if awaits] == [1, *range(TOLD_EACH, 31, TOLD_EACH)]
-        assert (told[20].store, told[20].number, told[20].resend) == (STORE, 21, False)
+        replies = {number: stream.send("a", data).reply for number, data in enumerate(blocks, 1)}
+        assert [number for number, reply in replies.items() if reply] == [1, *range(CONFIRM_EVERY, 31, CONFIRM_EVERY)]
+        assert (replies[20].store, replies[20].number, replies[20].resend) == (STORE, 21, False)
         stream.take_over()
-        assert stream.send("a", one_block(samples[600:620], 31)).awaits.number == 32
+        assert stream.send("a", one_block(samples[600:620], 31)).reply.number == 32
 
-    def test_once_a_gap_and_each_fifth_block_that_is_ahead_where_to_send_from(self, stream, samples) -> None:
+    def test_each_gap_and_each_fifth_early_block_request_the_missing_one(self, stream, samples) -> None:
         blocks = blocks_of(samples[:400])
         stream.send("a", blocks[0])
-        told = [stream.send("a", data).awaits for data in blocks[4:16]]
-        assert [place for place, awaits in enumerate(told) if awaits] == [0, ASKED_EACH, 2 * ASKED_EACH]
-        assert all(awaits.resend and awaits.number == 2 for awaits in told if awaits)
+        replies = [stream.send("a", data).reply for data in blocks[4:16]]
+        assert [index for index, reply in enumerate(replies) if reply] == [0, REQUEST_EVERY, 2 * REQUEST_EVERY]
+        assert all(reply.resend and reply.number == 2 for reply in replies if reply)
 
-    def test_who_goes_back_to_a_former_store_hears_of_the_present_one(self, stream, samples) -> None:
+    def test_block_of_a_former_store_is_answered_with_the_present_store(self, stream, samples) -> None:
         stream.send("a", one_block(samples[:20], 1, STORE + 1))
-        awaits = stream.send("a", one_block(samples[:20], 10, STORE)).awaits
-        assert (awaits.store, awaits.number) == (STORE + 1, 2)
+        reply = stream.send("a", one_block(samples[:20], 10, STORE)).reply
+        assert (reply.store, reply.number) == (STORE + 1, 2)
         assert stream.partition.counters["former_store"] == 1
 
 
-class TestANewStore:
-    def test_is_a_gap_as_long_as_the_wall_clock_says(self, stream, samples) -> None:
+class TestNewStore:
+    def test_gap_length_follows_from_the_wall_clock(self, stream, samples) -> None:
         first, second = samples[:600], samples[600:1200].copy()
         second["time_s"] -= second["time_s"][0] - 3.0
         deliver(stream, "a", blocks_of(first))
@@ -165,51 +165,51 @@ class TestANewStore:
         estimator.run(first)
         estimator.resume(3600.0 + 3.0 - 599.0)
         estimator.run(second)
-        assert_same(stream, "a", estimator.record)
+        assert_state_equals(stream, "a", estimator.record)
 
-    def test_that_begins_before_the_last_sample_is_a_gap_of_which_nobody_knows_how_long(self, stream, samples) -> None:
+    def test_store_created_before_the_last_sample_is_a_gap_of_unknown_length(self, stream, samples) -> None:
         deliver(stream, "a", blocks_of(samples[:600]))
         deliver(stream, "a", blocks_of(samples[:60], STORE + 10**9))
         estimator = estimator_of(SETTINGS, CELL)
         estimator.run(samples[:600])
         estimator.resume(np.inf)
         estimator.run(samples[:60])
-        assert_same(stream, "a", estimator.record)
+        assert_state_equals(stream, "a", estimator.record)
 
-    def test_takes_the_place_of_the_one_before_only_when_its_first_block_is_there(self, stream, samples) -> None:
+    def test_replaces_the_former_store_only_with_its_first_block(self, stream, samples) -> None:
         deliver(stream, "a", blocks_of(samples[:600]))
         later = blocks_of(samples[:200], STORE + HOUR_NS)
-        assert stream.send("a", later[3]).awaits.resend
+        assert stream.send("a", later[3]).reply.resend
         stream.take_over()
         deliver(stream, "a", later)
         estimator = estimator_of(SETTINGS, CELL)
         estimator.run(samples[:600])
         estimator.resume(3600.0 - 599.0)
         estimator.run(samples[:200])
-        assert_same(stream, "a", estimator.record)
+        assert_state_equals(stream, "a", estimator.record)
 
 
-def test_what_never_comes_is_counted_and_the_rest_goes_on(stream, samples) -> None:
+def test_blocks_that_the_edge_no_longer_has_count_as_lost(stream, samples) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
     rest = blocks_of(samples[200:400], oldest=11)
-    assert stream.send("a", rest[3]).awaits.number == 11
+    assert stream.send("a", rest[3]).reply.number == 11
     deliver(stream, "a", rest, first=11)
     estimator = estimator_of(SETTINGS, CELL)
     estimator.run(samples[:100])
     estimator.run(samples[200:400])
-    assert_same(stream, "a", estimator.record)
+    assert_state_equals(stream, "a", estimator.record)
     assert stream.partition.counters["lost_blocks"] == 5
     assert json.loads(stream.send("a", one_block(samples[400:420], 21)).state)["frames_lost"] == 5
 
 
 @pytest.mark.parametrize("refused", [None, b"damaged"])
-def test_a_block_that_the_edge_sends_in_vain_is_lost_and_the_rest_goes_on(stream, samples, refused) -> None:
+def test_block_that_is_repeatedly_rejected_counts_as_lost(stream, samples, refused) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
-    awaits = stream.send("a", blocks[6]).awaits
-    assert (awaits.number, awaits.resend) == (6, True)
-    for _ in range(MAX_PASSED - 2):
+    reply = stream.send("a", blocks[6]).reply
+    assert (reply.number, reply.resend) == (6, True)
+    for _ in range(MAX_EARLY_REPEATS - 2):
         if refused:
             stream.send("a", refused)
         assert stream.send("a", blocks[6]).state is None
@@ -219,14 +219,14 @@ def test_a_block_that_the_edge_sends_in_vain_is_lost_and_the_rest_goes_on(stream
     estimator = estimator_of(SETTINGS, CELL)
     estimator.run(samples[:100])
     estimator.run(samples[120:400])
-    assert_same(stream, "a", estimator.record)
+    assert_state_equals(stream, "a", estimator.record)
     assert stream.partition.counters["lost_blocks"] == 1
 
 
-def test_several_blocks_that_never_come_are_lost_and_the_rest_goes_on(stream, samples) -> None:
+def test_several_blocks_that_never_arrive_count_as_lost(stream, samples) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
-    for _ in range(MAX_PASSED - 1):
+    for _ in range(MAX_EARLY_REPEATS - 1):
         assert stream.send("a", blocks[8]).state is None
         assert stream.send("a", blocks[7]).state is None
     assert stream.send("a", blocks[7]).state
@@ -235,15 +235,15 @@ def test_several_blocks_that_never_come_are_lost_and_the_rest_goes_on(stream, sa
     estimator = estimator_of(SETTINGS, CELL)
     estimator.run(samples[:100])
     estimator.run(samples[140:400])
-    assert_same(stream, "a", estimator.record)
+    assert_state_equals(stream, "a", estimator.record)
 
 
-class TestWhatIsPublished:
-    def test_the_state_is_that_of_run_for_the_block(self, samples) -> None:
+class TestPublishedMessages:
+    def test_state_equals_that_of_one_run(self, samples) -> None:
         stream = Stream(Partition(5, table, wall=lambda: 2e9))
         deliver(stream, "a", blocks_of(samples[:580]))
-        taken = stream.send("a", one_block(samples[580:600], 30))
-        state = Estimate.model_validate_json(taken.state)
+        result = stream.send("a", one_block(samples[580:600], 30))
+        state = Estimate.model_validate_json(result.state)
         last = estimator_of(SETTINGS, CELL).run(samples[:600])[-1]
         assert (state.soc, state.soc_std, state.stability_margin) == (
             last["soc"],
@@ -256,26 +256,26 @@ class TestWhatIsPublished:
         assert (state.sample_rate_hz, state.frames_received, state.frames_lost) == (1.0, 30, 0)
         assert (state.time, state.publish_time) == ("2024-10-04T00:09:59.000Z", "2033-05-18T03:33:20.000Z")
 
-    def test_parameters_and_the_finished_hour_at_each_new_one(self, stream, samples) -> None:
-        made = [stream.send("a", data) for data in blocks_of(samples)]
-        assert [place for place, each in enumerate(made) if each.parameters] == [0, 180, 360]
-        for each in made:
+    def test_parameters_and_finished_hour_at_each_new_hour(self, stream, samples) -> None:
+        results = [stream.send("a", data) for data in blocks_of(samples)]
+        assert [index for index, each in enumerate(results) if each.parameters] == [0, 180, 360]
+        for each in results:
             if each.parameters:
                 ParameterReport.model_validate_json(each.parameters)
-        rows = [row for each in made for row in each.hours]
+        rows = [row for each in results for row in each.hours]
         assert [name for name, _ in rows] == ["a.480000", "a.480001"]
         hours = [Hour.model_validate_json(row) for _, row in rows]
         assert [(row.pack, row.samples, row.seen_s) for row in hours] == [("a", 3600, 3599.0), ("a", 3600, 3600.0)]
         assert hours[0].soc == estimator_of(SETTINGS, CELL).run(samples[:3600])["soc"][-1]
 
-    def test_of_samples_that_cannot_be_used_nothing(self, stream, samples) -> None:
+    def test_nothing_for_unusable_samples(self, stream, samples) -> None:
         rows = samples[:20].copy()
         rows["voltage_v"] = 0.0
-        taken = stream.send("a", one_block(rows, 1))
-        assert (taken.state, taken.parameters) == (None, None)
+        result = stream.send("a", one_block(rows, 1))
+        assert (result.state, result.parameters) == (None, None)
         assert stream.partition.counters["dropped_samples"] == 20
 
-    def test_a_fuel_cell_and_a_pack_without_identifier_are_estimated_too(self, samples) -> None:
+    def test_fuel_cell_and_pack_without_identifier(self, samples) -> None:
         cell = load_any("pem_30w")
         plain = Settings(identifier=IdentifierSettings(enabled=False))
         packs = {"stack": (Settings(), cell), "plain": (plain, CELL)}
@@ -283,22 +283,22 @@ class TestWhatIsPublished:
         stack = samples[:600].copy()
         stack["voltage_v"], stack["current_a"] = cell.cell.nominal_voltage_v, 1.0
         for name, rows in {"stack": stack, "plain": samples[:600]}.items():
-            taken = [stream.send(name, data) for data in blocks_of(rows)]
+            result = [stream.send(name, data) for data in blocks_of(rows)]
             stream.take_over()
             estimator = estimator_of(*packs[name])
             estimator.run(rows)
-            assert_same(stream, name, estimator.record)
-            Estimate.model_validate_json(taken[-1].state)
+            assert_state_equals(stream, name, estimator.record)
+            Estimate.model_validate_json(result[-1].state)
 
 
-class TestAPackThatTheTableDoesNotKnow:
-    def test_waits_and_is_taken_once_it_is_known(self, samples) -> None:
+class TestUnknownPack:
+    def test_is_deferred_until_it_is_known(self, samples) -> None:
         packs = {}
         stream = Stream(Partition(5, packs.get))
         blocks = blocks_of(samples[:400])
         for data in blocks[:10]:
-            taken = stream.send("a", data)
-            assert (taken.state, taken.awaits) == (None, None)
+            result = stream.send("a", data)
+            assert (result.state, result.reply) == (None, None)
             stream.take_over()
         assert stream.partition.unknown == ("a",)
         assert stream.take_deferred() == []
@@ -306,9 +306,9 @@ class TestAPackThatTheTableDoesNotKnow:
         assert [bool(each.state) for each in stream.take_deferred()] == 10 * [True]
         assert stream.partition.unknown == ()
         deliver(stream, "a", blocks)
-        assert_same(stream, "a", estimated(samples[:400]))
+        assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
 
-    def test_is_taken_in_order_where_it_became_known_between_two_blocks(self, samples) -> None:
+    def test_becomes_known_between_two_blocks(self, samples) -> None:
         packs = {}
         stream = Stream(Partition(5, packs.get))
         blocks = blocks_of(samples[:200])
@@ -316,10 +316,10 @@ class TestAPackThatTheTableDoesNotKnow:
             stream.send("a", data)
         packs["a"] = SETTINGS, CELL
         stream.send("a", blocks[-1])
-        assert stream.take_deferred()[-1].awaits.number == len(blocks) + 1
-        assert_same(stream, "a", estimated(samples[:200]))
+        assert stream.take_deferred()[-1].reply.number == len(blocks) + 1
+        assert_state_equals(stream, "a", record_of_one_run(samples[:200]))
 
-    def test_no_more_names_wait_than_can_be_stored(self, monkeypatch: pytest.MonkeyPatch, samples) -> None:
+    def test_number_of_deferred_packs_is_limited(self, monkeypatch: pytest.MonkeyPatch, samples) -> None:
         monkeypatch.setattr(partition_module, "MAX_UNKNOWN", 3)
         packs = {}
         stream = Stream(Partition(5, packs.get))
@@ -329,13 +329,13 @@ class TestAPackThatTheTableDoesNotKnow:
         assert stream.partition.unknown == ("pack0", "pack1", "pack2")
         assert stream.partition.counters["not_deferred"] == 2
         packs["pack4"] = SETTINGS, CELL
-        assert stream.send("pack4", data).awaits.number == 2
+        assert stream.send("pack4", data).reply.number == 2
 
 
-class TestAPackThatHasToWait:
+class TestDeferredPack:
     @settings(max_examples=25, deadline=None)
     @given(st.lists(st.sampled_from(["send", "defer", "take", "restart"]), max_size=40))
-    def test_leaves_the_same_whenever_it_waits_and_whoever_goes_on(self, steps) -> None:
+    def test_state_does_not_depend_on_deferrals_and_takeovers(self, steps) -> None:
         rows = pulses(soc=0.6, hours=0.1)[0]
         blocks, stream, number = blocks_of(rows, size=30), Stream(Partition(5, table)), 0
         for step in steps:
@@ -344,36 +344,36 @@ class TestAPackThatHasToWait:
             elif step == "restart":
                 stream.take_over()
             elif number < len(blocks):
-                stream.send("a", blocks[number], waits=step == "defer")
+                stream.send("a", blocks[number], defer=step == "defer")
                 number += 1
         stream.take_deferred()
         for data in blocks[number:]:
             stream.send("a", data)
-        assert_same(stream, "a", estimated(rows))
+        assert_state_equals(stream, "a", record_of_one_run(rows))
         assert stream.partition.counters["samples"] == rows.size
         assert not stream.partition.deferred
 
-    def test_is_taken_in_order_and_turn_about_whoever_goes_on(self, stream, samples) -> None:
+    def test_packs_are_served_in_turn_and_in_order_after_a_takeover(self, stream, samples) -> None:
         blocks, others = blocks_of(samples[:400]), blocks_of(pulses(soc=0.7, hours=0.2, seed=2)[0][:400])
         for pack, data in [("a", data) for data in blocks[:10]] + [("b", data) for data in others[:10]]:
-            stream.send(pack, data, waits=True)
+            stream.send(pack, data, defer=True)
         stream.take_over()
-        assert [taken.pack for taken in stream.take_deferred()] == 10 * ["a", "b"]
+        assert [result.pack for result in stream.take_deferred()] == 10 * ["a", "b"]
         stream.take_over()
         deliver(stream, "a", blocks[10:], first=11)
         deliver(stream, "b", others[10:], first=11)
-        assert_same(stream, "a", estimated(samples[:400]))
-        assert_same(stream, "b", estimated(pulses(soc=0.7, hours=0.2, seed=2)[0][:400]))
+        assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
+        assert_state_equals(stream, "b", record_of_one_run(pulses(soc=0.7, hours=0.2, seed=2)[0][:400]))
         assert "gaps" not in stream.partition.counters
 
 
-class TestOtherSettings:
+class TestChangedSettings:
     def take(self, stream, samples, first, last):
         for data in blocks_of(samples)[first:last]:
-            taken = stream.send("a", data)
-        return taken
+            result = stream.send("a", data)
+        return result
 
-    def test_of_another_cell_the_pack_begins_anew_and_goes_on_in_order(self, samples) -> None:
+    def test_another_cell_resets_the_state_but_not_the_block_order(self, samples) -> None:
         packs = {"a": (SETTINGS, CELL)}
         stream = Stream(Partition(5, packs.get))
         self.take(stream, samples, 0, 20)
@@ -383,31 +383,31 @@ class TestOtherSettings:
         self.take(stream, samples, 20, 30)
         estimator = estimator_of(SETTINGS, other)
         estimator.run(samples[400:600])
-        assert_same(stream, "a", estimator.record)
+        assert_state_equals(stream, "a", estimator.record)
         assert stream.partition.counters["begun_anew"] == 1
         assert stream.partition.state("a")["delivery"]["awaited"] == 31
 
     @pytest.mark.parametrize("taken_over", [False, True])
-    def test_of_another_tuning_the_pack_keeps_what_it_has_learned(self, samples, taken_over: bool) -> None:
+    def test_another_tuning_keeps_the_learned_values(self, samples, taken_over: bool) -> None:
         packs = {"a": (SETTINGS, CELL)}
         stream = Stream(Partition(5, packs.get))
         self.take(stream, samples, 0, 20)
         soc = stream.partition.state("a")["estimator"]["observer"]["soc"][0]
         packs["a"] = SETTINGS.model_copy(update={"observer": ObserverSettings(alpha=2.8)}), CELL
-        if taken_over:  # whoever takes over has the new settings at once
+        if taken_over:  # a new owner reads the new settings at once
             stream.take_over()
         else:
             stream.partition.settings_changed("a")
         stream.send("a", blocks_of(samples)[3])
-        taken = self.take(stream, samples, 20, 21)
-        state = Estimate.model_validate_json(taken.state)
+        result = self.take(stream, samples, 20, 21)
+        state = Estimate.model_validate_json(result.state)
         assert state.soc == pytest.approx(soc, abs=0.01)
         assert state.soc_std < 0.05
         assert stream.partition.counters["taken_over"] == 1
         self.take(stream, samples, 21, 40)
         assert stream.partition.counters["taken_over"] == 1
 
-    def test_of_a_pack_that_is_taken_out_of_the_table_the_state_stays(self, samples) -> None:
+    def test_state_survives_removal_from_the_table(self, samples) -> None:
         packs = {"a": (SETTINGS, CELL)}
         stream = Stream(Partition(5, packs.get))
         self.take(stream, samples, 0, 10)
@@ -417,19 +417,19 @@ class TestOtherSettings:
         packs["a"] = of_pack
         stream.partition.settings_changed("a")
         assert len(stream.take_deferred()) == 10
-        assert_same(stream, "a", estimated(samples[:400]))
+        assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
 
 
-class TestFaultsOfAnEdge:
+class TestInvalidBlocks:
     @pytest.mark.parametrize("data", [b"", b"BMSB", b"x" * 5000, bytes(range(256))])
-    def test_bytes_that_are_no_block_are_counted(self, stream, data: bytes) -> None:
+    def test_invalid_bytes_are_counted(self, stream, data: bytes) -> None:
         assert stream.send("a", data).state is None
         assert stream.send("unknown", data).state is None
         assert stream.partition.counters["damaged"] == 2
         assert stream.partition.unknown == ()
 
     @pytest.mark.parametrize("time_s", [np.nan, np.inf, -np.inf, -1.0, 1e300])
-    def test_times_that_cannot_be_are_none(self, stream, samples, time_s: float) -> None:
+    def test_implausible_timestamps_are_dropped(self, stream, samples, time_s: float) -> None:
         rows = samples[:600].copy()
         rows["time_s"][190:230] = time_s
         deliver(stream, "a", blocks_of(rows))
@@ -439,50 +439,52 @@ class TestFaultsOfAnEdge:
         assert stream.partition.counters["no_time"] == 40
         assert stream.partition.state("a")["estimator"]["observer"]["soc"] == estimator.state["soc"]
 
-    def test_a_block_with_which_something_fails_is_left_out_and_all_go_on(self, stream, samples, monkeypatch) -> None:
+    def test_block_with_an_internal_error_is_skipped(self, stream, samples, monkeypatch) -> None:
         def fail(*_args) -> None:
-            raise RuntimeError("of ours")
+            raise RuntimeError("internal error")
 
         blocks = blocks_of(samples[:400])
         deliver(stream, "a", blocks[:9])
         with monkeypatch.context() as patched, capture_logs() as logs:
-            patched.setattr(BlockProcessor, "_state", fail)  # after the estimator has taken the samples
-            taken = stream.send("a", blocks[9])
+            patched.setattr(BlockProcessor, "_state", fail)  # after the estimator has processed the samples
+            result = stream.send("a", blocks[9])
             stream.send("new", blocks[0])
-        assert (taken.state, taken.failed, taken.awaits.number, taken.awaits.resend) == (None, 1, 11, False)
+        assert (result.state, result.failed, result.reply.number, result.reply.resend) == (None, 1, 11, False)
         assert [(line["event"], line["pack"], line["number"]) for line in logs] == [
-            ("a block is left out", "a", 10),
-            ("a block is left out", "new", 1),
+            ("a block is skipped", "a", 10),
+            ("a block is skipped", "new", 1),
         ]
         assert stream.partition.counters["failed"] == 2
         other = json.loads(stream.send("b", one_block(samples[220:240], 1)).state)
-        assert other["voltage_v"] == pytest.approx(samples["voltage_v"][220:240].mean())  # nothing of theirs in it
+        assert other["voltage_v"] == pytest.approx(
+            samples["voltage_v"][220:240].mean()
+        )  # without samples of the skipped blocks
         deliver(stream, "a", blocks[10:], first=11)
         deliver(stream, "new", blocks[1:], first=2)
         estimator = estimator_of(SETTINGS, CELL)
         estimator.run(samples[:180])
         estimator.run(samples[200:400])
-        assert_same(stream, "a", estimator.record)
-        assert_same(stream, "new", estimated(samples[20:400]))
+        assert_state_equals(stream, "a", estimator.record)
+        assert_state_equals(stream, "new", record_of_one_run(samples[20:400]))
 
-    def test_an_edge_may_hear_what_time_it_is_after_it_began(self, stream, samples) -> None:
+    def test_clock_of_an_edge_is_set_after_its_start(self, stream, samples) -> None:
         rows = samples[:400].copy()
         rows["time_s"][200:] += 1.8e9  # since 1970
         deliver(stream, "a", blocks_of(rows, store=10**9))
         assert stream.partition.counters["dropped_samples"] == 0
-        assert_same(stream, "a", estimated(rows))
+        assert_state_equals(stream, "a", record_of_one_run(rows))
 
-    def test_time_that_goes_back_is_counted_as_it_is_everywhere(self, stream, samples) -> None:
+    def test_time_steps_back_are_counted(self, stream, samples) -> None:
         rows = samples[:600].copy()
         rows["time_s"][300:] -= 100.0
         deliver(stream, "a", blocks_of(rows))
-        assert_same(stream, "a", estimated(rows))
+        assert_state_equals(stream, "a", record_of_one_run(rows))
         assert stream.partition.counters["time_steps_back"] == 1
 
     @pytest.mark.parametrize("arrival_s", [-1e300, -1.0, 1e300])
-    def test_an_arrival_that_cannot_be_is_that_of_the_last_sample(self, stream, samples, arrival_s: float) -> None:
-        taken = stream.send("a", encode(Block(STORE, 1, 1, arrival_s, samples[:20])))
-        assert Estimate.model_validate_json(taken.state).time == "2024-10-04T00:00:19.000Z"
+    def test_implausible_arrival_is_replaced_by_the_last_sample_time(self, stream, samples, arrival_s: float) -> None:
+        result = stream.send("a", encode(Block(STORE, 1, 1, arrival_s, samples[:20])))
+        assert Estimate.model_validate_json(result.state).time == "2024-10-04T00:00:19.000Z"
         assert stream.partition.counters["no_arrival"] == 1
 
     @given(
@@ -499,7 +501,7 @@ class TestFaultsOfAnEdge:
         )
     )
     @settings(max_examples=60, deadline=None)
-    def test_nothing_that_a_header_or_a_sample_says_is_an_exception(self, sent) -> None:
+    def test_no_header_or_sample_value_raises(self, sent) -> None:
         stream = Stream(Partition(5, table))
         rows = pulses(hours=0.02)[0][:3]
         for store, number, oldest, arrival_s, time_s, value in sent:
@@ -510,19 +512,19 @@ class TestFaultsOfAnEdge:
             stream.take_over()
 
 
-def test_a_block_of_hours_is_as_many_small_ones(stream, samples) -> None:
+def test_long_block_equals_many_short_ones(stream, samples) -> None:
     long, short = stream.send("a", one_block(samples, 1)), Stream(Partition(5, table))
-    last = [short.send("a", data) for data in blocks_of(samples, size=AT_ONCE // 2)][-1]
-    assert_same(stream, "a", estimated(samples))
-    assert_same(short, "a", estimated(samples))
-    of_long, of_short = (json.loads(taken.state) for taken in (long, last))
+    last = [short.send("a", data) for data in blocks_of(samples, size=MAX_PART_SAMPLES // 2)][-1]
+    assert_state_equals(stream, "a", record_of_one_run(samples))
+    assert_state_equals(short, "a", record_of_one_run(samples))
+    of_long, of_short = (json.loads(result.state) for result in (long, last))
     assert of_long["sample_rate_hz"] == of_short["sample_rate_hz"] == 1.0
     assert of_long["voltage_v"] == pytest.approx(samples["voltage_v"].mean())
-    net = [told["charge_out_ah"] - told["charge_in_ah"] for told in (of_long, of_short)]
+    net = [state["charge_out_ah"] - state["charge_in_ah"] for state in (of_long, of_short)]
     assert net[0] == pytest.approx(net[1])
 
 
-def test_packs_of_many_types_do_not_disturb_each_other(samples) -> None:
+def test_packs_of_different_types_are_independent(samples) -> None:
     cells = {str(n): load_cell("ncr18650", 2.5 + 0.1 * n) for n in range(3)}
     packs = {name: (Settings(pack=PackSettings(name=name)), cell) for name, cell in cells.items()}
     stream = Stream(Partition(5, packs.get))
@@ -532,4 +534,4 @@ def test_packs_of_many_types_do_not_disturb_each_other(samples) -> None:
     for name, of_pack in packs.items():
         estimator = estimator_of(*of_pack)
         estimator.run(samples[:200])
-        assert_same(stream, name, estimator.record)
+        assert_state_equals(stream, name, estimator.record)

@@ -1,5 +1,4 @@
-"""Partitions without messages: messages of a dead worker, a partition with another owner meanwhile, and a block
-with an internal error."""
+"""Partition lease without deliveries: messages of a dead worker, another owner meanwhile, and an internal error."""
 
 import asyncio
 from pathlib import Path
@@ -16,8 +15,8 @@ from bms_estimator.fleet.worker.partition import Table
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.worker import Options, work
-from tests.fleet.engine import running
-from tests.fleet.workers import Heartbeats, block, end_states, estimated, know, send, until
+from tests.fleet.nats_cluster import running
+from tests.fleet.workers import Heartbeats, block, end_states, estimated, load_packs, send, until
 from tests.patience import end
 
 PARTITIONS = 4
@@ -25,79 +24,81 @@ PACKS = ["p1", "p2", "p3"]
 BLOCKS = 3
 
 
-async def test_what_a_dead_worker_was_given_is_taken_though_nobody_sends_more(tmp_path: Path) -> None:
-    with running(tmp_path, partitions=PARTITIONS) as engine:
-        nc = await nats.connect(engine.url)
+async def test_messages_delivered_to_a_dead_worker_are_processed_without_further_blocks(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=PARTITIONS) as cluster:
+        nc = await nats.connect(cluster.url)
         await make_streams(nc, partitions=PARTITIONS)
-        known = await know(nc, PACKS)
+        registry = await load_packs(nc, PACKS)
         used = {subjects.partition_of(pack, PARTITIONS) for pack in PACKS}
         assert 0 < len(used) < PARTITIONS
         for number in range(1, BLOCKS):
             for pack in PACKS:
                 await send(nc, pack, block(pack, number))
         for number in used:
-            await _be_given(nc, number, (BLOCKS - 1) * _packs_of(number))
+            await _receive_and_die(nc, number, (BLOCKS - 1) * _packs_of(number))
         stop = asyncio.Event()
-        working = asyncio.create_task(work(Options(engine.url, "w"), stop))
-        async with Heartbeats(nc) as heard:
-            await heard.until_held(PARTITIONS, "w")
-            await heard.until(lambda last: last["w"].blocks >= (BLOCKS - 1) * len(PACKS))
+        working = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+        async with Heartbeats(nc) as heartbeats:
+            await heartbeats.until_held(PARTITIONS, "w")
+            await heartbeats.until(lambda last: last["w"].blocks >= (BLOCKS - 1) * len(PACKS))
             for pack in PACKS:
                 await send(nc, pack, block(pack, BLOCKS))
-            await heard.until(lambda last: last["w"].blocks >= BLOCKS * len(PACKS))
+            await heartbeats.until(lambda last: last["w"].blocks >= BLOCKS * len(PACKS))
         stop.set()
         await working
-        states = await end_states(nc, known, PARTITIONS)
+        states = await end_states(nc, registry, PARTITIONS)
         for pack in PACKS:
             partition = states[subjects.partition_of(pack, PARTITIONS)]
             state = partition.state(pack)
             assert state is not None
-            assert state["estimator"].tobytes() == estimated(known, pack, BLOCKS)
+            assert state["estimator"].tobytes() == estimated(registry, pack, BLOCKS)
             assert partition.counters["blocks"] == BLOCKS * _packs_of(partition.number)
         await nc.close()
 
 
-async def test_a_fault_of_ours_costs_its_block_and_is_counted(tmp_path: Path) -> None:
-    with running(tmp_path, partitions=1) as engine:
-        nc = await nats.connect(engine.url)
+async def test_internal_error_skips_its_block_and_is_counted(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await nats.connect(cluster.url)
         await make_streams(nc, partitions=1)
-        known = await know(nc, PACKS)
+        registry = await load_packs(nc, PACKS)
 
         def table(pack: str):
-            return known(pack) if pack != "p1" else {}[pack]
+            return registry(pack) if pack != "p1" else {}[pack]
 
-        holding, taking = await _holding_first_blocks(nc, table)
-        assert holding.faults == 1
-        assert holding.partition
-        assert holding.partition.counters["blocks"] == len(PACKS) - 1
-        await end(taking)
+        lease, running_lease = await _lease_after_first_blocks(nc, table)
+        assert lease.faults == 1
+        assert lease.partition
+        assert lease.partition.counters["blocks"] == len(PACKS) - 1
+        await end(running_lease)
         await nc.close()
 
 
-async def test_who_was_fenced_out_and_is_given_the_partition_again_says_so_and_begins_from_what_is_kept(
+async def test_fenced_worker_that_owns_the_partition_again_continues_from_the_checkpoint(
     tmp_path: Path,
 ) -> None:
-    with running(tmp_path, partitions=1) as engine:
-        nc = await nats.connect(engine.url)
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await nats.connect(cluster.url)
         await make_streams(nc, partitions=1)
-        known = await know(nc, PACKS)
-        holding, taking = await _holding_first_blocks(nc, known)
-        await (await _keeping(nc, "other")).claim(0)  # and dies: its pin has lapsed when we ask for more
+        registry = await load_packs(nc, PACKS)
+        lease, running_lease = await _lease_after_first_blocks(nc, registry)
+        await (await _checkpoint_store(nc, "other")).claim(
+            0
+        )  # another worker claims the partition and dies; its pin lapses
 
-        def said() -> object:
-            holding.check_silence()
+        def is_fenced() -> object:
+            lease.check_silence()
             return any(line["event"].startswith("fenced out") and line["worker"] == "other" for line in logs)
 
         with capture_logs() as logs:
-            await until(said, lambda: logs)
-            await until(lambda: holding.blocks >= 2 * len(PACKS), lambda: holding.blocks)
-        assert holding.partition
-        assert holding.partition.counters["blocks"] == len(PACKS)
+            await until(is_fenced, lambda: logs)
+            await until(lambda: lease.blocks >= 2 * len(PACKS), lambda: lease.blocks)
+        assert lease.partition
+        assert lease.partition.counters["blocks"] == len(PACKS)
         for pack in PACKS:
-            state = holding.partition.state(pack)
+            state = lease.partition.state(pack)
             assert state is not None
-            assert state["estimator"].tobytes() == estimated(known, pack, 1)
-        await end(taking)
+            assert state["estimator"].tobytes() == estimated(registry, pack, 1)
+        await end(running_lease)
         await nc.close()
 
 
@@ -105,23 +106,23 @@ def _packs_of(partition: int) -> int:
     return sum(subjects.partition_of(pack, PARTITIONS) == partition for pack in PACKS)
 
 
-async def _holding_first_blocks(nc: Client, table: Table) -> tuple[PartitionLease, asyncio.Task[None]]:
-    """Run a worker's only partition once it has stepped the first block of each pack."""
+async def _lease_after_first_blocks(nc: Client, table: Table) -> tuple[PartitionLease, asyncio.Task[None]]:
+    """Return the running lease of the only partition after the first block of each pack."""
     inbox = nc.new_inbox()
-    holding = PartitionLease(
-        nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock(), partitions=1, is_busy=lambda: False
+    lease = PartitionLease(
+        nc, 0, table, await _checkpoint_store(nc, "w"), inbox, asyncio.Lock(), partitions=1, is_busy=lambda: False
     )
-    await _subscribe(nc, f"{inbox}.0.*", holding.receive)
-    taking = asyncio.create_task(holding.run())
+    await _subscribe(nc, f"{inbox}.0.*", lease.receive)
+    running_lease = asyncio.create_task(lease.run())
     for pack in PACKS:
         await send(nc, pack, block(pack, 1))
-    await holding.consumer.renew()
-    await until(lambda: holding.blocks >= len(PACKS), lambda: holding.blocks)
-    return holding, taking
+    await lease.consumer.renew()
+    await until(lambda: lease.blocks >= len(PACKS), lambda: lease.blocks)
+    return lease, running_lease
 
 
-async def _be_given(nc: Client, partition: int, messages: int) -> None:
-    """Be a worker that has all messages of a partition, and dies."""
+async def _receive_and_die(nc: Client, partition: int, messages: int) -> None:
+    """Receive all messages of a partition like a worker that then dies."""
     inbox = nc.new_inbox()
     consumer = PinnedConsumer(nc, partition, inbox)
     await _subscribe(nc, f"{inbox}.*", consumer.receive)
@@ -131,13 +132,13 @@ async def _be_given(nc: Client, partition: int, messages: int) -> None:
 
 
 async def _subscribe(nc: Client, subject: str, receive) -> None:
-    async def received(message: Msg) -> None:
+    async def on_message(message: Msg) -> None:
         receive(message)
 
-    await nc.subscribe(subject, cb=received)
+    await nc.subscribe(subject, cb=on_message)
 
 
-async def _keeping(nc: Client, worker: str) -> CheckpointStore:
+async def _checkpoint_store(nc: Client, worker: str) -> CheckpointStore:
     js = nc.jetstream()
     states = await js.object_store(subjects.STATES_BUCKET)
     return CheckpointStore(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)

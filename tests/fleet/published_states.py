@@ -1,4 +1,4 @@
-"""States of many packs, as workers publish them: spread as those of a fleet are, the same for the same seed."""
+"""States of many packs as workers publish them, with a realistic distribution that depends only on the seed."""
 
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ HOME, VAN, PLANT = (
     PackSpec(cell="nmc", capacity_ah=50.0, series=96),
 )
 SHARES = {"home": (HOME, 0.7), "van": (VAN, 0.25), "plant": (PLANT, 0.05)}
-MEASURED = {
+MEASURED_VALUES = {
     "home": {
         "voltage_v": 52.81,
         "voltage_estimate_v": 52.814,
@@ -40,11 +40,11 @@ MEASURED = {
         "temperature_c": 24.8,
     },
 }
-_MARK = 0.123456789012345
+_PLACEHOLDER = 0.123456789012345
 
 
 class Pack(NamedTuple):
-    """A pack, and what is said of it."""
+    """Pack with its published state."""
 
     name: str
     kind: PackSpec
@@ -52,49 +52,49 @@ class Pack(NamedTuple):
 
 
 def state(**values: Any) -> bytes:
-    """A state as it is published, with these values."""
+    """Return a published state with these values."""
     assert ONE.estimate
     return ONE.estimate.model_copy(update=values).model_dump_json().encode()
 
 
-def many(count: int, seed: int = 1) -> list[Pack]:
-    """So many packs."""
+def make_packs(count: int, seed: int = 1) -> list[Pack]:
+    """Return ``count`` packs."""
     rng = np.random.default_rng(seed)
     names = rng.choice(list(SHARES), count, p=[share for _, share in SHARES.values()])
     soc = np.where(names == "plant", rng.beta(9, 7, count), rng.beta(3.2, 1.9, count))
     std = rng.lognormal(np.where(names == "home", -4.1, -4.6), 0.45)
-    lowest = rng.uniform(0.01, 0.09, count)
-    marks = {"soc": _MARK, "soc_std": _MARK + 1.0, "stability_margin": _MARK + 2.0}
-    parts = {name: _parts(state(**marks, **MEASURED[name]), *marks.values()) for name in SHARES}
+    soc_minus_margin = rng.uniform(0.01, 0.09, count)
+    placeholders = {"soc": _PLACEHOLDER, "soc_std": _PLACEHOLDER + 1.0, "stability_margin": _PLACEHOLDER + 2.0}
+    parts = {name: _parts(state(**placeholders, **MEASURED_VALUES[name]), *placeholders.values()) for name in SHARES}
     packs = []
     for i, name in enumerate(names):
-        begin, of_soc, of_std, end = parts[name]
-        values = (f"{soc[i]:.6f}", f"{std[i]:.6f}", f"{soc[i] - lowest[i]:.6f}")
-        data = begin + values[0].encode() + of_soc + values[1].encode() + of_std + values[2].encode() + end
+        begin, after_soc, after_std, end = parts[name]
+        values = (f"{soc[i]:.6f}", f"{std[i]:.6f}", f"{soc[i] - soc_minus_margin[i]:.6f}")
+        data = begin + values[0].encode() + after_soc + values[1].encode() + after_std + values[2].encode() + end
         packs.append(Pack(f"{name}-{i:06d}", SHARES[name][0], data))
     return packs
 
 
-def _parts(data: bytes, *marks: float) -> list[bytes]:
+def _parts(data: bytes, *placeholders: float) -> list[bytes]:
     parts = []
-    for mark in marks:
-        before, _, data = data.partition(str(mark).encode())
+    for placeholder in placeholders:
+        before, _, data = data.partition(str(placeholder).encode())
         parts.append(before)
     return [*parts, data]
 
 
 async def publish(nc: Client, pack: str, data: bytes) -> None:
-    """A pack's state."""
+    """Publish a pack's state."""
     await nc.publish(subjects.published(pack, "state"), data)
 
 
-async def beat(nc: Client, worker: str, partitions: range, **values: Any) -> None:
-    """A worker's heartbeat."""
+async def publish_heartbeat(nc: Client, worker: str, partitions: range, **values: Any) -> None:
+    """Publish a worker's heartbeat."""
     heartbeat = Heartbeat(id=worker, started_s=0.0, partitions=tuple(partitions), **values)
     await nc.publish(subjects.worker(worker), heartbeat.model_dump_json().encode())
 
 
 async def load(nc: Client, packs: list[Pack]) -> None:
-    """Let the table have them."""
+    """Write the packs to the table."""
     rows = {kind: stored(kind) for kind in (HOME, VAN, PLANT)}
     await write_bucket(nc, subjects.PACKS_BUCKET, {pack.name: rows[pack.kind] for pack in packs})

@@ -1,4 +1,4 @@
-"""An edge's blocks, and an edge as its store and the worker's answers make it: it sends again from where it is asked."""
+"""Blocks of an edge, the stream of a partition, and an edge that resends as the partition requests."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import PackSettings, Settings
 
 STORE = 480_000 * 3600 * 10**9
-"""When a store was made: the begin of an hour [ns since 1970]."""
+"""Creation time of an edge's store, at the beginning of an hour [ns since 1970]."""
 CELL = load_cell("ncr18650")
 SETTINGS = Settings(pack=PackSettings(cell="ncr18650"))
 SAMPLES = 20
-"""Of a block."""
+"""Samples of a block."""
 
 
 def table(pack: str):
@@ -26,44 +26,44 @@ def one_block(samples: SampleBlock, number: int, store: int = STORE, oldest: int
 
 
 def blocks_of(samples: SampleBlock, store: int = STORE, oldest: int = 1, size: int = SAMPLES) -> list[bytes]:
-    """By their numbers, from ``oldest`` on."""
+    """Return the samples as blocks, numbered from ``oldest`` on."""
     parts = [samples[first : first + size] for first in range(0, samples.size, size)]
     return [one_block(part, number, store, oldest) for number, part in enumerate(parts, oldest)]
 
 
 class Stream:
-    """What a partition takes, with the sequence of the stream."""
+    """Messages of a partition with their stream sequence numbers."""
 
     def __init__(self, partition: Partition) -> None:
         self.partition = partition
         self.messages: list[tuple[str, bytes]] = []
 
-    def send(self, pack: str, data: bytes, *, waits: bool = False) -> BlockResult:
+    def send(self, pack: str, data: bytes, *, defer: bool = False) -> BlockResult:
         self.messages.append((pack, data))
-        if waits:
+        if defer:
             return self.partition.defer(pack, len(self.messages))
         return self.partition.take(pack, data, len(self.messages))
 
     def take_deferred(self, most: int = 10_000) -> list[BlockResult]:
-        """Take what waits of known packs, one message of each at a time."""
-        made: list[BlockResult] = []
-        while len(made) < most and (found := self.partition.deferred.next(self.partition.is_known)):
-            pack, span = found
+        """Process deferred messages of known packs, one message of each pack in turn."""
+        results: list[BlockResult] = []
+        while len(results) < most and (entry := self.partition.deferred.next(self.partition.is_known)):
+            pack, span = entry
             messages = enumerate(self.messages, 1)
-            data, sequence = next((data, n) for n, (of, data) in messages if of == pack and n >= span.first)
-            made.append(self.partition.take_deferred(pack, data, sequence))
-        return made
+            data, sequence = next((data, n) for n, (sender, data) in messages if sender == pack and n >= span.first)
+            results.append(self.partition.take_deferred(pack, data, sequence))
+        return results
 
     def take_over(self) -> None:
-        """Another worker goes on from a snapshot."""
+        """Restore the partition from a snapshot, as another worker does."""
         partition = self.partition
         data = b"".join(partition.snapshot().chunks())
         self.partition = Partition.restore(partition.number, partition._table, data)
 
 
 def deliver(stream: Stream, pack: str, blocks: list[bytes], first: int = 1) -> None:
-    """Send all, again from where the worker asks, until the last is taken."""
+    """Send all blocks, resending as requested, until the last one is processed."""
     number, last = first, first + len(blocks) - 1
     while number <= last:
-        awaits = stream.send(pack, blocks[number - first]).awaits
-        number = awaits.number if awaits and awaits.resend else number + 1
+        reply = stream.send(pack, blocks[number - first]).reply
+        number = reply.number if reply and reply.resend else number + 1

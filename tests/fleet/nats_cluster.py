@@ -1,4 +1,4 @@
-"""The real nats-server of the environment, as ``fleet serve`` configures it: one node, or three in a cluster."""
+"""Real nats-server for tests, configured as by ``fleet serve``: one node, or a cluster of three."""
 
 import contextlib
 import json
@@ -21,11 +21,11 @@ from tests.patience import LONG_S
 BINARY = Path(sys.executable).parent / "nats-server"
 
 
-class Engine:
+class NatsCluster:
     """The nodes, numbered from 0; ``kill`` is SIGKILL.
 
     Args:
-        folder: For their files; those of an engine that was there are taken up.
+        folder: For their files; those of an cluster that was there are taken up.
         nodes: 1 or 3.
         partitions, accounts, tls: As ``Node`` has them.
     """
@@ -61,7 +61,7 @@ class Engine:
 
     @property
     def url(self) -> str:
-        """Of the first node."""
+        """URL of the first node."""
         return self.urls[0]
 
     @property
@@ -70,7 +70,7 @@ class Engine:
 
     @property
     def mqtt_port(self) -> int:
-        """Of the first node."""
+        """MQTT port of the first node."""
         return self.mqtt_ports[0]
 
     @property
@@ -83,7 +83,7 @@ class Engine:
         return process.pid
 
     def start(self, i: int, *, wait: bool = True) -> None:
-        """Start node ``i`` as it was; return when it has what the others have."""
+        """Start node ``i`` with its stored streams; return when it is ready."""
         self.conf(i).write_text(configuration(self.nodes[i]))
         with self.log(i).open("ab") as log:
             self._processes[i] = subprocess.Popen([BINARY, "-c", self.conf(i)], stderr=log)
@@ -91,13 +91,14 @@ class Engine:
             self.wait_ready(i)
 
     def kill(self, i: int) -> None:
+        """Kill node ``i`` by SIGKILL, if it runs."""
         process, self._processes[i] = self._processes[i], None
         if process is not None:
             process.kill()
             process.wait(LONG_S)
 
     def accounts_changed(self, accounts: Accounts) -> None:
-        """Other claims, from the next start on, or the next reload of ``conf``."""
+        """Set other claims, which take effect at the next start or reload."""
         self.nodes = [replace(node, accounts=accounts) for node in self.nodes]
 
     def conf(self, i: int) -> Path:
@@ -107,7 +108,7 @@ class Engine:
         return self._folder / f"n{i}.log"
 
     def wait_ready(self, i: int) -> None:
-        """Until streams can be used at node ``i``, and what it keeps is as the others have it."""
+        """Wait until the streams of node ``i`` are available and up to date."""
         deadline = time.monotonic() + LONG_S
         while not self._is_ready(i):
             process = self._processes[i]
@@ -117,7 +118,7 @@ class Engine:
             time.sleep(0.02)
 
     def leader(self, stream: str, account: str = "") -> int:
-        """Number of the node that leads a stream of ``account``, of any where it is empty; -1 where none does."""
+        """Return the number of the node that leads a stream of ``account`` (empty: of any account); -1 without a leader."""
         for i, process in enumerate(self._processes):
             if process is None:
                 continue
@@ -131,7 +132,7 @@ class Engine:
         return -1
 
     def ask(self, i: int, what: str) -> Any:
-        """What the monitor of node ``i`` says, such as ``varz``."""
+        """Return the response of node ``i``'s monitor to a request such as ``varz``."""
         with urllib.request.urlopen(f"http://{self.nodes[i].monitor}/{what}", timeout=LONG_S) as answer:
             return json.load(answer)
 
@@ -145,7 +146,7 @@ class Engine:
 
 
 async def connected(urls: str | list[str]) -> Client:
-    """A connection that goes on however often its server is killed; one that broke in silence is noticed within seconds."""
+    """Return a connection that reconnects without limit and notices a silent break within seconds."""
 
     async def expected(_error: Exception) -> None:
         pass
@@ -156,21 +157,21 @@ async def connected(urls: str | list[str]) -> Client:
 
 
 @contextlib.contextmanager
-def running(folder: Path, nodes: int = 1, **more: Any) -> Iterator[Engine]:
-    """An engine whose nodes are ready; they are killed at the end.
+def running(folder: Path, nodes: int = 1, **more: Any) -> Iterator[NatsCluster]:
+    """Run a cluster whose nodes are ready; they are killed at the end.
 
     Args:
-        folder: For their files.
-        nodes: 1 or 3.
-        more: As ``Engine`` takes it.
+        folder: Folder of the nodes' files.
+        nodes: Number of nodes, 1 or 3.
+        more: Further arguments of ``NatsCluster``.
     """
-    engine = Engine(folder, nodes, **more)
+    cluster = NatsCluster(folder, nodes, **more)
     try:
         for i in range(nodes):
-            engine.start(i, wait=False)
+            cluster.start(i, wait=False)
         for i in range(nodes):
-            engine.wait_ready(i)
-        yield engine
+            cluster.wait_ready(i)
+        yield cluster
     finally:
         for i in range(nodes):
-            engine.kill(i)
+            cluster.kill(i)
