@@ -52,12 +52,12 @@ def test_a_token_that_cannot_be_is_said(tmp_path, text, said):
 def test_a_token_is_known_with_its_newline_off(tmp_path):
     (tmp_path / "token").write_text(f"{TOKEN}\n")
     guard = guard_of(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
-    assert guard.knows_token(TOKEN)
-    assert not any(guard.knows_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
-    assert not guard.knows_token("\udcff" * 16)  # as aiohttp has a header that is no UTF-8
-    assert not guard.knows_cookie("\udcff" * 64)
-    assert guard.knows_cookie(guard.cookie)
-    assert not guard.knows_cookie(TOKEN)
+    assert guard.is_valid_token(TOKEN)
+    assert not any(guard.is_valid_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
+    assert not guard.is_valid_token("\udcff" * 16)  # as aiohttp has a header that is no UTF-8
+    assert not guard.is_valid_cookie("\udcff" * 64)
+    assert guard.is_valid_cookie(guard.cookie)
+    assert not guard.is_valid_cookie(TOKEN)
     assert TOKEN not in guard.cookie
 
 
@@ -77,4 +77,4 @@ def test_a_token_is_known_with_its_newline_off(tmp_path):
     ],
 )
 def test_only_names_of_ours_are_answered(host, known):
-    assert AccessControl(["bms.example.org"]).knows_host(host) is known
+    assert AccessControl(["bms.example.org"]).is_own_host(host) is known

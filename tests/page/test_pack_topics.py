@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.page.event_stream import MESSAGE_BYTES, Reader
+from bms_estimator.page.event_stream import MAX_MESSAGE_BYTES, Reader
 from bms_estimator.page.pack_topics import RECENT_STATES, PackTopics
 from bms_estimator.store.minute import epoch_s
 
@@ -157,7 +157,7 @@ async def test_a_message_to_a_reader_is_bounded_and_the_rest_comes_next() -> Non
         while text := await reader.next(0.0):
             sizes.append(len(text))
             found |= json.loads(text)
-    assert max(sizes) < 1.1 * MESSAGE_BYTES
+    assert max(sizes) < 1.1 * MAX_MESSAGE_BYTES
     assert len(sizes) > 1
     assert sum(key.startswith("attic/alarm/") for key in found) == 100
 

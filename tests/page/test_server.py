@@ -228,7 +228,7 @@ async def test_a_pack_without_a_database_has_no_history(tmp_path, hub, past):
 
 
 async def test_an_address_that_is_taken_is_said_and_tried_again(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "AGAIN_S", 0.05)
+    monkeypatch.setattr(of_server, "RETRY_S", 0.05)
     opened = asyncio.Queue[str]()
     with socket.create_server(("127.0.0.1", 0)) as other:
         settings = PageSettings(listen=f"127.0.0.1:{other.getsockname()[1]}")

@@ -47,7 +47,7 @@ def test_lines_that_nobody_reads_are_lost_and_counted_and_those_that_wait_come_i
         return min(len(data), 3)  # as pipes do
 
     monkeypatch.setattr(stderr_writer, "os", SimpleNamespace(write=write))
-    monkeypatch.setattr(stderr_writer, "WAITING_LINES", 4)
+    monkeypatch.setattr(stderr_writer, "MAX_QUEUED_LINES", 4)
     out = Stderr()
     for i in range(20):
         out.take(f"line {i}")

@@ -69,4 +69,4 @@ def test_without_a_home_folder_the_service_runs_and_logs_that_state_is_not_saved
     monkeypatch.setenv("HOME", "~")
     with capture_logs() as lines:
         state_folder(Settings())
-    assert [line["event"] for line in lines] == ["the state cannot outlive a restart"]
+    assert [line["event"] for line in lines] == ["the state will be lost at a restart"]

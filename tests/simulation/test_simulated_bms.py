@@ -106,7 +106,7 @@ async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happen
             bms.inject(BmsFault.SILENCE, 1_000_000)
             await until(lambda: board.message)
             assert "open, but silent" in (board.message or "")
-            bms.mend()
+            bms.clear_faults()
             await taken.more(1)
             assert board.message is None
             counters = board.counters

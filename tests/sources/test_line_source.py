@@ -99,7 +99,7 @@ async def test_it_says_that_nothing_comes_and_what_comes_instead():
     junk = [CONNECTED, b'{"soc":1}\n', b'{"voltage":"unavailable"}\n']
     for script, said in (
         ([CONNECTED], "a device: connected, but silent"),
-        (junk, 'a device: lines come that do not tell voltage and current; the first: \'{"voltage":"unavailable"}\''),
+        (junk, 'a device: lines without voltage and current arrive; the first: \'{"voltage":"unavailable"}\''),
     ):
         source = LineSource(Scripted(script), TEXT, period_s=0.001, check_interval_s=0.001)
         async with source:

@@ -11,7 +11,7 @@ from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.protocols.firmware.frame_decoder import FrameFault
 from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command
-from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardProtocol
+from bms_estimator.protocols.firmware.protocol import RETRY_S, BoardProtocol
 from bms_estimator.protocols.registry import PROTOCOLS, make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
@@ -144,7 +144,7 @@ class BoardClient:
     """
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
-        self._port, self._line = port, open_port(port, baud, ASK_AGAIN_S)
+        self._port, self._line = port, open_port(port, baud, RETRY_S)
         self._board, self._text = BoardProtocol(), TextProtocol()
 
     def __enter__(self) -> Self:

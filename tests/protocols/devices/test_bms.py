@@ -17,7 +17,7 @@ from bms_estimator.protocols.base.polled_protocol import (
     PolledProtocol,
 )
 from bms_estimator.protocols.devices import daly, jbd, jk
-from bms_estimator.protocols.devices.daly import sealed
+from bms_estimator.protocols.devices.daly import with_checksum
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from tests.protocols import bms_frames as frames
@@ -176,7 +176,7 @@ def test_jbd_refuses_and_says_so() -> None:
     device = decoder("jbd")
     fed(device, bytes((0xDD, 0x03, 0x80, 0)) + jbd.checksum(b"\x80\0") + b"\x77")
     assert device.counters["refused"] == 1
-    assert "refuses to tell register 0x03" in (device.fault or "")
+    assert "rejects a request of register 0x03" in (device.fault or "")
 
 
 def test_jbd_without_a_probe_has_no_temperature() -> None:
@@ -196,7 +196,7 @@ def test_daly_loses_three_cells_with_a_frame_and_keeps_the_others_in_their_place
 def test_daly_that_numbers_its_frames_from_zero_is_understood() -> None:
     device = decoder("daly")
     cells = b"".join(
-        sealed(frames.DALY_CELLS[i : i + 4] + bytes((i // 13,)) + frames.DALY_CELLS[i + 5 : i + 12])
+        with_checksum(frames.DALY_CELLS[i : i + 4] + bytes((i // 13,)) + frames.DALY_CELLS[i + 5 : i + 12])
         for i in range(0, len(frames.DALY_CELLS), 13)
     )
     _, told = fed(device, frames.DALY_STATUS + cells + frames.DALY_PACK)
@@ -216,7 +216,7 @@ def test_the_older_jk_tells_its_current_in_two_ways(version: int, raw: int, curr
     """The four examples of JK's document."""
     frame = frames.JK_OLD.frames[:-4].replace(b"\x84\x80\xd0", b"\x84" + raw.to_bytes(2, "big"))
     frame = frame.replace(b"\xc0\x01", bytes((0xC0, version)))
-    (sample,), _ = fed(decoder("jk"), jk.old_sealed(frame))
+    (sample,), _ = fed(decoder("jk"), jk.with_old_checksum(frame))
     assert sample["current_a"] == current_a
 
 
@@ -224,7 +224,7 @@ def test_the_older_jk_tells_temperatures_below_zero_above_a_hundred() -> None:
     frame = (
         frames.JK_OLD.frames[:-4].replace(b"\x81\x00\x1e", b"\x81\x00\x69").replace(b"\x82\x00\x1c", b"\x82\x00\x8c")
     )
-    (sample,), _ = fed(decoder("jk"), jk.old_sealed(frame))
+    (sample,), _ = fed(decoder("jk"), jk.with_old_checksum(frame))
     assert sample["temperature_c"] == -5.0  # the other probe is not there
 
 
@@ -293,13 +293,13 @@ def test_a_device_that_answers_is_asked_once_a_second_and_one_that_is_silent_aga
 
 def test_what_is_known_is_not_asked_again() -> None:
     asked = [question for _, question in questions(decoder("jbd"), 10.0, A_ROUND["jbd"])]
-    assert asked.count(jbd.question(jbd.NAME)) == 1
-    assert asked.count(jbd.question(jbd.BASIC)) == 10
+    assert asked.count(jbd.request(jbd.NAME)) == 1
+    assert asked.count(jbd.request(jbd.BASIC)) == 10
 
 
 def test_what_may_be_another_pack_is_asked_anew_how_many_cells_it_has() -> None:
     device = decoder("daly")
-    status = daly.question(daly.HOSTS[0], daly.STATUS)
+    status = daly.request(daly.HOSTS[0], daly.STATUS)
     assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
     device.on_port_opened()
     assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
@@ -307,11 +307,11 @@ def test_what_may_be_another_pack_is_asked_anew_how_many_cells_it_has() -> None:
 
 def test_silence_makes_it_try_the_other_ways_of_asking() -> None:
     asked = [question for _, question in questions(decoder("jk"), 20.0)]
-    assert asked[: MAX_UNANSWERED_CYCLES + 1] == [jk.OLD_QUESTION] * (MAX_UNANSWERED_CYCLES + 1)
-    assert {jk.question(1), jk.question(0)} < set(asked)
+    assert asked[: MAX_UNANSWERED_CYCLES + 1] == [jk.OLD_REQUEST] * (MAX_UNANSWERED_CYCLES + 1)
+    assert {jk.request(1), jk.request(0)} < set(asked)
     assert {question for _, question in questions(decoder("jk", address=7), 20.0)} == {
-        jk.OLD_QUESTION,
-        jk.question(7),
+        jk.OLD_REQUEST,
+        jk.request(7),
     }
     assert {question[1] for _, question in questions(decoder("daly"), 20.0)} == {0x40, 0x80}
 
@@ -320,7 +320,7 @@ def test_the_way_that_is_answered_is_kept_to() -> None:
     device = decoder("jk")
     questions(device, (MAX_UNANSWERED_CYCLES + 1.5) * POLL_CYCLE_S)
     answered = [device.next_output(100.0 + tick) for tick in range(20) if device.feed(100.0 + tick, newer(1)).size]
-    assert set(answered) == {jk.question(1)}
+    assert set(answered) == {jk.request(1)}
 
 
 def test_who_only_probes_sends_nothing_that_another_device_could_take_for_a_change() -> None:
@@ -329,7 +329,7 @@ def test_who_only_probes_sends_nothing_that_another_device_could_take_for_a_chan
         device.probing = True
         for _, question in questions(device, 60.0):
             assert question[:2] in (b"\xdd\xa5", b"\xa5\x40", b"\xa5\x80", b"NW")
-            assert question[:2] != b"NW" or question == jk.OLD_QUESTION
+            assert question[:2] != b"NW" or question == jk.OLD_REQUEST
 
 
 def test_a_line_on_which_another_asks_is_only_listened_to() -> None:
@@ -343,7 +343,7 @@ def test_a_line_on_which_another_asks_is_only_listened_to() -> None:
             assert device.feed(now_s, newer(0)).size == 1
     assert not any(asked)
     assert device.allowed_silence_s > 6.0
-    assert device.next_output(60.0) == jk.OLD_QUESTION
+    assert device.next_output(60.0) == jk.OLD_REQUEST
 
 
 def test_many_reads_at_once_are_the_same_samples_and_cells() -> None:

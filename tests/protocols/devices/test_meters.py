@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
-from bms_estimator.protocols.devices.junctek import ASK, JunctekProtocol
+from bms_estimator.protocols.devices.junctek import QUERY, JunctekProtocol
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol
 from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
 from bms_estimator.protocols.registry import make_protocol
@@ -148,9 +148,9 @@ def test_history_and_hex_messages_between_blocks_disturb_none() -> None:
 @pytest.mark.parametrize(
     ("name", "good", "damaged", "counter", "said"),
     [
-        ("vedirect", BMV_NOW, BMV_NOW.replace(b"7625", b"7635"), "checksum_errors", "checksum is wrong"),
+        ("vedirect", BMV_NOW, BMV_NOW.replace(b"7625", b"7635"), "checksum_errors", "wrong checksum"),
         ("vedirect", BMV_NOW, bytes(range(128, 256)) * 20, "length_errors", "19200 baud"),
-        ("junctek", KG_CHARGING, KG_CHARGING.replace(b"5410", b"5411"), "checksum_errors", "checksum is wrong"),
+        ("junctek", KG_CHARGING, KG_CHARGING.replace(b"5410", b"5411"), "checksum_errors", "wrong checksum"),
         ("junctek", KG_CHARGING, KG_CHARGING[:30] + b"\r\n", "length_errors", "cut off"),
         ("junctek", KG_CHARGING, KG_CHARGING.replace(b"=1,", b"=2,"), "other_address", "address 2"),
         ("junctek", KG_CHARGING, b"\xff\x80\x81\n", "text_errors", "noise"),
@@ -208,9 +208,9 @@ def test_a_console_is_asked_for_the_stack_and_then_for_the_cells_of_each_in_turn
 
 def test_a_junctek_is_asked_once_a_second_and_after_the_port_was_opened_anew() -> None:
     decoder = JunctekProtocol()
-    assert [decoder.next_output(now) for now in (0.0, 0.5, 1.0)] == [ASK, b"", ASK]
+    assert [decoder.next_output(now) for now in (0.0, 0.5, 1.0)] == [QUERY, b"", QUERY]
     decoder.on_port_opened()
-    assert decoder.next_output(1.1) == ASK
+    assert decoder.next_output(1.1) == QUERY
 
 
 def test_cells_that_a_console_has_not_told_for_long_stand_beside_no_sample() -> None:

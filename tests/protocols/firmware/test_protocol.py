@@ -19,7 +19,7 @@ from bms_estimator.protocols.firmware.messages import (
     set_relay_command,
     zero_current_command,
 )
-from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardProtocol
+from bms_estimator.protocols.firmware.protocol import RETRY_S, BoardProtocol
 from tests.service.test_bad_line import HELLO, frames, sample
 
 ZERO = MessageType.COMMAND_ZERO_CURRENT
@@ -45,8 +45,8 @@ def test_what_is_not_answered_is_asked_again_and_no_sooner() -> None:
     decoder = BoardProtocol(rate_hz=100)
     decoder.feed(0.0, b"\0" + sample(0).encode())
     assert decoder.next_output(0.0) == hello_command()
-    assert decoder.next_output(0.9 * ASK_AGAIN_S) == b""
-    assert decoder.next_output(1.1 * ASK_AGAIN_S) == hello_command()
+    assert decoder.next_output(0.9 * RETRY_S) == b""
+    assert decoder.next_output(1.1 * RETRY_S) == hello_command()
 
 
 def test_the_rate_is_set_where_the_board_has_another() -> None:
@@ -133,7 +133,7 @@ def test_the_relay_is_told_until_it_is_acknowledged_and_no_hello_is_asked_for() 
     decoder, relay = talking(), Relay(high=True, high_when_silent=False, silent_s=30)
     command = decoder.relay(relay)
     assert decoder.next_output(0.0) == set_relay_command(relay)
-    assert decoder.next_output(1.1 * ASK_AGAIN_S) == set_relay_command(relay)
+    assert decoder.next_output(1.1 * RETRY_S) == set_relay_command(relay)
     decoder.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
     assert (command.done, command.refusal) == (True, None)
     assert decoder.next_output(2.0) == b""

@@ -98,7 +98,7 @@ async def test_a_wrong_unit_on_a_serial_line_is_silence(tmp_path: Path) -> None:
         given = source(profile="victron-gx", unit=9, port=str(path), timeout_s=0.2)
         said = await failure(ModbusProducer(given))
     assert said == (
-        "no answer within 0.2 s, asked for source.voltage, source.current, source.temperature"
+        "no response within 0.2 s to a request of source.voltage, source.current, source.temperature"
         " (holding registers 259 to 262)"
     )
 

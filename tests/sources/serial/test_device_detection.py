@@ -80,13 +80,13 @@ def test_a_silent_device_is_sent_questions_alone(monkeypatch: pytest.MonkeyPatch
     finally:
         os.close(slave)
         os.close(master)
-    assert jk.OLD_QUESTION in sent
+    assert jk.OLD_REQUEST in sent
     questions = [
-        jk.OLD_QUESTION,
+        jk.OLD_REQUEST,
         junctek.ASK,
         PylontechProtocol().next_output(0.0),
-        *(jbd.question(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
-        *(daly.question(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
+        *(jbd.request(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
+        *(daly.request(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
     ]
     for question in questions:
         sent = sent.replace(question, b"")

@@ -162,7 +162,7 @@ async def test_a_board_that_takes_the_place_of_another_behind_the_same_adapter_i
     port = folder / "ttyUSB0"
     async with source(port) as taken, board(port) as virtual:
         await until(lambda: taken._board_check.serial)
-        virtual._kept[20] = 2
+        virtual._stored[20] = 2
         virtual._converter = VirtualBoard(lambda _: Reading(0.5, 1.0), parts=BoardParts(divider=9.0))._converter
         virtual.reset()
         await until(lambda: taken.message and "board 00000002 is not the pack's, 00000001" in taken.message)
