@@ -1,4 +1,4 @@
-"""Progress messages for the kernel that is being compiled."""
+"""Progress messages for kernels that are compiled."""
 
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.kernels.cell_model import chen_mora
@@ -8,11 +8,11 @@ from bms_estimator.protocols.firmware import scaling
 
 
 def fresh():
-    """A kernel that is in no cache."""
+    """Return a kernel that is not in the cache."""
     return njit(chen_mora.crossing.py_func)
 
 
-def test_each_kernel_is_told_once_with_its_number_and_what_is_compiled_already_is_not() -> None:
+def test_each_newly_compiled_kernel_is_reported_once_with_its_number() -> None:
     told = []
     kernel = fresh()
     with report_compilation(lambda *what: told.append(what)):
@@ -26,7 +26,7 @@ def test_each_kernel_is_told_once_with_its_number_and_what_is_compiled_already_i
     assert len(told) == 1
 
 
-def test_what_decodes_the_line_is_told_as_well() -> None:
+def test_decoders_of_the_line_are_reported_too() -> None:
     told = []
     with report_compilation(lambda *what: told.append(what)):
         njit(scaling.running_mean.py_func)(0.0, 0.0, 1.0, 1.0, 0.0)
@@ -34,7 +34,7 @@ def test_what_decodes_the_line_is_told_as_well() -> None:
     assert name == "scaling: running mean"
 
 
-def test_nobody_is_told_after_the_end() -> None:
+def test_nothing_is_reported_after_the_end() -> None:
     told = []
     with report_compilation(lambda *what: told.append(what)):
         pass
@@ -42,7 +42,7 @@ def test_nobody_is_told_after_the_end() -> None:
     assert told == []
 
 
-def test_where_stderr_is_no_terminal_lines_come_now_and_then() -> None:
+def test_without_a_terminal_lines_are_printed_at_intervals() -> None:
     lines: list[str] = []
     with show_compile_progress(lines.append):
         fresh()(0.5, 1.0, 2.0)

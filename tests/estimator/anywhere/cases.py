@@ -69,7 +69,7 @@ class Case:
     """Mean of the load [C]."""
     temperature_c: float = 25.0
     rising_k: float = 0.0
-    """Temperature rise."""
+    """Temperature rise over the capture [K]."""
     rate_hz: float = 1.0
     hours: float = 1.3
     unseen_h: float = 0.5
@@ -85,7 +85,7 @@ class Case:
     curve_error: float = 1.0
     """Error of the OCV in the cell file over that of a common one; a capacity can be learned no better than it allows."""
     weak_cell: float = 1.0
-    """Below 1: six cells in series, one with this part of the capacity of the others."""
+    """Below 1: six cells in series, one with this fraction of the capacity of the others."""
     sensed: bool = True
     warms_k: float = 0.0
     """Temperature rise for a loss of 1 W."""
@@ -141,7 +141,7 @@ CASES: tuple[Case, ...] = (
     Case("6S one cell -20%", weak_cell=0.8, seed=35),
 )
 WRONG = (-0.2, 0.2)
-"""Error of the initial SOC."""
+"""Errors of the initial SOC."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class Capture:
 
     samples: SampleBlock
     soc: Floats
-    """At each sample; of the emptiest cell."""
+    """True SOC of the weakest cell at each sample."""
     cell: CellModel
 
 
@@ -172,7 +172,7 @@ def load_a(case: Case, seconds: int) -> Floats:
 
 
 def capture(case: Case, current_a: Floats | None = None) -> Capture:
-    """Simulate one; under ``current_a`` at ``rate_hz`` [A], where it is given."""
+    """Simulate a capture of one case; under ``current_a`` at ``rate_hz`` [A] if given."""
     assert not (case.sensed and case.warms_k), "the sensor shows the room"
     rng = np.random.default_rng(1000 + case.seed)
     if current_a is None:
@@ -203,7 +203,7 @@ def capture(case: Case, current_a: Floats | None = None) -> Capture:
 
 
 def cell_file(case: Case) -> CellModel:
-    """Return the estimator's cell file."""
+    """Return the cell file of the estimator."""
     kind = "nmc" if case.truth.ocv_v is OXIDE.ocv_v else "lfp"
     generic = load_cell(kind, case.capacity * case.truth.capacity_ah)
     if case.file_c == "generic":
@@ -225,13 +225,15 @@ def cell_file(case: Case) -> CellModel:
 
 
 def rising(curve_v: Floats) -> Floats:
-    """The same, level where it falls, from the middle outwards: an end that is wrong by its steepness moves nothing else."""
+    """Return the curve with falling parts made constant, from the middle outwards, so that errors of the ends stay
+    local."""
     half = curve_v.size // 2
     return np.r_[np.minimum.accumulate(curve_v[half - 1 :: -1])[::-1], np.maximum.accumulate(curve_v[half:])]
 
 
 def ladder(truth: Truth, temperatures_c: tuple[float, ...], rng: np.random.Generator) -> Ladder:
-    """The ladder nearest to the impedance of the truth at each SOC, in relative squares, no resistance below 0; of another cell."""
+    """Return the ladder of another cell, fitted to the true impedance at each SOC by relative non-negative least
+    squares."""
     branches = 1.0 / (1.0 + 1j * RAD_S[:, None] * np.array([0.0, *TAU_S]))
     another = np.exp(R_STD * rng.standard_normal())
     weak_ohm, strong_ohm = [], []

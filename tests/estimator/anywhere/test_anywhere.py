@@ -1,4 +1,4 @@
-"""Promises of the SOC and its interval for any start, on cells that differ from the model."""
+"""Accuracy of the SOC and its interval for any start, on cells that differ from the model."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,7 @@ def test_the_summary_is_as_checked_in(table) -> None:
 
 
 @pytest.mark.parametrize("case", LIMITS)
-def test_the_soc_is_right_and_its_band_true_and_narrow(table, case: str) -> None:
+def test_the_soc_error_coverage_and_std_are_within_their_limits(table, case: str) -> None:
     most, cover, std = LIMITS[case]
     both = [r.score for r in table if r.case == case]
     assert len(both) == 2
@@ -90,11 +90,11 @@ def test_the_soc_is_right_and_its_band_true_and_narrow(table, case: str) -> None
 
 
 @pytest.mark.parametrize("case", ["capacity +20%", "capacity -20%"])
-def test_a_capacity_that_is_wrong_by_a_fifth_is_found(table, case: str) -> None:
+def test_a_capacity_wrong_by_20_percent_is_corrected(table, case: str) -> None:
     assert [abs(r.capacity) < 3.0 for r in table if r.case == case] == [True, True]
 
 
-def test_errors_are_of_the_size_of_their_std(table) -> None:
+def test_nees_matches_the_std(table) -> None:
     """NEES: errors within one capture are correlated, so each capture is one degree of freedom.
 
     The packs are left out: their one weak cell is not drawn from what is common. A band that is too wide is the lesser fault,
@@ -105,7 +105,7 @@ def test_errors_are_of_the_size_of_their_std(table) -> None:
     assert low <= np.sum(nees) <= high
 
 
-def test_innovations_are_of_the_size_of_their_std_over_ten_minutes(table) -> None:
+def test_nis_of_ten_minutes_matches_the_std(table) -> None:
     """NIS of means.
 
     R is the error of the model, which stays for minutes, as if it were white: 50 mV in a second is 2 mV in ten minutes.

@@ -17,17 +17,17 @@ from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.numba_cache import njit
 
 GRID = np.linspace(0.0, 1.0, 401)
-"""SOC of all that is given along it."""
+"""SOC grid of the true cells."""
 TAU_S = np.array([0.0, 0.4, 3.0, 17.0, 70.0, 300.0, 1200.0, 4000.0])
-"""At 25 C [s]; the first is the series resistance."""
+"""Time constants at 25 C [s]; the first is that of the series resistance."""
 ENERGY_J = np.array([10e3, 42e3, 48e3, 38e3, 30e3, 28e3, 26e3, 24e3])
-"""Activation energies of the resistances [J/mol]; time constants go with half of it."""
+"""Activation energies of the resistances [J/mol]; those of the time constants are half as large."""
 KINETIC = 2
-"""The process of 3 s: charge transfer."""
+"""Index of the process with kinetics: charge transfer, 3 s."""
 KINETIC_V = 0.051
-"""2 R T / F: where its resistance begins to fall [V]."""
+"""Overpotential 2 R T / F above which the kinetic resistance falls [V]."""
 COOLING_S = 900.0
-"""Time constant in which a cell gets warm [s]."""
+"""Thermal time constant of a cell [s]."""
 GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 TAPER_C = 0.05
 """Current at which a charger ends its charge [C]."""
@@ -38,20 +38,20 @@ stop operators (Prandtl), which regeneration takes no further from the branch th
 
 @dataclass(frozen=True)
 class Truth:
-    """A cell. Arrays of shape (401,) are over ``GRID``."""
+    """True cell. Arrays of shape (401,) are over ``GRID``."""
 
     capacity_ah: float
     ocv_v: Floats
     per_kelvin_v: Floats
     hysteresis_v: Floats
-    """Half the difference between charge and discharge."""
+    """Half of the OCV after charge less the OCV after discharge [V]."""
     ohm: Floats
-    """At 25 C and small currents, shape (401, 8)."""
+    """Resistances at 25 C and small currents, shape (401, 8) [ohm]."""
 
 
 @njit
 def along(soc, values):
-    """Linear between the points of ``GRID``."""
+    """Interpolate linearly between the points of ``GRID``."""
     position = min(max(soc, 0.0), 1.0) * (len(values) - 1)
     i = min(int(position), len(values) - 2)
     return values[i] + (position - i) * (values[i + 1] - values[i])
@@ -116,7 +116,7 @@ def simulate(
 
 
 def impedance(truth: Truth, node: int, temperature_c: float, rad_s: Floats, current_a: float) -> Floats:
-    """Complex, at ``GRID[node]`` and each of ``rad_s`` [1/s], with the kinetics at ``current_a`` [ohm]."""
+    """Return the complex impedance at ``GRID[node]`` and ``rad_s`` [1/s], with the kinetics at ``current_a`` [ohm]."""
     cold = np.exp(ENERGY_J / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K))
     ohm = truth.ohm[node] * cold
     at = ohm[KINETIC] * current_a / KINETIC_V
@@ -125,18 +125,18 @@ def impedance(truth: Truth, node: int, temperature_c: float, rad_s: Floats, curr
 
 
 def rising(low: float, high: float) -> Floats:
-    """A factor over ``GRID`` that rises towards empty and full."""
+    """Return a factor over ``GRID`` that rises towards empty and full."""
     return 1.0 + low * np.exp(-GRID / 0.07) + high * np.exp((GRID - 1.0) / 0.05) + 0.15 * np.cos(5.0 * GRID)
 
 
 def resistances(milliohm: tuple[float, ...]) -> Floats:
-    """Shape (401, 8) [ohm], from those in the middle."""
+    """Return the resistances over SOC from those at mid SOC, shape (401, 8) [ohm]."""
     shapes = [rising(0.4, 0.0), rising(1.0, 0.3), rising(2.5, 0.8), rising(2.0, 0.5), *4 * [rising(3.0, 0.2)]]
     return 1e-3 * np.array(milliohm) * np.column_stack(shapes)
 
 
 def smooth(rng: np.random.Generator, length_soc: float) -> Floats:
-    """A normal process of variance 1 over ``GRID``, that forgets within ``length_soc``."""
+    """Return a normal process of variance 1 over ``GRID`` with the correlation length ``length_soc``."""
     k = np.pi * np.arange(0.0, 4.0 / length_soc / np.pi)
     part = np.exp(-0.25 * (k * length_soc) ** 2)
     cosines, sines = rng.standard_normal((2, k.size)) * part / np.sqrt(np.sum(part**2))
