@@ -127,7 +127,7 @@ async def a_board(kind: str, truth: Truth, folder: Path) -> AsyncIterator[Board]
     else:
         rows = [(t, *r) for t, r in zip(truth.time_s, truth.readings, strict=True)]
         with SimavrBoard(write_readings(folder / "readings.csv", rows)) as simulated:
-            yield Board(simulated.path, lambda: None)  # it powers up when its line is opened
+            yield Board(simulated.path, lambda: None)  # the simulated board starts when its line is opened
 
 
 @pytest.fixture(params=["simavr", pytest.param("python", marks=pytest.mark.thorough)])
@@ -188,7 +188,7 @@ async def test_the_service_continues_without_board_and_without_broker(
             assert again["lock"]
             assert again["board_time_s"] > before["board_time_s"]
             broker.stop()
-            await asyncio.sleep(1.0)  # so long it is away
+            await asyncio.sleep(1.0)  # duration without the board
             broker.start()
             async with Listener(broker, "bms/#") as later:
                 after = await later.wait_json(

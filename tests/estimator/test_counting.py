@@ -1,7 +1,7 @@
-"""Counting errors are learned with a true std: the capacity, and the offset of the current sensor.
+"""Learned capacity and offset of the current sensor, and their std, on cells that differ from the model.
 
-On cells that no model here contains. Their files have half the error of a common curve, 2 mV and 0.35 % of SOC, as from a slow
-discharge of the cell itself: between two SOCs a capacity is known no better than the curve is at both.
+The cell files have half of the typical OCV error, 2 mV and 0.35 % of SOC, as from a slow discharge of the cell itself. The
+error of the OCV limits the accuracy of a capacity.
 """
 
 import numpy as np
@@ -59,7 +59,7 @@ def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(told_wro
             ratios.append(ratio(learned, 1.0 / told))
     assert np.abs(errors).max() < MAX_ERROR
     assert np.sqrt(np.mean(np.square(errors))) < SOH_ERROR
-    assert np.mean(np.square(ratios)) < nees_limit(len(SEEDS))  # both of one seed have the same curve
+    assert np.mean(np.square(ratios)) < nees_limit(len(SEEDS))  # both runs of a seed have equal curves and count once
 
 
 def test_a_gain_error_of_the_current_sensor_is_equivalent_to_a_capacity() -> None:

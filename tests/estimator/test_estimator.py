@@ -95,7 +95,7 @@ def test_slow_sampling_does_not_count_as_gaps() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 10.0, 20.0, 30.0, 90.0, 100.0):
         estimator.step(time_s, 1.0, 3.7)
-    assert estimator.state["gaps"][0] == 2  # the first step, which nothing tells from a gap, and the long one
+    assert estimator.state["gaps"][0] == 2  # the first step, which is indistinguishable from a gap, and the long one
 
 
 def test_the_current_over_an_unmeasured_hour_is_the_smaller_of_both_ends() -> None:

@@ -24,7 +24,9 @@ def test_a_file_without_a_ladder_gets_one_equivalent_to_its_rc_pairs() -> None:
     r_ts, r_tl = chen_mora.r_ts(soc, a), chen_mora.r_tl(soc, a)
     assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=1e-3)
     both = elements["r_ts_ohm"].value + elements["r_tl_ohm"].value
-    assert both == pytest.approx((1.0 + BEYOND_BRANCHES) * (r_ts + r_tl), rel=0.05)  # a load before is supposed
+    assert both == pytest.approx(
+        (1.0 + BEYOND_BRANCHES) * (r_ts + r_tl), rel=0.05
+    )  # the filter assumes a load before the first sample
     assert elements["r_ts_ohm"].value == pytest.approx(r_ts, rel=0.15)
     assert elements["c_ts_farad"].value == pytest.approx(chen_mora.c_ts(soc, a), rel=0.15)
     assert estimator.settings_record["filter"]["r_std"][0] == BRANCHES_STD

@@ -70,7 +70,7 @@ def test_the_true_soc_stays_inside_the_interval(
     assert named.any()
     assert not (suspects[before] & FROZEN).any()
     assert suspects[-1] & FROZEN == 0
-    judged = named if fields is BOTH else ~before  # a current that is repeated counts until it is found
+    judged = named if fields is BOTH else ~before  # a repeated current is integrated until its detection
     assert (np.abs(soc - true_soc)[judged] < 2.5 * std[judged]).all()
 
 

@@ -114,7 +114,7 @@ def test_an_unmeasured_gap_adds_nothing_to_the_map(load) -> None:
     left = np.exp(-gap_s / estimator.settings_record["map_memory_s"][0])
     known = before > 0.0
     kept = estimator.record[0]["map"]["weight"][known] / before[known]
-    assert np.median(kept) == pytest.approx(left, rel=2e-3)  # at the present SOC it learns on
+    assert np.median(kept) == pytest.approx(left, rel=2e-3)  # at the present SOC learning continues
 
 
 def test_a_long_gap_preserves_the_capacity_and_the_constant_part_of_the_offset(load) -> None:

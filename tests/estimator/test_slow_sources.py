@@ -1,5 +1,4 @@
-"""Sources with little information: a sample each minute, current steps, a dead band of amperes, voltage and current
-apart."""
+"""Sources with little information: a sample each minute, coarse current, dead band, voltage and current at different times."""
 
 import numpy as np
 import pytest
@@ -78,7 +77,7 @@ def test_a_constant_reported_current_has_a_constant_error(sampling: Sampling, cu
     assert variance_as2 == pytest.approx((error_a * 3600.0) ** 2)
     assert rounding_charge_variance(f, p, 1.0, current_a + 1.0) == pytest.approx(
         0.1**2 / 12.0
-    )  # another current errs on its own
+    )  # the error of another current is independent
 
 
 def test_settings_of_a_board_have_the_default_resolution() -> None:

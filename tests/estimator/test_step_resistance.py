@@ -58,7 +58,7 @@ def test_r_s_matches_the_resistance_of_current_steps(pulses, file: str, rate_hz:
     trace = estimator.run(samples)
     late = trace["time_s"] > 0.5 * trace["time_s"][-1]
     r_s, std = trace["r_s_ohm"][late], trace["r_s_std_ohm"][late]
-    # at 1 Hz a part of what a step shows is the fastest branches, which in the cold a generic file does not know
+    # at 1 Hz a step includes a part of the fastest RC pairs, which a generic file does not describe in the cold
     assert np.abs(r_s / shown_ohm - 1.0).max() < (0.12 if (file, rate_hz) == ("generic", 1) else 0.1)
     assert (np.abs(r_s - shown_ohm) < 2.0 * std).mean() > 0.95
     assert (std < 0.2 * r_s).all()

@@ -53,7 +53,7 @@ def test_the_curve_of_a_generic_cell_increases_and_has_an_error(name):
     assert (np.diff(fine) > 0).all()
     middle = (soc >= 0.2) & (soc <= 0.9)
     error_v = np.array(ocv.error_v)[middle]
-    # no curve of a chemistry is sure to a few millivolts, none is useless
+    # curves of one chemistry differ by more than a few millivolts, but by less than 100 mV
     assert error_v.min() >= 0.01
     assert error_v.max() <= 0.1
     assert max(ocv.hysteresis_v) <= 0.02
@@ -115,7 +115,7 @@ def test_error_covers_the_leaf_and_the_lg_m50(data):
     leaf = load_cell("leaf").ocv
     for apart, least in ((within("nmc", soc, ocv_v), 0.95), (within("lmo", np.array(leaf.soc), leaf.ocv_v), 0.9)):
         assert (apart <= 2.0).mean() >= least
-        assert apart.mean() > 0.3  # and is not so wide that it says nothing
+        assert apart.mean() > 0.3  # the error is not much too large
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_growth_near_empty_without_data_is_between_constant_and_that_of_the_file
         once = identify([above], given, refine_ocv=False).cell
         found[name] = growth(once.ladder)
         again = growth(identify([above], once, refine_ocv=False).cell.ladder)
-        assert again == pytest.approx(found[name], rel=0.1)  # what was identified does not wear away
+        assert again == pytest.approx(found[name], rel=0.1)  # repeated identification preserves the growth
     assert 1.5 * found["level"] < found["growing"] < 3.0
 
 
@@ -209,7 +209,7 @@ def test_the_miscount_of_a_capture_is_identified(warm):
         for name, rows in (("whole", warm.rows), ("lacking", lacking))
     }
     assert abs(found["whole"]) < 0.001
-    assert 0.005 < found["lacking"] < 0.02  # two per cent, pulled to nothing: it is five of its std
+    assert 0.005 < found["lacking"] < 0.02  # true value 0.02, reduced by the prior, whose std is 0.004
 
 
 def test_refine_ocv_false_keeps_the_ocv_and_its_temperature_coefficient(warm, cold):

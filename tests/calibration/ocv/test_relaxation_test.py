@@ -81,10 +81,10 @@ def test_without_noise_a_long_rest_is_extrapolated_to_a_fifth_of_a_millivolt():
 def test_rests_of_any_length_are_within_their_std(rest_s):
     found = relaxation_test(relaxation(rest_s=rest_s, rounds=ROUNDS), CAPACITY_AH, name="mine")
     assert len(found.rests) + len(found.rejected) == 1 + ROUNDS
-    assert len(found.rejected) <= (rest_s < 400)  # the last, where the elements rise
+    assert len(found.rejected) <= (rest_s < 400)  # the last rest, at a low SOC where the elements rise
     error_v = np.abs(found.ocv_v - true_ocv(found.soc))
     assert error_v.max() < {240: 0.016, 400: 8e-3, 3600: 1e-3}[rest_s]
-    assert np.sqrt(np.mean((error_v / found.std_v) ** 2)) < 1.3  # and they know it
+    assert np.sqrt(np.mean((error_v / found.std_v) ** 2)) < 1.3  # errors match their std
 
 
 def test_a_longer_rest_is_more_certain():
@@ -217,5 +217,5 @@ def test_several_captures_in_one_file_are_rejected():
         ):
             remove_glitches(together, "mine")
     late = pulse.copy()
-    late["time_s"][50] -= 30.0  # one stamp
+    late["time_s"][50] -= 30.0  # one wrong time stamp
     assert remove_glitches(late, "mine").size == pulse.size - 1

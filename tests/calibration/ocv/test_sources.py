@@ -45,7 +45,7 @@ def test_a_pair_gives_mean_hysteresis_and_capacity(files):
     assert np.abs(off_v(found)).max() < 2e-3
     assert found.hysteresis_v[INSIDE] == pytest.approx(
         0.7 * hysteresis_v(NODES[INSIDE]), abs=2e-3
-    )  # the rest polarisation
+    )  # the remainder is polarization
 
 
 @pytest.mark.parametrize("noise_a", [0.01, 0.04])

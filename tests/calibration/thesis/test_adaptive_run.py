@@ -54,7 +54,7 @@ def test_scheme_2_returns_small_parameters_to_their_initial_values(disturbed):
     assert change[LARGE] == pytest.approx(np.full(10, integral), rel=1e-6)
     assert np.abs(change[SMALL]).max() < 1e-3 * integral
     while_disturbed, _ = moved("scheme-2", disturbed[:3])
-    assert (while_disturbed[SMALL] > 1e-4).all()  # drawn back, not held
+    assert (while_disturbed[SMALL] > 1e-4).all()  # the parameters return afterwards and were not constant
     assert while_disturbed[1] == pytest.approx(while_disturbed[3], rel=1e-9)
 
 

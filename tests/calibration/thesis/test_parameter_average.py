@@ -89,7 +89,7 @@ def test_override_outside_the_run_is_rejected(given, message):
 
 def test_t_int_is_the_time_at_which_the_error_has_settled():
     window = find(error_v=np.where(TIME_S < 120.0, 5e-3, 2e-4))
-    assert window.t_int_s == pytest.approx(112.0, abs=9.0)  # one sample in a hundred may still be beyond
+    assert window.t_int_s == pytest.approx(112.0, abs=9.0)  # one sample in a hundred may be beyond the limit
     assert "99 % of the later errors are within 1.00 mV" in window.start_reason
     spikes = np.where((TIME_S < 50.0) | (TIME_S % 300.0 == 299.0), 5e-3, 0.0)
     assert 40.0 <= find(error_v=spikes).t_int_s <= 50.0
@@ -118,7 +118,7 @@ def test_t_unst_is_the_first_of_margin_knee_and_end():
     assert window.end_reason == "knee of the voltage"
     assert window.t_unst_s == pytest.approx(800.0, abs=12.0)
     dip = np.linspace(4.2, 3.6, TIME_S.size) - np.where((TIME_S > 500.0) & (TIME_S < 520.0), 0.3, 0.0)
-    assert find(voltage_v=dip).end_reason == "end of the run"  # a load that comes and goes is no knee
+    assert find(voltage_v=dip).end_reason == "end of the run"  # a temporary load is no knee
 
 
 def test_mean_over_uneven_steps_is_the_integral():

@@ -66,7 +66,7 @@ def test_the_dynamic_model_is_better_than_the_static_one_where_elements_rise(loa
     low = static.soc < 0.15
     assert static.error_percent[low].mean() > 3.0 * static.error_percent[~low].mean()
     near = np.abs(static.soc - 0.5) < 0.02
-    assert np.abs(static.error_v[near]).max() < 4e-3  # where it was frozen both are right
+    assert np.abs(static.error_v[near]).max() < 4e-3  # near the SOC of the static model both agree
 
 
 def test_given_parameters_replace_those_of_the_cell():

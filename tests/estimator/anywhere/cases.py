@@ -1,8 +1,8 @@
-"""Short captures of each kind that a user may have, identical on every machine.
+"""Short simulated captures of typical loads and conditions, identical on every machine.
 
-The estimator is switched on in mid-load, at an SOC that is 0.2 too low and 0.2 too high. The cell file comes from the
-impedance of the truth at the temperatures that it is made for, as far as a ladder can follow it, and errs as much as it
-says: an OCV wrong by some millivolts and some SOC, the resistances of another such cell, a capacity off by a percent.
+The estimator starts in mid-load with an SOC 0.2 too low or 0.2 too high. The cell file's ladder is fitted to the true
+impedance at the file's temperatures. The file has errors of the size that it declares: an OCV error of some millivolts and
+some SOC, resistances of another cell of the make, a capacity error of a percent.
 """
 
 from dataclasses import dataclass, replace
@@ -59,12 +59,12 @@ VOLT_STEP, AMPERE_STEP, KELVIN_STEP = 1e-3, 1e-3, 0.1
 
 @dataclass(frozen=True)
 class Case:
-    """One capture, and the estimator's description of its cell."""
+    """Parameters of one capture and of the estimator's cell file."""
 
     name: str
     truth: Truth = OXIDE
     load: Literal["drive", "constant", "rest"] = "drive"
-    """A drive, a constant load, or a drive with 30 min of rest from 5 min after switch-on."""
+    """Kind of load: a drive, a constant load, or a drive with 30 min of rest from 5 min after switch-on."""
     load_c: float = 0.5
     """Mean of the load [C]."""
     temperature_c: float = 25.0
@@ -77,18 +77,18 @@ class Case:
     soc: float = 0.9
     """SOC at the start of the load, from rest; 1: just charged."""
     file_c: tuple[float, ...] | Literal["generic"] = (25.0, 10.0, 0.0, -10.0)
-    """Temperatures that the cell file is made for; or a generic one."""
+    """Temperatures of the cell file [C], or a generic cell file."""
     gain: float = 1.0
     offset_a: float = 0.0
     capacity: float = 1.01
     """Capacity in the cell file over the true one."""
     curve_error: float = 1.0
-    """Error of the OCV in the cell file over that of a common one; a capacity can be learned no better than it allows."""
+    """Error of the OCV in the cell file over that of a typical one. It limits the accuracy of a learned capacity."""
     weak_cell: float = 1.0
     """Below 1: six cells in series, one with this fraction of the capacity of the others."""
     sensed: bool = True
     warms_k: float = 0.0
-    """Temperature rise for a loss of 1 W."""
+    """Temperature rise for a loss of 1 W [K]."""
     after_s: float = 900.0
     seed: int = 1
 
@@ -155,7 +155,7 @@ class Capture:
 
 
 def load_a(case: Case, seconds: int) -> Floats:
-    """Current at 1 Hz [A]: levels of some seconds, stops, some regeneration where it is warm."""
+    """Return the current at 1 Hz [A]: levels of some seconds, stops, and some regeneration in warm cells."""
     rng = np.random.default_rng(case.seed)
     one_c = case.truth.capacity_ah
     if case.load == "constant":
@@ -213,7 +213,7 @@ def cell_file(case: Case) -> CellModel:
     std_v, std_soc_v = case.curve_error * OCV_STD_V[kind], case.curve_error * OCV_STD_SOC * slope_v
     wrong_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
     told_v = rising((case.truth.ocv_v + wrong_v)[OCV_NODES])
-    hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # everywhere: an error that `ocv` allows for
+    hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # constant over SOC, an error within the std of `ocv`
     table = {
         "soc": GRID[OCV_NODES],
         "ocv_v": told_v + 1e-6 * np.arange(OCV_NODES.size),

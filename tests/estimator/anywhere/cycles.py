@@ -1,8 +1,8 @@
-"""Full cycles and charges from empty: the first day of a cell of which only chemistry and capacity are known.
+"""Full cycles and charges from empty: first day of a cell with known chemistry and capacity only.
 
-The estimator has the generic cell file and no initial SOC. The true cell has the OCV of another make, as far as a capture of
-one is at hand (LG M50, NCR18650, Leaf), that of the LFP test cell, or one up to 1.5 std off (LCO, LTO). Its resistances are 0.7
-to 3 times those of the generic cell.
+The estimator has the generic cell file and no initial SOC. The true cell has the OCV of a measured cell (LG M50, NCR18650,
+Leaf, the LFP test cell) or a random OCV with errors up to 1.5 std (LCO, LTO). Its resistances are 0.7 to 3 times those of
+the generic cell.
 """
 
 import csv

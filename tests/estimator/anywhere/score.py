@@ -23,8 +23,8 @@ class Score:
     std: float
     """Mean of soc_std [%]."""
     score: float
-    """Interval score of that band as of 95 %: its width plus 40 times what lies outside (Gneiting and Raftery 2007,
-    eq. 43). Neither a wider nor a narrower band than is true betters it."""
+    """Interval score of soc +- 2 soc_std as a 95 % interval: width plus 40 times the distance of the true SOC outside
+    (Gneiting and Raftery 2007, eq. 43)."""
     nees: float
     """Mean of (error / soc_std)^2; 1 for a correct std."""
 
@@ -33,7 +33,7 @@ def score(time_s: Floats, soc: Floats, soc_std: Floats, truth: Floats, after_s: 
     """Score a run from ``after_s`` on, above ``LOWEST_SOC``. Arrays of shape (n,).
 
     Returns:
-        None where that leaves too little.
+        None if too few samples remain.
     """
     judged = (time_s - time_s[0] >= after_s) & (truth >= LOWEST_SOC)
     weight = np.clip(np.diff(time_s, append=time_s[-1]), 0.0, MAX_S)[judged]

@@ -1,8 +1,8 @@
-"""Cells that differ from the estimator's model: their samples and true values.
+"""Simulation of cells that differ from the estimator's model.
 
-Eight processes with time constants of their own between those of the ladder, which slow down in the cold, each with an
-activation energy of its own; one of them obeys Butler-Volmer kinetics, so its resistance falls with the current; two
-kinds of hysteresis, one fast and one slow; entropy; resistances that rise towards empty and full.
+A cell has eight processes with time constants between those of the ladder, each with its own activation energy. One process
+has Butler-Volmer kinetics, so that its resistance falls with the current. The OCV has a fast and a slow hysteresis and an
+entropy term. Resistances rise towards empty and full.
 """
 
 import math
@@ -32,8 +32,8 @@ GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 TAPER_C = 0.05
 """Current at which a charger ends its charge [C]."""
 LOOPS_SOC, FAST_LOOP = (0.015, 0.15), 0.6
-"""Charge that leads halfway from one branch of the hysteresis to the other, fast and slow, and the share of the fast one:
-stop operators (Prandtl), which regeneration takes no further from the branch than its own charge does."""
+"""Charge constants of the fast and the slow hysteresis [SOC], and share of the fast one. Both are stop operators (Prandtl),
+so that regeneration moves the hysteresis only by its own charge."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def simulate(
     """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
     x, fast, slow, rise_k = np.zeros(len(TAU_S)), branch, branch, 0.0
-    stopped = 0.0  # sign of the current that was stopped
+    stopped = 0.0  # sign of the current that a limit has stopped
     for n in range(len(current_a)):
         i, celsius = current_a[n], room_c[n] + rise_k
         if i * stopped > 0.0:

@@ -65,7 +65,7 @@ def thevenin_voltages(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         model, parameter_values=values, experiment=pybamm.Experiment(steps * ROUNDS), solver=solver
     )
     solved = simulation.solve(showprogress=False)
-    # A step's last value is the next one's first instant, still under the old current.
+    # the last value of a step is at the start of the next one, but under the previous current
     voltage_v = [cycle["Voltage [V]"].entries[:-1] for cycle in solved.cycles]
     soc = [cycle["SoC"].entries[:-1] for cycle in solved.cycles]
     return np.concatenate(voltage_v), np.concatenate(soc)

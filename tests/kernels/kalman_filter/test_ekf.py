@@ -113,7 +113,7 @@ def test_p_is_propagated_by_the_derivative_of_the_mean() -> None:
     expected, nodes = f @ covariance @ f.T, np.arange(NODE, STATES)
     assert by_kernel[nodes, nodes] == pytest.approx(
         expected[nodes, nodes], abs=1.0 / ekf_noise.AGED_SOC
-    )  # their Q is P's
+    )  # Q of these states depends on P
     by_kernel[nodes, nodes] = expected[nodes, nodes]
     assert by_kernel == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
@@ -167,7 +167,7 @@ def test_an_innovation_of_many_std_counts_as_one_of_two() -> None:
     for stds in (2.0, 8.0):
         s = somewhere(p)
         s["covariance"][0][SOC] = s["covariance"][0][:, SOC] = (
-            0.0  # by the SOC's own move it would be linear about another
+            0.0  # otherwise the update would be linearized about another SOC
         )
         _, curved_v = linearised(s, p)
         h, covariance, before = (np.array(x) for x in (s["h"], s["covariance"][0], s["mean"][0]))
@@ -246,7 +246,7 @@ def test_inflation_is_one_for_white_innovations_and_grows_for_persistent_ones() 
     for u in rng.standard_normal(20_000):
         ekf.adapt_bias_inflation(s, 0, 1.0, u)
         slow.append(s["slow_inflation"][0])
-    assert np.mean(slow) == pytest.approx(1.3, abs=0.3)  # what is below 1 counts as 1
+    assert np.mean(slow) == pytest.approx(1.3, abs=0.3)  # ratios below 1 count as 1
     for _ in range(7200):
         ekf.adapt_bias_inflation(s, 0, 1.0, 0.2)
     assert s["slow_inflation"][0] > 30.0
@@ -273,7 +273,7 @@ def test_a_single_innovation_after_a_gap_causes_no_inflation(drive) -> None:
     before, seeded_s = [float(f[name][0]) for name in names], float(f["seeded_s"])
     estimator.run(drive.samples[1980:1981])
     assert [float(f[name][0]) for name in names] == before
-    assert f["seeded_s"] == seeded_s + 181.0  # the sample was taken in
+    assert f["seeded_s"] == seeded_s + 181.0  # the sample was processed
     assert estimator.state["gaps"][0] == 1
 
 

@@ -69,7 +69,7 @@ def test_exponents_are_uncertain_with_data_at_high_soc_only() -> None:
 def test_an_exponent_beyond_the_searched_range_is_limited(exponent: float, end: float) -> None:
     prior = TRUTH.copy()
     prior[[2, 5, 8, 11, 14]] = exponent
-    fit = fitted(filled(0.6, 0.61), prior)  # nothing seen where the exponent shows: the configured one draws
+    fit = fitted(filled(0.6, 0.61), prior)  # no data determine the exponent: the fit tends to the configured one
     found = fit["a"][[2, 5, 8, 11, 14]]
     assert (found >= EXPONENT_MIN).all()
     assert (found <= EXPONENT_MAX).all()
@@ -91,7 +91,7 @@ def test_a_fit_allocates_no_memory() -> None:
     before = rtsys.get_allocation_stats().alloc
     for _ in range(100):
         fit_element(table[0], 0, TRUTH, fit[0])
-    assert rtsys.get_allocation_stats().alloc - before <= 100  # one a call, to hand the prior over from Python
+    assert rtsys.get_allocation_stats().alloc - before <= 100  # one for each call, for passing the prior from Python
 
 
 def test_an_uncertain_value_is_not_added() -> None:

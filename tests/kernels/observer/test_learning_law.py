@@ -63,7 +63,7 @@ def test_the_step_solves_for_the_balance_of_information_and_leakage(seed: int) -
     rng = np.random.default_rng(seed)
     state, settings = np.zeros(1, LEARNING_STATE), np.zeros(1, LEARNING_SETTINGS)
     m, q = state[0], settings[0]
-    psi = rng.normal(size=(3, COUNT))  # fewer than there are parameters: the leakage decides the rest
+    psi = rng.normal(size=(3, COUNT))  # fewer rows than parameters: the leakage determines the others
     q["count"], q["leak_v2s"][:COUNT], q["middle"][:COUNT] = COUNT, 1e-3, rng.normal(size=COUNT)
     m["information"][:COUNT, :COUNT] = np.tril(psi.T @ psi)
     m["pull"][:COUNT], m["theta"][:COUNT] = psi.T @ rng.normal(size=3), rng.normal(size=COUNT)

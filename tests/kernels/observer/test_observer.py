@@ -174,7 +174,7 @@ def test_adaptation_stops_above_the_margin_and_is_reported() -> None:
     cell = load_cell("chen_mora")
     trace = Estimator(cell, initial_soc=1.0, identifier=None)
     samples = discharge(cell, 0.95, 1.0, 0.275)
-    samples["current_a"] *= 1.2  # the count runs empty before the cell does
+    samples["current_a"] *= 1.2  # coulomb counting reaches empty before the cell does
     rows = trace.run(samples)
     assert rows["soc"][-1] < max(rows["delta_1"][-1], rows["delta_2"][-1])
     assert rows["stability_margin"][-1] < 0
