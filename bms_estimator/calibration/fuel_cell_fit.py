@@ -102,8 +102,8 @@ def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFi
         if std[worst] <= MAX_RELATIVE_STD:
             break
         j = free.pop(worst)
-        accuracy = f"to {std[worst]:.0%} only" if std[worst] < 1.0 else "not at all"
-        undetermined[KEYS[j]] = f"determined {accuracy} by these data; it needs {REQUIRED_DATA[NAMES[j]]}"
+        accuracy = f"only to {std[worst]:.0%}" if std[worst] < 1.0 else "not"
+        undetermined[KEYS[j]] = f"{accuracy} determined by these data; it needs {REQUIRED_DATA[NAMES[j]]}"
     if not free:
         reasons = "; ".join(f"{key}: it needs {REQUIRED_DATA[name]}" for key, name in zip(KEYS, NAMES, strict=True))
         raise UserError(f"these data determine no parameter of a fuel cell: {reasons}")

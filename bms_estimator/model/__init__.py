@@ -1,1 +1,1 @@
-"""Typed values: samples, cells, settings, estimates."""
+"""Typed values: samples, cell files, published payloads."""

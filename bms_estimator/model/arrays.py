@@ -1,4 +1,4 @@
-"""Types of arrays and records that kernels and their callers share."""
+"""Array and record types of kernels and their callers."""
 
 from typing import Any
 
@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+"""Array of floats."""
 Record = Any
-"""An element of a structured array inside a kernel: numba resolves its fields, the type checker does not."""
+"""Element of a structured array in a kernel. Its type is Any, because only numba resolves its fields."""
 Records = NDArray[np.void]
-"""A structured array."""
+"""Structured array."""

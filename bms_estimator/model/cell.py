@@ -1,7 +1,7 @@
-"""The cell model: what ``cell.toml`` holds, and its a1..a21.
+"""Cell model: contents of a cell file, with a1..a21.
 
-The values describe ``series_count`` cells in series as one two-terminal object; ``CellModel.pack``
-scales them to packs of such objects in series and parallel.
+The values describe ``series_count`` cells in series as one two-terminal object. ``CellModel.pack`` scales them to packs
+of such objects in series and parallel.
 """
 
 import itertools
@@ -29,7 +29,7 @@ ELEMENTS = {
 
 
 class Resistance(Strict):
-    """R(SOC) = amplitude e^(-exponent SOC) + offset: (2.5), (2.6), (2.9)."""
+    """Resistance R(SOC) = amplitude e^(-exponent SOC) + offset, (2.5), (2.6), (2.9)."""
 
     amplitude_ohm: Positive
     exponent: Positive
@@ -42,7 +42,7 @@ class Resistance(Strict):
 
 
 class Capacitance(Strict):
-    """C(SOC) = -amplitude e^(-exponent SOC) + offset: (2.7), (2.8)."""
+    """Capacitance C(SOC) = -amplitude e^(-exponent SOC) + offset, (2.7), (2.8)."""
 
     amplitude_farad: Positive
     exponent: Positive
@@ -55,7 +55,7 @@ class Capacitance(Strict):
 
 
 class ChenMoraOcv(Strict):
-    """E_o(SOC) of (2.10): -a16 e^(-a17 SOC) + a18 + a19 SOC - a20 SOC^2 + a21 SOC^3."""
+    """OCV in the form (2.10): E_o(SOC) = -a16 e^(-a17 SOC) + a18 + a19 SOC - a20 SOC^2 + a21 SOC^3."""
 
     form: Literal["chen-mora"] = "chen-mora"
     amplitude_v: Positive = Field(description="a16")
@@ -67,12 +67,12 @@ class ChenMoraOcv(Strict):
 
     @property
     def a(self) -> tuple[float, ...]:
-        """a16..a21."""
+        """Parameters a16..a21."""
         return self.amplitude_v, self.exponent, self.constant_v, self.linear_v, self.quadratic_v, self.cubic_v
 
 
 class TableOcv(Strict):
-    """E_o(SOC) at 25 C through measured points (monotone, PCHIP), with its error, hysteresis and entropy."""
+    """OCV at 25 C as a table with monotone interpolation (PCHIP), with its error, hysteresis and temperature coefficient."""
 
     form: Literal["table"]
     soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=4, description="increasing, from 0 to 1")
@@ -105,9 +105,10 @@ class TableOcv(Strict):
 
 
 class Ladder(Strict):
-    """Overpotential as a series resistance and RC branches of fixed time constants (``kernels.cell_model.rc_ladder.TAU_S``).
+    """RC ladder: series resistance and RC pairs with fixed time constants (``kernels.cell_model.rc_ladder.TAU_S``).
 
-    R(SOC, T) = weak + strong, each with the Arrhenius factor of its own activation energy, both given at 25 C.
+    R(SOC, T) is the sum of a weak and a strong part, given at 25 C, each with the Arrhenius factor of its activation
+    energy.
     """
 
     soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=2, description="increasing")
@@ -126,7 +127,7 @@ class Ladder(Strict):
     temperature_c: tuple[float, float] = Field(description="lowest and highest cell temperature of those captures")
 
     @model_validator(mode="after")
-    def _of_one_shape(self) -> Self:
+    def _equal_lengths(self) -> Self:
         if any(b <= a for a, b in itertools.pairwise(self.soc)):
             raise ValueError("soc must increase")
         for name in ("weak_ohm", "strong_ohm"):
@@ -139,7 +140,7 @@ class Ladder(Strict):
 
 
 class Bounds(Strict):
-    """Settings of (3.18) for one parameter: its bounds, the confidence in each, the initial value."""
+    """Settings of (3.18) for one parameter: bounds, weight of each bound, and initial value."""
 
     upper: Positive = Field(description="a_iu")
     lower: Positive = Field(description="a_il")
@@ -197,7 +198,7 @@ class Cell(Rated):
 
 
 class CellModel(Strict):
-    """A cell file: the cell, its elements (2.5)-(2.9), its OCV, and the bounds of the adaptation law."""
+    """Contents of a cell file: ratings, elements (2.5)-(2.9), OCV, RC ladder, and bounds of the adaptive law."""
 
     cell: Cell
     r_ts: Resistance
@@ -219,24 +220,24 @@ class CellModel(Strict):
 
     @property
     def a(self) -> NDArray[np.float64]:
-        """a1..a15 at index 1..15, and a16..a21 when the OCV has the form (2.10), else NaN. Shape (22,)."""
+        """Parameters a1..a21 at index 1..21, shape (22,); a16..a21 are NaN unless the OCV has the form (2.10)."""
         ocv = self.ocv.a if isinstance(self.ocv, ChenMoraOcv) else (np.nan,) * 6
         return np.array([np.nan, *self.r_ts.a, *self.r_tl.a, *self.c_ts.a, *self.c_tl.a, *self.r_s.a, *ocv])
 
     def bounds(self, index: int) -> Bounds:
-        """Bounds of a_index: the configured ones, or a quarter to four times the model's value, with that as limit."""
+        """Return the configured bounds of a_index, or a quarter and four times the model's value with that value as limit."""
         configured = self.adaptation.get(f"a{index}")
         if configured is not None:
             return configured
         value = float(self.a[index])
         rate = 100.0
         if index in (9, 12) and self.a[index - 2] > value:
-            # Lemma 4.1.1: a9 (a12) must settle faster than a7 (a10), but not by more than their ratio allows
+            # Lemma 4.1.1: the rate of a9 (a12) must exceed that of a7 (a10), but by less than the ratio of both values
             rate *= float(np.sqrt(self.a[index - 2] / value))
         return Bounds(upper=4.0 * value, lower=0.25 * value, weight_upper=0.2 * rate, weight_lower=0.8 * rate)
 
     def pack(self, series: int, parallel: int) -> "CellModel":
-        """Return the model of ``series`` x ``parallel`` cells: voltages, resistances, capacitances and capacity scaled."""
+        """Return the model of ``series`` x ``parallel`` cells, with all values scaled."""
         if series == parallel == 1:
             return self
         return _scaled(self, series, parallel)
@@ -245,7 +246,7 @@ class CellModel(Strict):
 def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
     ohm, farad = series / parallel, parallel / series
 
-    def times(part: Strict, factor: dict[str, float]) -> dict[str, object]:
+    def scaled_by_unit(part: Strict, factor: dict[str, float]) -> dict[str, object]:
         table = part.model_dump()
         for key, value in table.items():
             unit = key.rsplit("_", 1)[-1]
@@ -254,17 +255,17 @@ def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
         return table
 
     factor = {"ohm": ohm, "farad": farad, "v": float(series), "a": parallel, "ah": parallel}
-    elements = {name: times(getattr(model, name), factor) for name in ELEMENTS}
+    elements = {name: scaled_by_unit(getattr(model, name), factor) for name in ELEMENTS}
     adaptation = {}
     for name, bounds in model.adaptation.items():
-        element, place = divmod(int(name[1:]) - 1, 3)
-        scale = 1.0 if place == 1 else farad if element in (2, 3) else ohm
+        element, coefficient = divmod(int(name[1:]) - 1, 3)  # coefficient 1 is the exponent, elements 2, 3 capacitances
+        scale = 1.0 if coefficient == 1 else farad if element in (2, 3) else ohm
         table = bounds.model_dump()
         adaptation[name] = table | {k: table[k] * scale for k in ("upper", "lower", "initial") if table[k] is not None}
-    cell = times(model.cell, factor) | {"series_count": model.cell.series_count * series}
-    ladder = None if model.ladder is None else times(model.ladder, factor)
+    cell = scaled_by_unit(model.cell, factor) | {"series_count": model.cell.series_count * series}
+    ladder = None if model.ladder is None else scaled_by_unit(model.ladder, factor)
     return CellModel.model_validate(
-        {"cell": cell, "ocv": times(model.ocv, factor), "ladder": ladder, "adaptation": adaptation, **elements}
+        {"cell": cell, "ocv": scaled_by_unit(model.ocv, factor), "ladder": ladder, "adaptation": adaptation, **elements}
     )
 
 
@@ -274,17 +275,17 @@ def _product(value: Any, factor: float) -> Any:
 
 
 def shipped_cells() -> list[str]:
-    """Names of the shipped cells."""
+    """Return the names of the shipped cells."""
     return _names("cells")
 
 
 def generic_cells() -> list[str]:
-    """Names of the chemistries that there is a generic cell of."""
+    """Return the names of the generic cells, one for each chemistry."""
     return _names("cells/generic")
 
 
 def shipped_fuel_cells() -> list[str]:
-    """Names of the shipped fuel cells."""
+    """Return the names of the shipped fuel cells."""
     return _names("cells/fuel_cell")
 
 
@@ -295,7 +296,7 @@ def is_fuel_cell(name_or_path: str | Path) -> bool:
     try:
         return "fuel_cell" in tomllib.loads(Path(name_or_path).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        return False  # the reader of the cell file reports errors
+        return False  # read_toml reports errors of the file later
 
 
 def _names(folder: str) -> list[str]:
@@ -307,14 +308,13 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
     """Load a generic or shipped cell by name, or a cell file by path.
 
     Args:
-        name_or_path: As in ``generic_cells`` or ``shipped_cells``, else a path.
-        capacity_ah: Capacity [Ah]. A generic cell needs it and is scaled by it: resistances go down and
-            capacitances up with it. In any other it replaces the capacity alone: there it is the cell's own, faded
-            with age or measured better, and its resistances were measured on it.
+        name_or_path: Name in ``generic_cells`` or ``shipped_cells``, otherwise a path.
+        capacity_ah: Capacity [Ah]. A generic cell requires a capacity, with which its resistances and capacitances are
+            scaled. In any other cell the argument replaces only the capacity, because the resistances were measured.
 
     Raises:
-        UserError: No such cell or file, or a value in it that is not allowed; a capacity that is missing or cannot be;
-            a fuel cell, which has neither SOC nor capacity.
+        UserError: No such cell or file, an invalid value in the file, a missing or invalid capacity, or a fuel cell, which
+            has neither SOC nor capacity.
     """
     text = str(name_or_path)
     if is_fuel_cell(text):
@@ -322,17 +322,17 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
             f"{text} is a fuel cell, which has no state of charge, capacity or OCV: this needs a battery cell"
         )
     if capacity_ah is not None and not 0.0 < capacity_ah < math.inf:
-        raise UserError(f"capacity_ah = {capacity_ah}: must be above 0 (what the cell holds, in ampere-hours)")
+        raise UserError(f"capacity_ah = {capacity_ah}: must be above 0 (capacity in ampere-hours)")
     if text in generic_cells():
         if capacity_ah is None:
             raise UserError(f"{text} is a generic cell: give its capacity, capacity_ah of [pack] or --capacity-ah")
         return _scaled(_packaged(f"cells/generic/{text}.toml"), 1, capacity_ah)
-    cell = _packaged(f"cells/{text}.toml") if text in shipped_cells() else read_toml(existing(text), CellModel)
+    cell = _packaged(f"cells/{text}.toml") if text in shipped_cells() else read_toml(cell_file_path(text), CellModel)
     return cell if capacity_ah is None else with_capacity(cell, capacity_ah)
 
 
 def with_capacity(cell: CellModel, capacity_ah: float) -> CellModel:
-    """Return the cell with another capacity [Ah]; its resistances stay as measured."""
+    """Return the cell with another capacity [Ah] and unchanged resistances."""
     return cell.model_copy(
         update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": None})}
     )
@@ -343,16 +343,16 @@ def _packaged(name: str) -> CellModel:
         return read_toml(path, CellModel)
 
 
-def existing(text: str) -> Path:
+def cell_file_path(text: str) -> Path:
     """Return the path of a cell file.
 
     Raises:
-        UserError: It does not exist.
+        UserError: The file does not exist.
     """
     path = Path(text)
     if not text or not path.exists():
         raise UserError(
-            f"{text or 'a cell of no name'}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())}), "
+            f"{text or '(empty name)'}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())}), "
             f"nor a generic one ({', '.join(generic_cells())}), nor a fuel cell ({', '.join(shipped_fuel_cells())})"
         )
     return path

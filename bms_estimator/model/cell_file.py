@@ -1,4 +1,4 @@
-"""Writing a cell file: every command that finds out something about a cell writes it with ``write_cell``."""
+"""Writer of cell files."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,18 +9,18 @@ from bms_estimator.model.cell import ELEMENTS
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.fuel_cell import PackModel
 
-SOURCES = {"r_ts": "(2.5)", "r_tl": "(2.6)", "c_ts": "(2.7)", "c_tl": "(2.8)", "r_s": "(2.9)"}
-"""Section -> its equation."""
+EQUATIONS = {"r_ts": "(2.5)", "r_tl": "(2.6)", "c_ts": "(2.7)", "c_tl": "(2.8)", "r_s": "(2.9)"}
+"""Equation of each section, for its comment."""
 DIGITS = 8
-"""Significant digits: a hundredth of a microvolt of a cell's voltage."""
+"""Number of significant digits. The rounding error of a cell's voltage is below 0.1 uV."""
 
 
 def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None:
     """Write a cell file that ``load_any`` reads.
 
     Args:
-        path: Overwritten if it exists.
-        cell: Numbers are rounded to ``DIGITS`` significant ones.
+        path: Path of the file, which is overwritten if it exists.
+        cell: Cell model. Its numbers are rounded to ``DIGITS`` significant digits.
         remarks: Origin of the values, one line each, for the head of the file.
 
     Raises:
@@ -41,7 +41,7 @@ def cell_text(cell: PackModel, remarks: Sequence[str] = ()) -> str:
         document.add(name, section)
         if name in ELEMENTS:
             first = ELEMENTS[name][0]
-            section.comment(f"{SOURCES[name]} a{first}, a{first + 1}, a{first + 2}")
+            section.comment(f"{EQUATIONS[name]} a{first}, a{first + 1}, a{first + 2}")
     return tomlkit.dumps(document).rstrip() + "\n"
 
 
@@ -54,7 +54,7 @@ def _section(values: dict[str, object]) -> tomlkit.items.Table:
 
 
 def _bounds(values: dict[str, dict[str, object]]) -> tomlkit.items.Table:
-    """``[adaptation]``: one parameter, one line."""
+    """Return the section ``[adaptation]`` with one line for each parameter."""
     section = tomlkit.table()
     for parameter, bounds in values.items():
         line = tomlkit.inline_table()
@@ -65,10 +65,10 @@ def _bounds(values: dict[str, dict[str, object]]) -> tomlkit.items.Table:
 
 
 def _value(value: object) -> object:
-    """Format a value as TOML: rounded; a long list over several lines."""
+    """Return a value for TOML: numbers rounded, lists with several lines."""
     if isinstance(value, list):
         array = tomlkit.array()
-        if value and isinstance(value[0], list):  # a table: one row, one line
+        if value and isinstance(value[0], list):  # a matrix: one line for each row
             for row in value:
                 line = tomlkit.array()
                 line.extend(_value(x) for x in row)

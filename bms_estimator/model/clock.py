@@ -1,4 +1,4 @@
-"""The clocks, taken as a value so that tests can step them."""
+"""Clocks of the host as a value, so that tests can replace them."""
 
 import time
 from collections.abc import Callable
@@ -8,21 +8,21 @@ from datetime import UTC, datetime
 
 @dataclass(frozen=True)
 class Clock:
-    """Two clocks: ``wall`` gives the time of day (and may be stepped), ``monotonic`` gives durations."""
+    """Pair of clocks: ``wall`` for the time of day, which may be set, and ``monotonic`` for durations [s]."""
 
     wall: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic
 
     def utc(self) -> str:
-        """Wall clock now, ISO 8601."""
+        """Return the present wall clock time in ISO 8601."""
         return iso_utc(self.wall())
 
 
 def since_boot() -> float:
-    """Return the time since boot [s]; it never steps and counts while the machine sleeps, as the cell does not sleep."""
+    """Return the time since boot, with suspended time [s], because the load continues while the host is suspended."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def iso_utc(epoch_s: float) -> str:
-    """Seconds since 1970 as ISO 8601 in UTC with milliseconds: ``2024-05-01T12:00:00.250Z``."""
+    """Return seconds since 1970 in ISO 8601, UTC, with milliseconds: ``2024-05-01T12:00:00.250Z``."""
     return datetime.fromtimestamp(epoch_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

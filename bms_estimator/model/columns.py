@@ -1,4 +1,4 @@
-"""Columns by name: those of a capture, and those of its estimates. Names contain the unit."""
+"""Columns of a capture or of its estimates by name. Names contain the unit."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Columns(Mapping[str, NDArray[Any]]):
-    """Equally long columns of one capture, a mapping from name to array.
+    """Columns of equal length, a mapping from name to array.
 
     Attributes:
-        rows: Shape (n,), a structured array: the same numbers row by row, as ``Estimator.run`` takes and gives them.
-        name: What to call it in messages.
+        rows: Shape (n,), structured array with the columns as fields, as in ``Estimator.run``.
+        name: Name of the capture for messages.
     """
 
     rows: NDArray[np.void]

@@ -1,4 +1,4 @@
-"""Reading a TOML file into a pydantic model, with errors that name file, key, value and constraint."""
+"""Reader of TOML files into pydantic models, with errors that name file, key, value and constraint."""
 
 import re
 import tomllib
@@ -26,10 +26,10 @@ def _number(value: object) -> object:
     """Return a number unchanged.
 
     Raises:
-        ValueError: pydantic would take it for one: ``true`` for 1, and the text "3_9" for 39.
+        ValueError: The value is a boolean or a string, which pydantic would convert: ``true`` to 1 and "3_9" to 39.
     """
     if isinstance(value, bool):
-        raise ValueError("must be a number")  # noqa: TRY004 - what pydantic takes for a wrong value
+        raise ValueError("must be a number")  # noqa: TRY004 - pydantic handles ValueError as an invalid value
     if isinstance(value, str):
         raise ValueError("must be a number, without quotes")  # noqa: TRY004
     return value
@@ -51,35 +51,35 @@ def _make_strict(schema: Any) -> None:
 
 
 class Strict(BaseModel):
-    """Base of all configured values: unknown keys are errors, numbers are numbers, values do not change after load."""
+    """Base of all configured values: unknown keys and values of other types are errors, instances are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return pydantic's schema with strict numbers: it would accept ``true`` as 1 and the text "3_9" as 39."""
+        """Return pydantic's schema with strict numbers and booleans."""
         schema = handler(source)
         _make_strict(schema)
         return schema
 
 
 T = TypeVar("T", bound=BaseModel)
-FEW = 12
-"""Maximum number of keys of a section that are listed for an unknown one."""
+MAX_LISTED_KEYS = 12
+"""Maximum number of keys of a section that an error on an unknown key lists."""
 
 
 MESSAGES = {
     "model_type": "must be a table, {key = value}",
     "string_pattern_mismatch": "is not of the form that it must have",
 }
-"""Messages by pydantic's error type, where its own ones are for programmers."""
+"""Replacements for messages of pydantic that are for programmers, by error type."""
 
 
 def read_toml(path: Path, model: type[T]) -> T:
-    """Load and check a TOML file.
+    """Load and validate a TOML file.
 
     Raises:
-        UserError: File missing, not TOML, or a value not allowed; one line per wrong key.
+        UserError: The file cannot be read, is not TOML, or contains invalid keys or values, with one line for each.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -91,10 +91,10 @@ def read_toml(path: Path, model: type[T]) -> T:
 
 
 def parse_toml(text: str, model: type[T], path: str) -> T:
-    """Check the text of a TOML file; ``path`` is what messages call it.
+    """Validate the text of a TOML file; ``path`` is its name in messages.
 
     Raises:
-        UserError: Not TOML, or a value not allowed; one line per wrong key.
+        UserError: The text is not TOML or contains invalid keys or values, with one line for each.
     """
     try:
         table = tomllib.loads(text)
@@ -109,7 +109,7 @@ def parse_toml(text: str, model: type[T], path: str) -> T:
 
 
 def _line(path: str, model: type[BaseModel], table: object, detail: Any) -> str:
-    """One wrong key: ``pack.toml: cell.capacity_ah = -6.6: must be above 0 (rated capacity ...)``."""
+    """Return the message of one error: ``pack.toml: cell.capacity_ah = -6.6: must be above 0 (rated capacity ...)``."""
     keys = _keys(table, detail)
     where = ".".join(keys)
     described = _description(model, keys)
@@ -117,7 +117,7 @@ def _line(path: str, model: type[BaseModel], table: object, detail: Any) -> str:
     if detail["type"] in ("missing", "union_tag_not_found"):
         return f"{path}: {where}: missing{hint}"
     if detail["type"] == "extra_forbidden":
-        return f"{path}: {where}: unknown key{_meant(model, keys)}"
+        return f"{path}: {where}: unknown key{_suggestion(model, keys)}"
     if detail["type"] == "union_tag_invalid":
         return f"{path}: {where}.{_discriminator(detail)} = {detail['ctx']['tag']!r}: must be one of {detail['ctx']['expected_tags']}"
     message = MESSAGES.get(detail["type"], detail["msg"].removeprefix("Value error, "))
@@ -129,9 +129,9 @@ def _line(path: str, model: type[BaseModel], table: object, detail: Any) -> str:
 
 
 def _keys(table: object, detail: Any) -> list[str]:
-    """Return the keys of the file that lead to an error, without the model names that pydantic inserts."""
-    keys, way = [], detail["loc"]
-    for key in way[:-1]:
+    """Return the path of keys in the file to an error, without the model names that pydantic inserts."""
+    keys, location = [], detail["loc"]
+    for key in location[:-1]:
         if isinstance(table, dict) and key in table:
             keys.append(str(key))
             table = table[key]
@@ -139,7 +139,7 @@ def _keys(table: object, detail: Any) -> list[str]:
             keys.append(str(key))
             table = table[key] if key < len(table) else None
     kind = [_discriminator(detail)] if detail["type"] == "union_tag_not_found" else []
-    last = [] if detail["type"] == "value_error" and way and not _has(table, way[-1]) else way[-1:]
+    last = [] if detail["type"] == "value_error" and location and not _has(table, location[-1]) else location[-1:]
     return [*keys, *map(str, last), *kind]
 
 
@@ -148,13 +148,13 @@ def _discriminator(detail: Any) -> str:
     return str(detail["ctx"]["discriminator"]).strip("'")
 
 
-def _meant(model: type[BaseModel], keys: list[str]) -> str:
-    """Suggest the key that an unknown one may be, or list the keys if they are few; empty otherwise."""
+def _suggestion(model: type[BaseModel], keys: list[str]) -> str:
+    """Return a suggestion for an unknown key: a similar key, or all keys if they are few; otherwise an empty text."""
     models = _within(model, keys[:-1])
     known = list(dict.fromkeys(field.alias or name for m in models for name, field in m.model_fields.items()))
     if close := get_close_matches(keys[-1], known, n=1):
         return f"; is {close[0]} meant?"
-    return f"; there are {', '.join(known)}" if len(models) == 1 and 0 < len(known) <= FEW else ""
+    return f"; there are {', '.join(known)}" if len(models) == 1 and 0 < len(known) <= MAX_LISTED_KEYS else ""
 
 
 def _within(model: type[BaseModel], keys: list[str]) -> list[type[BaseModel]]:
@@ -167,7 +167,7 @@ def _within(model: type[BaseModel], keys: list[str]) -> list[type[BaseModel]]:
 
 
 def _has(table: object, key: object) -> bool:
-    """Return True if a key leads further."""
+    """Return True if ``table`` can contain ``key``."""
     return key in table if isinstance(table, dict) else isinstance(table, list)
 
 
@@ -190,7 +190,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def without_secrets(text: str) -> str:
-    """Text of a URL, or of several, without everything before the last @, which may contain a name and a password."""
+    """Return a text with everything before the last @ removed, because a URL may contain a user name and a password."""
     return re.sub(r".*@", "***@", text, flags=re.DOTALL)
 
 
@@ -198,12 +198,12 @@ def write_text(path: Path, text: str, *, make_folder: bool = False) -> None:
     """Write a file in UTF-8.
 
     Args:
-        path: Any existing file.
-        text: All of it.
+        path: Path of the file, which is overwritten if it exists.
+        text: Contents of the file.
         make_folder: True to create a missing folder.
 
     Raises:
-        UserError: It cannot be written.
+        UserError: The file cannot be written.
     """
     try:
         if make_folder:

@@ -1,35 +1,35 @@
-"""Foreign text to numbers: decimal ones and nothing else."""
+"""Strict parser of decimal numbers in text from devices and files."""
 
 import math
 import re
 
 PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
-"""Bytes of printed lines."""
+"""Bytes allowed in lines of text: printable ASCII, tab, and line ends."""
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
-"""A decimal number. Python's ``float`` also takes ``3_9`` for 39, other scripts' digits, ``nan`` and ``inf``."""
+"""Pattern of a decimal number. Python's ``float`` would also accept ``3_9``, digits of other scripts, ``nan`` and ``inf``."""
 NOT_MEASURED = frozenset({"nan", "inf", "infinity", "ovf"})
-"""Words that programs print in place of a number, perhaps with a sign."""
+"""Words that devices print for a missing value, with an optional sign."""
 
-_WHOLE = re.compile(NUMBER)
+_NUMBER = re.compile(NUMBER)
 
 
 def number(text: str) -> float:
-    """Parse a number in ``text``, with blanks around it allowed.
+    """Parse a decimal number with optional white space around it.
 
     Raises:
-        ValueError: It is not a number, or too large.
+        ValueError: The text is not a decimal number, or the number is too large.
     """
     text = text.strip(" \t\r\n")
-    if not _WHOLE.fullmatch(text) or not math.isfinite(value := float(text)):
+    if not _NUMBER.fullmatch(text) or not math.isfinite(value := float(text)):
         raise ValueError(f"{text[:40]!r}: no decimal number")
     return value
 
 
 def measured(text: str) -> float:
-    """Parse a number as ``number`` does; NaN for a word that means a missing value.
+    """Parse a decimal number, or a word of ``NOT_MEASURED`` as NaN.
 
     Raises:
-        ValueError: It is neither.
+        ValueError: The text is neither.
     """
     return math.nan if text.strip().lstrip("+-").lower() in NOT_MEASURED else number(text)

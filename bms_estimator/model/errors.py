@@ -1,8 +1,8 @@
-"""Errors that a user can fix: shown without a traceback, exit code 2."""
+"""Error that a user can fix. Commands print it without a traceback and exit with code 2."""
 
 
 class UserError(Exception):
     """Invalid input, setting or device.
 
-    The message says what is wrong, where, and what to do.
+    The message contains the fault, its place, and a remedy.
     """

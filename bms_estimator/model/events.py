@@ -1,4 +1,4 @@
-"""Topic ``event``: what happened to a pack, once each, found by comparing one snapshot with the one before. Pure."""
+"""Events of a pack for the topic ``event``, from the differences between successive snapshots."""
 
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
@@ -9,9 +9,9 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import Health, Payload, Snapshot
 
 MIN_UNSEEN_S = 1.0
-"""Shorter gaps are counted in ``health`` alone [s]."""
+"""Minimum duration of a gap that causes an event [s]. Shorter gaps only count in ``health``."""
 NOT_SAVED = ("cannot be saved", "not saved")
-"""Beginnings of ``health.checkpoint`` when the disk does not accept it."""
+"""Prefixes of ``health.checkpoint`` after a failed checkpoint."""
 
 Name = Literal[
     "start",
@@ -30,28 +30,28 @@ Name = Literal[
 
 
 class Event(Payload):
-    """Topic ``event``, not retained: something that happened."""
+    """Topic ``event``, not retained: one event of a pack."""
 
-    time: str = Field(description="when it was seen, ISO 8601, UTC")
-    name: Name = Field(description="what it is")
-    text: str = Field(description="for people: the reason, what to do")
+    time: str = Field(description="time of detection, ISO 8601, UTC")
+    name: Name = Field(description="kind of event")
+    text: str = Field(description="description: reason and remedy")
 
 
-class _Found(NamedTuple):
+class _EventText(NamedTuple):
     name: Name
     text: str
 
 
 def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
-    """Yield the events between two snapshots.
+    """Return the events between two snapshots.
 
     Args:
-        before: The snapshot before; None: the service has just started.
-        snapshot: The snapshot.
+        before: Previous snapshot; None: the service has just started.
+        snapshot: Present snapshot.
     """
     health = snapshot.health
     if before is None:
-        started = _Found("start", f"checkpoint: {health.checkpoint}")
+        started = _EventText("start", f"checkpoint: {health.checkpoint}")
         found = [started, *_unseen(health.unseen_s or 0.0), *_sensor(None, health)]
         found += [*_suspicions([], health.suspects), *_checkpoint("", health)]
     elif before.health is health:
@@ -66,64 +66,65 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
     return of_health + [Event(time=seen, name=name, text=text) for name, text in _alarms(before, snapshot)]
 
 
-def _alarms(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Found]:
-    """Yield raised and ended alarms. One that ended and was raised again in between has another ``since``.
+def _alarms(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
+    """Yield raised and cleared alarms.
 
-    An alarm raised before the start was reported by the run before.
+    An alarm that was cleared and raised again between the snapshots has another ``since``. The previous run reported alarms
+    that were raised before the start.
     """
     was = {alarm.name: alarm.since for alarm in before.alarms} if before else {}
     for alarm in snapshot.alarms:
         since = was.get(alarm.name)
         if since is not None and since != alarm.since:
-            yield _Found("alarm_cleared", alarm.name)
+            yield _EventText("alarm_cleared", alarm.name)
         if alarm.since is not None and since != alarm.since and alarm.since >= snapshot.info.started:
-            yield _Found("alarm_raised", f"{alarm.name}: {alarm.text}")
+            yield _EventText("alarm_raised", f"{alarm.name}: {alarm.text}")
     yield from _watched(before, snapshot)
 
 
-def _watched(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Found]:
-    """Alarms that can no longer be watched, and those that can again."""
+def _watched(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
+    """Yield alarms whose quantity has become unavailable or available."""
     was = {alarm.name: alarm.watched for alarm in before.alarms} if before else {}
     for alarm in snapshot.alarms:
         if was.get(alarm.name, True) and not alarm.watched:
-            yield _Found("alarm_unwatched", f"{alarm.name}: {alarm.unwatched_reason}")
+            yield _EventText("alarm_unwatched", f"{alarm.name}: {alarm.unwatched_reason}")
         elif alarm.watched and not was.get(alarm.name, True):
-            yield _Found("alarm_watched", alarm.name)
+            yield _EventText("alarm_watched", alarm.name)
 
 
-def _unseen(unseen_s: float) -> Iterator[_Found]:
+def _unseen(unseen_s: float) -> Iterator[_EventText]:
     if unseen_s >= MIN_UNSEEN_S:
-        yield _Found("unseen", f"nobody measured for {unseen_s:.1f} s")
+        yield _EventText("unseen", f"no measurements for {unseen_s:.1f} s")
 
 
-def _sensor(was: Health | None, health: Health) -> Iterator[_Found]:
+def _sensor(was: Health | None, health: Health) -> Iterator[_EventText]:
     if was is not None and was.sensor_online == health.sensor_online:
         return
     if health.sensor_online:
-        yield _Found("sensor_online", "samples come")
-    elif was is not None:  # none at start
-        yield _Found("sensor_offline", health.sensor_message or "")
+        yield _EventText("sensor_online", "samples arrive")
+    elif was is not None:  # an offline sensor at the start causes no event
+        yield _EventText("sensor_offline", health.sensor_message or "")
 
 
-def _suspicions(was: list[str], now: list[str]) -> Iterator[_Found]:
-    """Yield suspicions that began and ended; numbers in their sentences may change meanwhile."""
+def _suspicions(was: list[str], now: list[str]) -> Iterator[_EventText]:
+    """Yield diagnostics that began and ended. The numbers in a diagnostic may change without an event."""
     before, after = ({_kind(sentence): sentence for sentence in sentences} for sentences in (was, now))
     for kind, sentence in after.items():
         if kind not in before:
-            yield _Found("suspicion", sentence)
+            yield _EventText("suspicion", sentence)
     for kind, sentence in before.items():
         if kind not in after:
-            yield _Found("suspicion_cleared", sentence)
+            yield _EventText("suspicion_cleared", sentence)
 
 
 def _kind(sentence: str) -> str:
-    """Return the constant part of a suspicion's sentence."""
+    """Return the constant part of a diagnostic's text."""
     return next((suspect.text for suspect in InputFault if sentence.endswith(suspect.text)), sentence)
 
 
-def _checkpoint(was: str, health: Health) -> Iterator[_Found]:
+def _checkpoint(was: str, health: Health) -> Iterator[_EventText]:
     failed, fails = was.startswith(NOT_SAVED), health.checkpoint.startswith(NOT_SAVED)
     if fails and not failed:
-        yield _Found("checkpoint_fails", health.checkpoint)
+        yield _EventText("checkpoint_fails", health.checkpoint)
     elif failed and not fails:
-        yield _Found("checkpoint_saved", health.checkpoint)
+        yield _EventText("checkpoint_saved", health.checkpoint)

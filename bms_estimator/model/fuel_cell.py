@@ -1,7 +1,7 @@
-"""The fuel cell: what its file holds, in the place of a cell file.
+"""Fuel cell model: contents of a fuel cell file.
 
-The values describe ``series_count`` cells in series as one two-terminal object; ``FuelCellModel.pack`` scales them to
-several such stacks. There is no capacity and no SOC: a stack delivers as long as it is fed.
+The values describe ``series_count`` cells in series as one two-terminal object. ``FuelCellModel.pack`` scales them to
+several such stacks. A fuel cell has no capacity and no SOC.
 """
 
 import math
@@ -16,7 +16,7 @@ from pydantic import Field
 from bms_estimator.model.cell import (
     CellModel,
     Rated,
-    existing,
+    cell_file_path,
     is_fuel_cell,
     load_cell,
     shipped_fuel_cells,
@@ -37,7 +37,7 @@ Parameter = Literal[
 
 
 class FuelCell(Strict):
-    """Losses of a stack, of all its cells in series, and its gas supply."""
+    """Parameters of a stack: losses of all its cells in series, and gas supply."""
 
     r_ohm: Positive = Field(description="membrane and contacts")
     tafel_slope_v: Positive = Field(description="growth of the activation loss when the current grows e times")
@@ -54,7 +54,7 @@ class FuelCell(Strict):
 
 
 class FuelCellModel(Strict):
-    """A fuel cell's file."""
+    """Contents of a fuel cell file."""
 
     cell: Rated
     fuel_cell: FuelCell
@@ -64,10 +64,10 @@ class FuelCellModel(Strict):
 
     @property
     def a(self) -> NDArray[np.float64]:
-        """Constants for the kernels, shape (16,).
+        """Constants of the kernels, shape (16,).
 
-        From 1 on the parameters of ``kernels.cell_model.fuel_cell.NAMES``, then cells in series, temperature [C], hydrogen and
-        oxygen [atm].
+        Index 1..7: parameters in the order of ``kernels.cell_model.fuel_cell.NAMES``. Index 8..11: cells in series,
+        temperature [C], partial pressures of hydrogen and oxygen [atm].
         """
         f = self.fuel_cell
         learned = (f.r_ohm, f.tafel_slope_v, self.activation_v, f.c_dl_farad, f.concentration_v)
@@ -83,11 +83,11 @@ class FuelCellModel(Strict):
         return -self.fuel_cell.tafel_slope_v * math.log(self.fuel_cell.exchange_current_a)
 
     def identified(self, a: NDArray[np.float64], std: dict[Parameter, float]) -> "FuelCellModel":
-        """Return the same stack with other parameters.
+        """Return the stack with identified parameters.
 
         Args:
-            a: As the property ``a``; conditions are ignored.
-            std: Relative standard deviations of those that were identified.
+            a: Constants as in the property ``a``; only the parameters are used.
+            std: Relative standard deviations of the identified parameters.
         """
         r_ohm, tafel_v, activation_v, c_dl, b, limit, internal = (float(f"{value:.6g}") for value in a[1:8])
         values = {
@@ -104,10 +104,10 @@ class FuelCellModel(Strict):
         return self.model_copy(update={"fuel_cell": losses, "std": rounded})
 
     def pack(self, series: int, parallel: int) -> "FuelCellModel":
-        """Return the model of ``series`` x ``parallel`` stacks: voltages, resistance, capacitance and currents scaled.
+        """Return the model of ``series`` x ``parallel`` stacks, with all values scaled.
 
         Raises:
-            UserError: The exchange current is 1 A or more, which leaves no activation loss at 1 A to learn.
+            UserError: The exchange current is 1 A or more, so that the activation loss at 1 A is not positive.
         """
         if series == parallel == 1:
             return self
@@ -131,27 +131,27 @@ class FuelCellModel(Strict):
 
 
 PackModel = CellModel | FuelCellModel
-"""Model of a pack."""
+"""Model of a pack of batteries or of fuel cell stacks."""
 
 
 def load_fuel_cell(name_or_path: str | Path) -> FuelCellModel:
     """Load a shipped fuel cell by name, or a fuel cell file by path.
 
     Raises:
-        UserError: No such name or file, or a value in it that is not allowed.
+        UserError: No such name or file, or an invalid value in the file.
     """
     text = str(name_or_path)
     if text not in shipped_fuel_cells():
-        return read_toml(existing(text), FuelCellModel)
+        return read_toml(cell_file_path(text), FuelCellModel)
     with resources.as_file(resources.files("bms_estimator.model") / f"cells/fuel_cell/{text}.toml") as path:
         return read_toml(path, FuelCellModel)
 
 
 def load_any(name_or_path: str | Path, capacity_ah: float | None = None) -> PackModel:
-    """Load a cell as ``load_cell`` does, or a fuel cell.
+    """Load a battery cell (``load_cell``) or a fuel cell (``load_fuel_cell``).
 
     Raises:
-        UserError: As ``load_cell``; a fuel cell is given a capacity.
+        UserError: No such cell or file, an invalid value, or a capacity for a fuel cell.
     """
     if not is_fuel_cell(name_or_path):
         return load_cell(name_or_path, capacity_ah)

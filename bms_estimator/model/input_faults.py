@@ -1,4 +1,4 @@
-"""Faults that the identifier suspects in its input, and remedies."""
+"""Faults of the input that the identifier detects, and their remedies."""
 
 from enum import IntFlag
 
@@ -17,7 +17,7 @@ class InputFault(IntFlag):
 
     @property
     def text(self) -> str:
-        """Describe every set bit and its remedy; empty if none is set."""
+        """Description and remedy of every set bit."""
         return "; ".join(_TEXT[suspect] for suspect in InputFault if suspect in self)
 
 

@@ -1,4 +1,4 @@
-"""A string that must be one of some names, which are known only at run time."""
+"""Validation of a string by a list of names that is available only at run time."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from pydantic_core.core_schema import no_info_after_validator_function
 
 @dataclass(frozen=True)
 class OneOf:
-    """Annotation of a ``str`` field. Its JSON schema lists the names, as that of a ``Literal`` does."""
+    """Annotation of a ``str`` field, the run-time equivalent of ``Literal``. The JSON schema lists the names."""
 
     names: Collection[str]
 

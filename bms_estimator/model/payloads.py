@@ -1,7 +1,6 @@
 """Published payloads: estimate, parameters, health and info of one pack.
 
-Every number that can be missing is ``None`` and never NaN: the payloads are JSON. The field descriptions
-are published as JSON schema.
+A missing number is ``None``, because JSON has no NaN. The field descriptions are published as JSON schema.
 """
 
 from functools import cached_property
@@ -19,8 +18,8 @@ from bms_estimator.model.quantity import (
 )
 
 FRESH_PERIODS = 3
-"""Number of periods without an accepted sample after which values are stale; the longer one of publish and sample
-period."""
+"""Number of periods without an accepted sample after which values are stale. The period is the longer one of publish and
+sample period."""
 
 PAYLOAD_VERSION = 1
 """Version of all payloads; ``sinks/mqtt/topics.py`` defines when it increases."""
@@ -378,4 +377,4 @@ class Snapshot(NamedTuple):
     health: Health
     info: Info
     alarms: tuple[Alarm, ...] = ()
-    """All monitored limits, raised or not."""
+    """All alarms, raised or not."""

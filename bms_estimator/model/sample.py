@@ -1,7 +1,7 @@
-"""One sample of a battery: what every source yields and the estimator takes.
+"""Samples of a battery, the input of the estimator.
 
-Samples travel in blocks, numpy structured arrays of dtype ``SAMPLE``: what one read of the serial
-descriptor brought, or some thousand rows of a file. A block of one is a sample.
+Sources yield samples in blocks, numpy structured arrays of dtype ``SAMPLE``. A block contains the samples of one chunk
+from a serial line, or some thousand rows of a file.
 """
 
 from enum import IntFlag
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 SAMPLE = np.dtype(
     [
-        ("time_s", "f8"),  # the stream's own clock; never decreasing in a good stream
+        ("time_s", "f8"),  # time on the source's clock, not decreasing without faults
         ("current_a", "f8"),  # positive on discharge
         ("voltage_v", "f8"),  # pack terminals
         ("temperature_c", "f8"),  # NaN where there is no sensor
@@ -31,12 +31,12 @@ CellBlock = NDArray[np.float64]
 """Shape (n, m): voltages of m cells for each of a block's n samples [V], NaN if not reported."""
 
 NO_CELLS: CellBlock = np.empty((0, 0))
-"""Cell voltages of a block without any, of any length."""
+"""Cell voltages of a block of any length without cell voltages."""
 
 MIN_C, MAX_C = -60.0, 200.0
-"""Maximum plausible temperature of a pack or stack [degC]."""
+"""Range of plausible temperatures of a pack or stack [C]."""
 MIN_CELL_V, MAX_CELL_V = -5.0, 10.0
-"""No single cell has a voltage beyond, be it reversed [V]."""
+"""Range of plausible voltages of a single cell, with reversed cells [V]."""
 
 
 class SampleStatus(IntFlag):
@@ -49,8 +49,8 @@ class SampleStatus(IntFlag):
     GAP = 16
 
 
-def forget_beyond(values: NDArray[np.float64], least: float, most: float) -> int:
-    """Replace, in place, values outside ``least``..``most`` with NaN. Returns how many there were."""
-    beyond = (values < least) | (values > most)
-    values[beyond] = np.nan
-    return int(np.count_nonzero(beyond))
+def remove_implausible(values: NDArray[np.float64], low: float, high: float) -> int:
+    """Replace values outside ``low``..``high`` with NaN in place; return their number."""
+    implausible = (values < low) | (values > high)
+    values[implausible] = np.nan
+    return int(np.count_nonzero(implausible))

@@ -1,4 +1,4 @@
-"""Captures of a simulated cell, for the tests of identification."""
+"""Simulated captures for tests of identification."""
 
 import numpy as np
 from scipy.signal import lfilter
@@ -9,11 +9,11 @@ from bms_estimator.model.cell import ELEMENTS, CellModel, Ladder, load_cell
 from bms_estimator.model.sample import SAMPLE
 
 TRUTH = load_cell("ncr18650").model_copy(update={"ladder": None})
-"""Two branches: what (2.2)-(2.9) make of it is the truth."""
+"""True cell with two RC pairs, (2.2)-(2.9)."""
 
 
 def steps(seed=0, duration_s=18_000):
-    """Random steps of 20 to 400 s with rests between them, 1 Hz, mean about C/5."""
+    """Return a current of random steps of 20 to 400 s with rests between them, at 1 Hz, mean about C/5 [A]."""
     rng = np.random.default_rng(seed)
     pieces = [np.zeros(60)]
     while sum(map(len, pieces)) < duration_s:
@@ -22,7 +22,7 @@ def steps(seed=0, duration_s=18_000):
 
 
 def constant(current_a=0.75, duration_s=13_000):
-    """A constant load from its first sample on."""
+    """Return a current that is constant from the first sample on [A]."""
     return np.full(duration_s, current_a)
 
 
@@ -42,7 +42,7 @@ def capture(current_a, *, cell=TRUTH, soc=0.98, noise_v=0.5e-3, seed=0):
 
 
 def wrong_start(factor_ohm=1.7, factor_farad=0.6):
-    """The true cell with wrong elements."""
+    """Return the true cell with wrong elements."""
     table = TRUTH.model_dump()
     for name, (_, amplitude, offset) in ELEMENTS.items():
         factor = factor_farad if name.startswith("c_") else factor_ohm
@@ -60,7 +60,7 @@ LADDER = Ladder(
     error_v=0.005,
     temperature_c=(-20.0, 45.0),
 )
-"""Parts of ``ladder_capture``."""
+"""RC ladder of ``ladder_capture``."""
 
 
 def ladder_capture(current_a, temperature_c, *, soc=0.98, noise_v=0.5e-3, seed=0, told_c=None):

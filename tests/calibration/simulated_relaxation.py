@@ -1,4 +1,4 @@
-"""Captures of simulated voltage relaxation tests, good and bad."""
+"""Simulated captures of voltage relaxation tests, valid and invalid."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ LOAD_A, LOAD_S, REST_S, FIRST_REST_S = 1.5, 360, 900, 60
 
 
 def schedule(*, load_a=LOAD_A, load_s=LOAD_S, rest_s=REST_S, rounds=30):
-    """A short rest, then loads with a rest after each: 19 rounds empty the cell."""
+    """Return the current of a short rest and of loads with a rest after each [A]. 19 rounds empty the cell."""
     return np.r_[np.zeros(FIRST_REST_S), np.tile(np.r_[np.full(load_s, load_a), np.zeros(rest_s)], rounds)]
 
 
 def relaxation(**options):
-    """A full cell through a relaxation test, 1 Hz, noise of 0.5 mV."""
+    """Return samples of a relaxation test of a full cell at 1 Hz with 0.5 mV of noise."""
     noise = {key: options.pop(key) for key in ("noise_v", "seed") if key in options}
     return capture(schedule(**options), soc=1.0, **noise)
 
@@ -27,7 +27,7 @@ def rests_too_short():
 
 
 def glitched(share, seed=5):
-    """Samples at 0 V, as a loose wire gives them."""
+    """Return samples with some at 0 V, as with a loose wire."""
     samples = relaxation()
     hit = np.random.default_rng(seed).random(samples.size) < share
     samples["voltage_v"][hit] = 0.0
@@ -61,4 +61,4 @@ BAD = {
     "span": (small_span, 3.0, "points span SOC 0.93 to 1.00 only"),
     "0 V": (mostly_zero, 3.0, "of 24144 samples are glitches, the first at 2 s with 0.000 V where the median is 3.6"),
 }
-"""Capture, capacity it is counted against [Ah], what the message must hold."""
+"""Function of the capture, capacity [Ah], and text of the error."""

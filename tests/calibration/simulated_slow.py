@@ -1,4 +1,4 @@
-"""Captures of slow discharges and charges of a cell with hysteresis and an ohmic resistance."""
+"""Simulated low-rate captures of a cell with hysteresis and an ohmic resistance."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ CAPACITY_AH, CURRENT_A, OHM, STEP_S = 3.0, 0.15, 0.04, 30.0
 
 
 def true_v(soc):
-    """Halfway between discharge and charge."""
+    """Return the mean of the voltages after discharge and after charge [V]."""
     return chen_mora(np.array(TABLE_1), np.clip(soc, 0.0, 1.0))
 
 

@@ -13,9 +13,9 @@ from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, Case, Truth, cell_f
 from tests.estimator.anywhere.truth import simulate
 
 WRONG_CAPACITY = 1.2
-"""Capacity of the cell file relative to the true one, which must not matter."""
+"""Capacity of the cell file relative to the true one, which must not influence the result."""
 SENSOR_A = 0.004
-"""Offset of a good current sensor, std."""
+"""Std of the offset of a good current sensor [A]."""
 
 
 def samples(current_a: np.ndarray, truth: Truth = OXIDE, soc: float = 0.95, offset_a: float = 0.0) -> SampleBlock:
@@ -29,7 +29,7 @@ def samples(current_a: np.ndarray, truth: Truth = OXIDE, soc: float = 0.95, offs
 
 
 def loads(swing: float, rests: int = 6, rest_s: float = 2400.0) -> np.ndarray:
-    """Rests with a discharge of C/2 before each but the first, ``swing`` of SOC in all."""
+    """Return a current of rests with discharges of C/2 between them, over ``swing`` of SOC in total [A]."""
     one = np.full(round(swing / (rests - 1) * 720.0), 0.5 * OXIDE.capacity_ah)
     rest = np.zeros(round(rest_s / 10.0))
     return np.concatenate([rest, *(rests - 1) * [one, rest]])
@@ -43,8 +43,8 @@ def measured(rows: SampleBlock, model: CellModel, offset_std_a: float | None = N
     return measure_capacity([Columns(rows, "drive")], model, offset_std_a=offset_std_a)
 
 
-def test_the_error_is_as_large_as_said() -> None:
-    """Twelve files and sensors; half-way through the SOC the curve's error is most of it."""
+def test_the_error_of_the_capacity_matches_its_std() -> None:
+    """Twelve cell files and sensors. At mid SOC the error of the curve dominates."""
     errors = []
     for seed in range(12):
         offset_a = SENSOR_A * np.random.default_rng(seed).standard_normal()
@@ -55,13 +55,13 @@ def test_the_error_is_as_large_as_said() -> None:
     assert np.abs(errors).max() < 2.6
 
 
-def test_a_wide_swing_tells_more_than_a_narrow_one() -> None:
+def test_a_wider_soc_span_gives_a_smaller_std() -> None:
     narrow, wide = (measured(samples(loads(swing)), cell()).std_ah for swing in (0.3, 0.8))
     assert wide < 0.6 * narrow
 
 
-def test_the_same_socs_again_tell_the_offset() -> None:
-    """Down and up: the errors of the curve are the same both times, what differs is the sensor's zero."""
+def test_repeated_socs_determine_the_offset() -> None:
+    """The errors of the curve are equal on the way down and up, so that a difference is due to the sensor's offset."""
     down = loads(0.6)
     found = measured(samples(np.concatenate([down, -down, down]), offset_a=0.02), cell())
     assert found.offset_std_a < 0.003
@@ -69,7 +69,7 @@ def test_the_same_socs_again_tell_the_offset() -> None:
     assert abs(found.capacity_ah - OXIDE.capacity_ah) < 2.5 * found.std_ah
 
 
-def test_two_captures_tell_more_than_one() -> None:
+def test_two_captures_give_a_smaller_std_than_one() -> None:
     one, other = (samples(loads(0.5), soc=soc) for soc in (0.95, 0.7))
     alone = measured(one, cell())
     both = measure_capacity([Columns(one, "one"), Columns(other, "other")], cell())
@@ -78,8 +78,8 @@ def test_two_captures_tell_more_than_one() -> None:
     assert abs(both.capacity_ah - OXIDE.capacity_ah) < 2.5 * both.std_ah
 
 
-def test_a_gap_parts_a_capture() -> None:
-    """The charge in the gap is unknown: 0.4 Ah here, and the capacity is still right."""
+def test_a_gap_splits_a_capture() -> None:
+    """An unknown charge of 0.4 Ah in the gap does not change the capacity."""
     rows = samples(loads(0.8))
     middle = int(np.flatnonzero(np.abs(rows["current_a"]) > 0.0)[rows.size // 5])
     cut = np.concatenate([rows[:middle], rows[middle + 40 :]])
@@ -88,9 +88,10 @@ def test_a_gap_parts_a_capture() -> None:
     assert abs(found.capacity_ah - OXIDE.capacity_ah) < 2.5 * found.std_ah
 
 
-def test_a_flat_curve_is_no_anchor() -> None:
+def test_a_rest_on_a_flat_curve_is_no_anchor() -> None:
     with pytest.raises(
-        UserError, match=r"(?s)no capacity.*tells SOC to 0\.\d\d only, the curve rises by 0\.\d{3} V there"
+        UserError,
+        match=r"(?s)no capacity.*determines SOC to \+-0\.\d\d only, because the curve has a slope of 0\.\d{3} V",
     ):
         measured(samples(loads(0.3) * PHOSPHATE.capacity_ah / 3.0, PHOSPHATE, soc=0.6), load_cell("lfp", 2.4))
 
@@ -98,11 +99,11 @@ def test_a_flat_curve_is_no_anchor() -> None:
 @pytest.mark.parametrize(
     ("current_a", "why"),
     [
-        (np.full(2000, 0.5), "no two rests tell the SOC"),
+        (np.full(2000, 0.5), "no two rests give an SOC"),
         (loads(0.1), r"at most 0\.\d\d of SOC apart, at least 0\.15"),
         (loads(0.5, rest_s=20.0), "shorter than 30 s"),
     ],
 )
-def test_captures_without_anchors_are_refused_with_the_reason(current_a: np.ndarray, why: str) -> None:
+def test_captures_without_anchors_are_rejected_with_the_reason(current_a: np.ndarray, why: str) -> None:
     with pytest.raises(UserError, match=why):
         measured(samples(current_a), cell())

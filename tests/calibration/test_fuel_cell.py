@@ -16,13 +16,13 @@ from tests.mann_stack import CURVE_A
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 TRUTH = np.array([1.0, 1.3, 0.9, 1.05, 1.6, 0.8, 1.1, 1.4, *[1.0] * 8])
-"""Parameters of a stack over those of the file."""
+"""True parameters relative to those of the file."""
 IMPEDANCE_OHM = 0.061
 """High frequency resistance of the cell of ``nafion112_oxygen``, 1 cm2, by impedance: its data paper."""
 
 
 def of_the_model(truth: FuelCellModel, *, seed: int, highest_a: float = 8.0) -> list[Source]:
-    """A curve and ten seconds at 500 Hz of the model itself with 3 mV of noise."""
+    """Return a curve and a record of 10 s at 500 Hz, simulated by the model with 3 mV of noise."""
     dice, theta = np.random.default_rng(seed), np.zeros(8)
     time_s, current_a = mann_stack.random_steps(10.0, 500.0, seed=seed, highest_a=highest_a)
     warm = np.full(CURVE_A.size, np.nan), np.full(time_s.size, np.nan)
@@ -34,8 +34,8 @@ def of_the_model(truth: FuelCellModel, *, seed: int, highest_a: float = 8.0) -> 
     ]
 
 
-def test_parameters_come_out_within_their_errors() -> None:
-    """Seven parameters of five stacks: the stated errors hold on average and for each."""
+def test_identified_parameters_are_within_their_errors() -> None:
+    """Seven parameters of five stacks: errors match their std on average and for each parameter."""
     truth = PEM.identified(PEM.a * TRUTH, {})
     scores = []
     for seed in range(5):
@@ -49,7 +49,7 @@ def test_parameters_come_out_within_their_errors() -> None:
     assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
 
 
-def test_a_curve_alone_does_not_tell_of_the_double_layer() -> None:
+def test_a_curve_alone_does_not_determine_the_double_layer() -> None:
     fit = fit_fuel_cell(of_the_model(PEM, seed=1)[:1], PEM)
     assert "steps of the current" in fit.undetermined["c_dl_farad"]
     assert fit.model.fuel_cell.c_dl_farad == PEM.fuel_cell.c_dl_farad
@@ -57,15 +57,15 @@ def test_a_curve_alone_does_not_tell_of_the_double_layer() -> None:
     assert fit.model.fuel_cell.r_ohm == pytest.approx(PEM.fuel_cell.r_ohm, rel=3.0 * fit.model.std["r_ohm"])
 
 
-def test_steps_far_from_the_limit_do_not_tell_of_concentration() -> None:
+def test_steps_far_from_the_limit_do_not_determine_the_concentration_loss() -> None:
     fit = fit_fuel_cell(of_the_model(PEM, seed=2, highest_a=2.0)[1:], PEM)
     assert "concentration_v" in fit.undetermined
     assert "near the limiting one" in fit.undetermined["concentration_v"]
     assert fit.model.fuel_cell.c_dl_farad == pytest.approx(0.067, rel=3.0 * fit.model.std["c_dl_farad"])
 
 
-def test_one_current_tells_of_nothing_but_the_voltage() -> None:
-    """One number is found, the total loss, which cannot be divided."""
+def test_a_single_current_determines_only_the_total_loss() -> None:
+    """The data determine a single number, the total loss."""
     record = of_the_model(PEM, seed=3)[1]
     constant = np.full(record.current_a.size, 3.0)
     voltage_v = np.random.default_rng(0).normal(9.4, 0.003, constant.size)
@@ -73,14 +73,15 @@ def test_one_current_tells_of_nothing_but_the_voltage() -> None:
     assert set(fit.undetermined) >= {"r_ohm", "tafel_slope_v", "c_dl_farad", "limiting_current_a"}
 
 
-def test_data_that_are_no_fuel_cell_s_are_refused() -> None:
+def test_data_without_information_are_rejected() -> None:
     voltage_v = np.array([2.0, 18.0, 4.0])
-    with pytest.raises(UserError, match=r"tell of no parameter.*r_ohm: it needs steps"):
+    with pytest.raises(UserError, match=r"determine no parameter.*r_ohm: it needs steps"):
         fit_fuel_cell([Source("noise", None, np.array([0.0, 1.0, 2.0]), voltage_v, np.full(3, np.nan))], PEM)
 
 
-def test_a_stack_that_is_more_than_the_model_is_explained_to_some_millivolts() -> None:
-    """Drying membrane, lagging oxygen, warming: parameters of a curve and a minute of steps, judged on another minute."""
+def test_a_stack_with_unmodelled_effects_is_predicted_to_some_millivolts() -> None:
+    """The stack has a drying membrane, delayed oxygen and self-heating. Parameters from a curve and a minute of steps
+    predict another minute."""
     curve = mann_stack.curve(CURVE_A)
     sources = [Source("curve", None, curve.current_a, curve.voltage_v, curve.temperature_c)]
     for seed in (1, 5):
@@ -100,8 +101,9 @@ def test_a_stack_that_is_more_than_the_model_is_explained_to_some_millivolts() -
     assert fit.model.fuel_cell.r_ohm < 1.35 * r.r_ohm.mean()
 
 
-def test_a_real_polarisation_curve_gives_the_resistance_that_impedance_has() -> None:
-    """H2/O2, Nafion 112, 25 psig, 100 % RH. Below 0.1 A/cm2 the voltage falls by 50 mV in 34 mA, which is no Tafel's line."""
+def test_a_real_polarisation_curve_gives_the_resistance_of_impedance() -> None:
+    """H2/O2, Nafion 112, 25 psig, 100 % RH. Below 0.1 A/cm2 the voltage falls by 50 mV within 34 mA, which does not
+    follow Tafel's equation."""
     columns = read_polarisation(DATA / "nafion112_oxygen.csv")
     assert columns is not None
     current_a, voltage_v, temperature_c = columns[columns[:, 0] > 0.1].T.copy()
@@ -116,7 +118,7 @@ def test_a_real_polarisation_curve_gives_the_resistance_that_impedance_has() -> 
     assert fit.model.fuel_cell.limiting_current_a == pytest.approx(4.39, rel=0.05)
 
 
-def test_a_flooding_cell_on_air_is_not_this_model_s() -> None:
+def test_a_flooding_cell_on_air_does_not_determine_the_resistance() -> None:
     """Its resistance cannot be determined from a curve with a residual of 23 mV: the reason is given, and the
     file's value kept."""
     columns = read_polarisation(DATA / "nafion112_air.csv")

@@ -11,7 +11,7 @@ from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps
 
 END_OF_CHARGE_S = 10_085.5
-"""Duration of the first rest in ``leaf/cc_1c``, and of the rest after it [s]."""
+"""Time at which the charge of ``leaf/cc_1c`` ends [s]."""
 
 
 def with_series_resistance(extra_ohm):
@@ -20,7 +20,7 @@ def with_series_resistance(extra_ohm):
     return CellModel.model_validate(table)
 
 
-def test_the_true_cell_leaves_the_noise():
+def test_the_true_cell_has_the_noise_as_error():
     found = validate(Columns(capture(steps(), noise_v=1e-3), "steps"), TRUTH)
     assert found.initial_soc == pytest.approx(0.98, abs=1e-3)
     assert found.initial_soc_from == "first rest"
@@ -29,15 +29,15 @@ def test_the_true_cell_leaves_the_noise():
     assert found.warnings == ()
 
 
-def test_a_resistance_beside_the_cell_is_seen():
+def test_an_additional_series_resistance_is_measured():
     found = validate(Columns(capture(steps(), cell=with_series_resistance(0.005)), "steps"), TRUTH)
     assert found.extra_ohm == pytest.approx(0.005, abs=1e-4)
     assert found.without_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < found.above.voltage_rms_v
     assert found.resting.voltage_rms_v < 1e-3 < found.loaded.voltage_rms_v
 
 
-def test_temperature_and_hysteresis_are_taken_out_once():
-    """A discharge at -15 C, with a file that contains both effects on its OCV."""
+def test_temperature_and_hysteresis_are_subtracted_once():
+    """A discharge at -15 C with a file that contains hysteresis and temperature coefficient."""
     samples = ladder_capture(steps(), -15.0)
     samples["voltage_v"] -= 40.0 * 2e-4 + 0.01 * arrhenius(HYSTERESIS_J, -15.0)
     grid_v = ocv_grid(TRUTH)[0]
@@ -69,7 +69,7 @@ def test_a_capture_that_starts_under_load_starts_at_its_voltage_with_the_ohmic_d
     assert found.initial_soc == pytest.approx(0.8, abs=0.005)
 
 
-def test_samples_below_soc_a_tenth_count_only_in_all():
+def test_samples_below_soc_0_1_count_only_in_the_total_error():
     found = validate(Columns(capture(steps()), "steps"), TRUTH)
     assert found.all.samples == found.time_s.size == found.error_v.size
     assert found.above.samples == int((found.soc > 0.1).sum()) < found.all.samples
@@ -84,7 +84,7 @@ def test_glitches_are_left_out_and_counted():
     assert found.above.voltage_rms_v < 1e-3
 
 
-def test_a_capture_of_another_cell_is_refused_with_the_numbers():
+def test_a_capture_of_another_cell_is_rejected_with_its_numbers():
     table = TRUTH.model_dump()
     table["cell"]["capacity_ah"] = 0.5
     with pytest.raises(UserError, match=r"steps: SOC runs from -\d\.\d+ to 0\.98\d, outside 0\.\.1.* of 0\.5 Ah"):
@@ -93,12 +93,12 @@ def test_a_capture_of_another_cell_is_refused_with_the_numbers():
         validate(Columns(capture(steps()), "steps"), TRUTH, initial_soc=0.6)
 
 
-def test_too_few_samples_are_not_blamed_on_the_cell():
+def test_too_few_samples_cause_an_error_of_their_own():
     with pytest.raises(UserError, match=r"^steps: 3 good samples are too few, at least 5 are needed$"):
         validate(Columns(capture(steps())[:3], "steps"), TRUTH)
 
 
-def test_wrong_sign_is_measured_and_warned_of():
+def test_a_wrong_sign_causes_a_warning_with_its_size():
     samples = capture(steps(duration_s=6000), soc=0.5)
     samples["current_a"] *= -1.0
     found = validate(Columns(samples, "steps"), TRUTH)
@@ -107,7 +107,7 @@ def test_wrong_sign_is_measured_and_warned_of():
     assert found.all.voltage_rms_v > 0.1
 
 
-def test_simulation_goes_on_below_delta_and_below_empty():
+def test_simulation_continues_below_delta_and_below_empty():
     current_a = np.r_[np.zeros(10), np.full(9000, 1.3)]
     samples = capture(current_a, soc=0.98)
     longer = np.concatenate([samples, samples[-600:]])
@@ -117,7 +117,7 @@ def test_simulation_goes_on_below_delta_and_below_empty():
     assert np.isfinite(found.error_v).all()
 
 
-def test_charging_from_empty(data):
+def test_a_charge_from_empty_is_validated(data):
     cycles = load_capture(data / "leaf" / "cc_1c.csv.gz")
     first = Columns(cycles.rows[cycles["time_s"] < END_OF_CHARGE_S], "charge")
     found = validate(first, load_cell("leaf"))
@@ -127,8 +127,8 @@ def test_charging_from_empty(data):
     assert found.warnings == ()
 
 
-def test_the_leaf_s_pulses_by_their_figures(data):
-    """The capture that its cell file is made of: what the form of the elements leaves."""
+def test_errors_of_the_leaf_cell_on_its_own_pulses(data):
+    """Errors on the capture to which the cell file was fitted, due to the form of the elements."""
     found = validate(load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz"), load_cell("leaf"))
     assert (found.initial_soc, found.final_soc) == pytest.approx((1.0, 0.001), abs=0.0005)
     assert (found.above.samples, found.all.samples) == (11715, 13000)

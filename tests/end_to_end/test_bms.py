@@ -1,4 +1,4 @@
-"""A BMS in place of a board: simulated pack -> JK-BMS -> serial line -> the real program -> the real broker."""
+"""End-to-end test with a BMS: simulated pack -> JK-BMS -> serial line -> program -> broker."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""The whole way with a fuel cell: simulated stack -> board -> serial line -> the real program -> the real broker."""
+"""End-to-end test with a fuel cell: simulated stack -> board -> serial line -> program -> broker."""
 
 import asyncio
 import contextlib
@@ -31,9 +31,7 @@ def stack() -> list[Reading]:
     return [Reading(*map(float, row)) for row in zip(*columns, strict=True)]
 
 
-async def test_a_fuel_cell_is_served_as_a_battery_is_and_goes_on_after_a_restart(
-    tmp_path: Path, broker: Broker
-) -> None:
+async def test_a_fuel_cell_is_served_and_resumes_after_a_restart(tmp_path: Path, broker: Broker) -> None:
     readings, pack, capture = stack(), tmp_path / "pack.toml", tmp_path / "line.bms"
     with VirtualBoard(lambda at_s: readings[min(int(100.0 * at_s), len(readings) - 1)]) as board:
         pack.write_text(f"""

@@ -1,4 +1,4 @@
-"""delta1, delta2 and N of Algorithm 1: bytes on the line -> the real program -> the real broker -> values on the topic."""
+"""End-to-end test of delta1, delta2 and N of Algorithm 1: serial line -> program -> broker -> topic."""
 
 import asyncio
 import contextlib
@@ -19,11 +19,11 @@ from tests.serial_line import Line
 
 CELL = load_cell("chen_mora")
 STEP_S, START_SOC, LAMBDA = 0.1, 0.5, 50_000.0
-"""lambda is large, so that N falls within seconds."""
+"""Sample period [s], initial SOC, and lambda of (3.10). lambda is large, so that N falls within seconds."""
 N_ERROR = 0.005
-"""The program lets e decay with one rate over a sample, which is good to half a percent of k; N falls by 0.5 here."""
+"""Tolerance of N. The program uses one decay rate of e over a sample, with an error of 0.5 % of k; N falls by 0.5 here."""
 REPEAT_S = 0.05
-"""The first line is repeated at this interval until the program reads the port."""
+"""Interval at which the first line is repeated until the program reads the port [s]."""
 
 
 def rows() -> list[tuple[float, float, float]]:
@@ -38,12 +38,12 @@ def text(row: tuple[float, float, float]) -> bytes:
 
 
 def element(a: np.ndarray, first: int, soc: float, sign: float) -> float:
-    """(2.5) to (2.8)."""
+    """Return an element by (2.5) to (2.8)."""
     return float(sign * a[first] * math.exp(-a[first + 1] * soc) + a[first + 2])
 
 
 def mittag_leffler(k: float) -> float:
-    """N(k) = E_2.5(-lambda k^2.5) by its series (3.11)."""
+    """Return N(k) = E_2.5(-lambda k^2.5) by the series (3.11)."""
     return math.fsum((-LAMBDA * k**2.5) ** j / math.gamma(2.5 * j + 1.0) for j in range(60))
 
 
@@ -112,11 +112,11 @@ folder = "{folder / "state"}"
 
 
 async def state_after(listener: Listener, row: tuple[float, float, float]) -> Any:
-    """The state that was published with this line as the latest."""
+    """Return the state that was published with this line as the latest."""
     return await listener.wait_json("bms/pack/state", lambda s: s["board_time_s"] == pytest.approx(row[0], abs=1e-6))
 
 
-async def test_delta_1_delta_2_and_n_on_the_topic_are_algorithm_1_of_the_bytes_on_the_line(
+async def test_published_delta_1_delta_2_and_n_follow_algorithm_1_from_the_received_bytes(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
     samples, expected = rows(), list(algorithm_1(rows()))

@@ -1,4 +1,4 @@
-"""The whole way: simulated cell -> board -> serial line -> the real program -> the real broker -> a subscriber."""
+"""End-to-end test: simulated cell -> board -> serial line -> program -> broker -> subscriber."""
 
 import asyncio
 import contextlib
@@ -31,11 +31,11 @@ START_SOC = 0.9
 LOAD_A = 0.3
 RUN_S = 14.0
 EDGE_S = 0.3
-"""Tolerance of the clocks of board and cell, plus a publish window."""
+"""Tolerance for the clocks of board and cell, plus a publish window [s]."""
 
 
 class Truth:
-    """The simulated cell's own run under pulses of 10 s, sampled at 50 Hz."""
+    """Simulated cell under pulses of 10 s, sampled at 50 Hz."""
 
     def __init__(self) -> None:
         pack = SimulatedPack(load_cell("chen_mora"), pulses(LOAD_A), soc=START_SOC)
@@ -66,7 +66,7 @@ def truth() -> Truth:
 
 
 class Plug:
-    """Path of the board for the program; a board can be unplugged and another plugged in."""
+    """Path of the serial port, at which a board can be unplugged and another plugged in."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -113,7 +113,7 @@ async def program(pack: Path, *options: str) -> AsyncIterator[asyncio.subprocess
 
 
 class Board(NamedTuple):
-    """A board that measures the simulated cell, and what switches it on."""
+    """Board that measures the simulated cell, with a function that starts it."""
 
     path: str
     power_up: Callable[[], None]
@@ -127,7 +127,7 @@ async def a_board(kind: str, truth: Truth, folder: Path) -> AsyncIterator[Board]
     else:
         rows = [(t, *r) for t, r in zip(truth.time_s, truth.readings, strict=True)]
         with SimavrBoard(write_readings(folder / "readings.csv", rows)) as simulated:
-            yield Board(simulated.path, lambda: None)  # it powers up when its line is opened
+            yield Board(simulated.path, lambda: None)  # the simulated board starts when its line is opened
 
 
 @pytest.fixture(params=["simavr", pytest.param("python", marks=pytest.mark.thorough)])
@@ -137,7 +137,7 @@ def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-async def test_what_is_published_is_the_simulated_truth_within_the_converter_s_resolution(
+async def test_published_values_are_the_simulated_ones_within_the_resolution_of_the_converter(
     kind: str, truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
 ) -> None:
     async with a_board(kind, truth, tmp_path) as board, Listener(broker, "bms/#") as listener:
@@ -168,7 +168,7 @@ async def test_what_is_published_is_the_simulated_truth_within_the_converter_s_r
     assert info["board"]["firmware"]
 
 
-async def test_the_loop_goes_on_when_the_board_is_unplugged_and_when_the_broker_dies(
+async def test_the_service_continues_without_board_and_without_broker(
     kind: str, truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
 ) -> None:
     async with Listener(broker, "bms/#") as listener, contextlib.AsyncExitStack() as stack:
@@ -188,7 +188,7 @@ async def test_the_loop_goes_on_when_the_board_is_unplugged_and_when_the_broker_
             assert again["lock"]
             assert again["board_time_s"] > before["board_time_s"]
             broker.stop()
-            await asyncio.sleep(1.0)  # so long it is away
+            await asyncio.sleep(1.0)  # duration without the board
             broker.start()
             async with Listener(broker, "bms/#") as later:
                 after = await later.wait_json(
@@ -198,7 +198,7 @@ async def test_the_loop_goes_on_when_the_board_is_unplugged_and_when_the_broker_
             assert after["frames_lost"] == again["frames_lost"]
 
 
-async def test_a_recorded_capture_gives_the_live_run_s_state_to_the_last_bit(
+async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
     truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
 ) -> None:
     pack, capture = pack_file(tmp_path, plug, broker), tmp_path / "line.bms"

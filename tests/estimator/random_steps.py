@@ -1,4 +1,4 @@
-"""The thesis's cell under steps of random height and length, and copies of its file that are wrong."""
+"""Simulation of the thesis's cell under random current steps, and cell files with wrong parameters."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
 
 TRUTH = load_cell("chen_mora").model_copy(update={"adaptation": {}})
-"""Bounds a quarter to four times the file's: those of Table 5 are not around a file that is wrong."""
+"""True cell with default bounds, because those of Table 5 do not contain wrong files."""
 RATED_A = 0.275
 HEIGHTS_C = (-1.0, -0.5, 0.0, 0.0, 0.5, 1.0)
 HOLD_S = (20, 400)
@@ -50,7 +50,7 @@ def held_currents(hours: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def random_steps(hours: float, noise_v: float = 0.0, seed: int = 1, cell: CellModel = TRUTH) -> SampleBlock:
-    """A sample each second of ``cell``, its voltage with ``noise_v`` [V]."""
+    """Return samples of ``cell`` at 1 Hz with ``noise_v`` of voltage noise [V]."""
     rng = np.random.default_rng(seed)
     return measured(held_currents(hours, rng), noise_v, rng, cell)
 

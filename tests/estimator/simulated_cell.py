@@ -1,4 +1,4 @@
-"""A cell of two branches under random pulses, and copies of its file that are wrong."""
+"""Simulation of a cell with two RC pairs under random pulses, and cell files with wrong parameters."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ NOISE_V = 3e-4
 
 
 def wrong_cell(factor: float) -> CellModel:
-    """The true cell with every resistance ``factor`` times as large."""
+    """Return the true cell with all resistances multiplied by ``factor``."""
     parts = {}
     for name in ("r_s", "r_ts", "r_tl"):
         part = getattr(TRUTH, name)
@@ -23,7 +23,7 @@ def wrong_cell(factor: float) -> CellModel:
 
 
 def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleBlock, np.ndarray]:
-    """Random pulses and rests at 1 Hz that empty the true cell, and its true SOC."""
+    """Return samples of random pulses and rests at 1 Hz that empty the true cell, and its true SOC."""
     rng = np.random.default_rng(seed)
     seconds = int(3600 * hours)
     return measured(np.repeat(rng.choice([0.0, 0.0, 0.75, 1.5, 3.0, -0.5], seconds // 60), 60), soc, rng)

@@ -1,7 +1,7 @@
-"""Counting errors are learned with a true std: the capacity, and the offset of the current sensor.
+"""Learned capacity and offset of the current sensor, and their std, on cells that differ from the model.
 
-On cells that no model here contains. Their files have half the error of a common curve, 2 mV and 0.35 % of SOC, as from a slow
-discharge of the cell itself: between two SOCs a capacity is known no better than the curve is at both.
+The cell files have half of the typical OCV error, 2 mV and 0.35 % of SOC, as from a slow discharge of the cell itself. The
+error of the OCV limits the accuracy of a capacity.
 """
 
 import numpy as np
@@ -17,9 +17,9 @@ from tests.estimator.anywhere.use import DAY_S, cycles, days
 SEEDS = range(1, 9)
 OWN_CURVE = {"curve_error": 0.5, "unseen_h": 0.0}
 MAX_ERROR, SOH_ERROR = 0.025, 0.015
-"""Limits of the capacity error: the worst of 16 cells, and RMS."""
+"""Limits of the relative capacity error: maximum over 16 cells, and RMS."""
 MAX_A, MAX_STD_A = 0.003, 0.006
-"""Error and std of an offset after a day, in cells of 3 Ah."""
+"""Limits of the error and std of an offset after a day, in cells of 3 Ah [A]."""
 
 
 def nees_limit(cells: int) -> float:
@@ -29,7 +29,7 @@ def nees_limit(cells: int) -> float:
 
 
 def ratio(learned: IdentifiedValue, true: float) -> float:
-    """Error over std."""
+    """Return the error over the std."""
     return (learned.value - true) / learned.std
 
 
@@ -43,13 +43,13 @@ def after_cycles(case: Case, told_wrong: float) -> Estimator:
 
 
 def in_use(case: Case, count: int) -> Capture:
-    """Days of mixed use with rests."""
+    """Return the estimator after days of mixed use with rests."""
     rng = np.random.default_rng(case.seed)
     return capture(case, days(rng, case.truth.capacity_ah, count, case.soc))
 
 
 @pytest.mark.parametrize("told_wrong", [0.0, -0.2])
-def test_a_capacity_wrong_by_a_fifth_is_known_after_three_cycles(told_wrong: float) -> None:
+def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(told_wrong: float) -> None:
     errors, ratios = [], []
     for seed in SEEDS:
         for told in (0.8, 1.2):
@@ -59,11 +59,12 @@ def test_a_capacity_wrong_by_a_fifth_is_known_after_three_cycles(told_wrong: flo
             ratios.append(ratio(learned, 1.0 / told))
     assert np.abs(errors).max() < MAX_ERROR
     assert np.sqrt(np.mean(np.square(errors))) < SOH_ERROR
-    assert np.mean(np.square(ratios)) < nees_limit(len(SEEDS))  # both of one seed have the same curve
+    assert np.mean(np.square(ratios)) < nees_limit(len(SEEDS))  # both runs of a seed have equal curves and count once
 
 
-def test_a_gain_of_the_current_sensor_is_a_capacity() -> None:
-    """All currents 1.05 times as large, capacity 1.05, resistances 1/1.05: the same voltages. No data tell them apart."""
+def test_a_gain_error_of_the_current_sensor_is_equivalent_to_a_capacity() -> None:
+    """Currents and capacity 1.05 times as large and resistances 1/1.05 times give equal voltages, so that data cannot
+    distinguish a gain error from a capacity."""
     errors = []
     for seed in SEEDS:
         estimator = after_cycles(Case("gain", gain=1.05, capacity=1.0, seed=seed, **OWN_CURVE), 0.0)
@@ -72,7 +73,7 @@ def test_a_gain_of_the_current_sensor_is_a_capacity() -> None:
 
 
 @pytest.mark.parametrize("temperature_c", [25.0, 0.0])
-def test_an_offset_of_20_ma_is_found_within_a_day(temperature_c: float) -> None:
+def test_an_offset_of_20_ma_is_identified_within_a_day(temperature_c: float) -> None:
     ratios = []
     for seed in SEEDS:
         offset_a = 0.02 if seed % 2 else -0.02
@@ -87,7 +88,7 @@ def test_an_offset_of_20_ma_is_found_within_a_day(temperature_c: float) -> None:
     assert np.mean(np.square(ratios)) < 1.0
 
 
-def test_an_offset_that_changes_after_days_is_found_again_and_the_soc_stays_right() -> None:
+def test_an_offset_that_changes_after_days_is_identified_again() -> None:
     seen = in_use(Case("step", soc=0.8, **OWN_CURVE), 6)
     change = 4 * DAY_S
     seen.samples["current_a"][change:] += 0.03
@@ -102,8 +103,8 @@ def test_an_offset_that_changes_after_days_is_found_again_and_the_soc_stays_righ
     assert inside[DAY_S:].mean() > 0.95
 
 
-def test_self_discharge_is_found_as_an_offset() -> None:
-    """10 % in a month. It takes charge that no sensor sees, at all times, as a sensor's zero does."""
+def test_self_discharge_is_identified_as_an_offset() -> None:
+    """Self-discharge of 10 % a month is a constant unmeasured current, like an offset of the sensor."""
     drain_a = 0.1 * 3.0 / 30.0 / 24.0
     case = Case("self-discharge", soc=0.8, offset_a=-drain_a, **OWN_CURVE)
     seen = capture(case, np.full(4 * DAY_S, drain_a))
@@ -114,7 +115,7 @@ def test_self_discharge_is_found_as_an_offset() -> None:
     assert abs(ratio(learned, -drain_a)) < 1.0
 
 
-def test_the_error_of_what_is_learned_is_that_of_all_hypotheses() -> None:
+def test_the_std_of_a_learned_value_is_that_of_the_mixture() -> None:
     case = Case("start", **OWN_CURVE)
     seen = capture(case, np.zeros(60))
     estimator = Estimator(seen.cell, initial_soc=0.5)

@@ -1,4 +1,4 @@
-"""One object, two interfaces, identical results; and its handling of bad samples."""
+"""Identical results of ``step`` and ``run``, and handling of invalid samples."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def noisy_load(n: int = 5000) -> SampleBlock:
     return samples
 
 
-def test_step_and_run_are_bit_identical_whatever_the_blocks() -> None:
+def test_step_and_run_are_bit_identical_for_any_block_size() -> None:
     samples = noisy_load()
     whole, stepped, pieces = (Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None) for _ in range(3))
     whole.run(samples)
@@ -34,7 +34,7 @@ def test_step_and_run_are_bit_identical_whatever_the_blocks() -> None:
     assert whole.state.tobytes() == stepped.state.tobytes() == pieces.state.tobytes()
 
 
-def test_saved_state_goes_on_where_it_was() -> None:
+def test_a_restored_state_resumes_identically() -> None:
     samples = noisy_load()
     straight = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
     straight.run(samples)
@@ -71,11 +71,11 @@ def test_a_bad_sample_is_dropped_counted_and_changes_nothing_else(
     assert before.tobytes() == estimator.state.tobytes()
 
 
-def test_verdicts_are_found_by_their_value() -> None:
+def test_outcomes_are_indexed_by_their_value() -> None:
     assert [SAMPLE_OUTCOMES[verdict] for verdict in SampleOutcome] == list(SampleOutcome)
 
 
-def test_a_clock_set_back_is_counted_and_costs_one_step_only() -> None:
+def test_a_clock_set_back_is_counted_and_loses_a_single_step() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 1.0, 2.0, -500.0, -499.0):
         assert estimator.step(time_s, 3.0, 3.7) is SampleOutcome.ACCEPTED
@@ -83,7 +83,7 @@ def test_a_clock_set_back_is_counted_and_costs_one_step_only() -> None:
     assert estimator.state["soc"][0] == pytest.approx(0.5 - 3.0 * 3.0 / (3.0 * 3600))
 
 
-def test_charge_flows_on_over_a_gap() -> None:
+def test_charge_is_counted_over_a_gap() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     estimator.step(0.0, 1.0, 3.7)
     estimator.step(10.0, 1.0, 3.7)
@@ -91,14 +91,14 @@ def test_charge_flows_on_over_a_gap() -> None:
     assert estimator.state["soc"][0] == pytest.approx(0.5 - 10.0 / (3.0 * 3600))
 
 
-def test_slow_sampling_is_no_row_of_gaps() -> None:
+def test_slow_sampling_does_not_count_as_gaps() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 10.0, 20.0, 30.0, 90.0, 100.0):
         estimator.step(time_s, 1.0, 3.7)
-    assert estimator.state["gaps"][0] == 2  # the first step, which nothing tells from a gap, and the long one
+    assert estimator.state["gaps"][0] == 2  # the first step, which is indistinguishable from a gap, and the long one
 
 
-def test_over_an_unmeasured_hour_flows_what_both_ends_agree_on() -> None:
+def test_the_current_over_an_unmeasured_hour_is_the_smaller_of_both_ends() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s, current_a in ((0.0, 1.0), (1800.0, 0.2), (3600.0, -1.0)):
         estimator.step(time_s, current_a, 3.7)
@@ -128,12 +128,12 @@ def test_shipped_cells_load_and_step(name: str) -> None:
 
 
 def test_printed_settings_of_table_5_fail_condition_1_of_the_lemma() -> None:
-    """E6: P9.l9 = 89000 is not below P7.l7 = 87500."""
+    """Erratum 6: P9.l9 = 89000 is not below P7.l7 = 87500."""
     cell = load_cell("chen_mora")
     assert [(c.name, c.left, c.right) for c in failed_conditions(cell)] == [("1: P9.l9 < P7.l7", 89000.0, 87500.0)]
     assert sum(c.holds for c in lemma_conditions(cell)) == 5
 
 
-def test_default_bounds_meet_the_lemma() -> None:
+def test_default_bounds_satisfy_the_lemma() -> None:
     cell = load_cell("chen_mora").model_copy(update={"adaptation": {}})
     assert failed_conditions(cell) == []

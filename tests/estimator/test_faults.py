@@ -1,4 +1,4 @@
-"""Bad input: the estimate stays finite, reports diagnostics, and recovers with good input."""
+"""Invalid input: the estimate stays finite, diagnostics report the fault, and the estimate recovers."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,18 +13,18 @@ from bms_estimator.model.sample import SampleBlock
 from tests.estimator.simulated_cell import TRUTH, pulses
 
 FAULT_S = 3600.0, 7200.0
-"""The hour in which the input is bad, from the first sample."""
+"""Start and end of the fault after the first sample [s]."""
 CAPACITY_AH = 3.0
 FIRST_SOC = {"cell1_random_steps": 0.98, "cell5_hppc": 0.98}
-"""SOC at which the first rest is not that of a full cell."""
+"""Initial SOC of captures that do not start full."""
 CHANGING = ["cell5_random_steps", "cell1_dst", "cell1_hppc"]
 PIECE = 20
-"""Samples after which the suspicions are looked at."""
+"""Number of samples between two evaluations of the diagnostics."""
 Fault = Callable[[SampleBlock, np.ndarray], None]
 
 
 def good(block: SampleBlock, during: np.ndarray) -> None:
-    """None."""
+    """Return the samples without a fault."""
 
 
 def flipped(block: SampleBlock, during: np.ndarray) -> None:
@@ -32,7 +32,7 @@ def flipped(block: SampleBlock, during: np.ndarray) -> None:
 
 
 def offset(block: SampleBlock, during: np.ndarray) -> None:
-    """1 % of a range of 5 A."""
+    """Return samples with an offset of 1 % of a range of 5 A."""
     block["current_a"][during] += 0.05
 
 
@@ -41,7 +41,7 @@ def now_and_then(during: np.ndarray) -> np.ndarray:
 
 
 def glitches(block: SampleBlock, during: np.ndarray) -> None:
-    """Within the range of the cell."""
+    """Return samples with voltage glitches within the range of the cell."""
     block["voltage_v"][now_and_then(during)] = 2.6
 
 
@@ -55,18 +55,18 @@ def stuck(block: SampleBlock, during: np.ndarray) -> None:
 
 
 def dead(block: SampleBlock, during: np.ndarray) -> None:
-    """The current sensor."""
+    """Return samples of a dead current sensor."""
     block["current_a"][during] = 0.0
 
 
 def repeated(block: SampleBlock, during: np.ndarray) -> None:
-    """Every second stamp is that of the sample before."""
+    """Return samples in which every second time stamp repeats the previous one."""
     twice = np.flatnonzero(during)[1::2]
     block["time_s"][twice] = block["time_s"][twice - 1]
 
 
 class Run:
-    """A capture with a fault, started 0.2 too low: time since the start [s], error of the SOC, its std, suspects."""
+    """Run over a capture with a fault and an initial SOC 0.2 too low: time [s], error of the SOC, std, diagnostics."""
 
     def __init__(self, path: Path, cell: CellModel, fault: Fault = good, wrong: float = -0.2) -> None:
         block = load_capture(path).rows.copy()
@@ -106,8 +106,8 @@ def capture(captures: Path, name: str) -> Path:
 
 @pytest.mark.parametrize("name", CHANGING)
 @pytest.mark.parametrize("fault", [flipped, offset, glitches, spikes, repeated, stuck, dead])
-def test_an_hour_of_bad_input(captures: Path, name: str, fault: Fault) -> None:
-    """Within an hour of good input the SOC is right again, and stays so."""
+def test_the_soc_recovers_after_an_hour_of_bad_input(captures: Path, name: str, fault: Fault) -> None:
+    """The SOC is correct again within an hour of good input, and stays correct."""
     run = Run(capture(captures, name), TRUTH, fault)
     assert np.isfinite(run.error).all()
     assert np.abs(run.error[run.after(FAULT_S[1] + 3600.0)]).max() < 0.025
@@ -124,7 +124,7 @@ def test_an_hour_of_bad_input(captures: Path, name: str, fault: Fault) -> None:
         (dead, InputFault.CURRENT),
     ],
 )
-def test_a_passing_fault_is_named_and_then_forgotten(
+def test_a_temporary_fault_is_reported_and_then_cleared(
     captures: Path, name: str, fault: Fault, suspect: InputFault
 ) -> None:
     run = Run(capture(captures, name), TRUTH, fault)
@@ -148,7 +148,7 @@ def test_an_offset_of_the_current_is_learned(captures: Path, name: str, offset_a
 
 
 @pytest.mark.parametrize("name", CHANGING)
-def test_an_offset_that_no_sensor_may_have_is_suspected(captures: Path, name: str) -> None:
+def test_an_implausible_offset_is_reported(captures: Path, name: str) -> None:
     def off(block: SampleBlock, _: np.ndarray) -> None:
         block["current_a"] += 0.15
 
@@ -158,7 +158,7 @@ def test_an_offset_that_no_sensor_may_have_is_suspected(captures: Path, name: st
 
 
 @pytest.mark.parametrize("name", ["cell5_random_steps", "cell1_dst"])
-def test_a_capacity_that_is_a_fifth_too_small_is_suspected(captures: Path, name: str) -> None:
+def test_a_capacity_20_percent_too_small_is_reported(captures: Path, name: str) -> None:
     smaller = TRUTH.cell.model_copy(update={"capacity_ah": 0.8 * TRUTH.cell.capacity_ah})
     run = Run(capture(captures, name), TRUTH.model_copy(update={"cell": smaller}))
     assert run.suspects[-1] & InputFault.CAPACITY
@@ -167,8 +167,8 @@ def test_a_capacity_that_is_a_fifth_too_small_is_suspected(captures: Path, name:
 
 
 @pytest.mark.parametrize("name", CHANGING)
-def test_the_ocv_of_another_chemistry_is_suspected(captures: Path, name: str) -> None:
-    """An iron-phosphate curve: a plateau at 3.3 V."""
+def test_the_ocv_of_another_chemistry_is_reported(captures: Path, name: str) -> None:
+    """The wrong curve is that of LFP, with a plateau at 3.3 V."""
     soc = np.linspace(0.0, 1.0, 51)
     plateau_v = 3.275 + 0.05 * soc + 0.1 * np.tanh((soc - 0.98) * 40.0) - 0.5 * np.exp(-25.0 * soc)
     table = TableOcv(form="table", soc=tuple(soc), ocv_v=tuple(plateau_v))
@@ -177,18 +177,18 @@ def test_the_ocv_of_another_chemistry_is_suspected(captures: Path, name: str) ->
 
 
 @pytest.mark.parametrize("wrong", [-0.2, 0.2])
-def test_nothing_is_suspected_of_good_captures(captures: Path, wrong: float) -> None:
+def test_good_captures_cause_no_diagnostics(captures: Path, wrong: float) -> None:
     for path in sorted(captures.glob("*.csv.gz")):
         run = Run(path, TRUTH, wrong=wrong)
         assert not run.suspects.any(), path.name
 
 
-def test_nothing_is_suspected_of_a_leaf(data: Path) -> None:
+def test_captures_of_a_leaf_cause_no_diagnostics(data: Path) -> None:
     for name in ("hppc_25c_from_full", "cc_1c"):
         assert not Run(data / "leaf" / f"{name}.csv.gz", load_cell("leaf")).suspects.any()
 
 
-def test_a_gap_of_an_hour(captures: Path) -> None:
+def test_the_true_soc_is_inside_the_interval_after_a_gap_of_an_hour(captures: Path) -> None:
     """The current in the gap is unknown, and the std includes that."""
     block = load_capture(capture(captures, "cell5_random_steps")).rows
     when_s = block["time_s"] - block["time_s"][0]
@@ -208,8 +208,8 @@ def load() -> tuple[SampleBlock, np.ndarray]:
     return pulses()
 
 
-def test_garbage_for_hours(load) -> None:
-    """Any numbers at all: nothing overflows, and the cell is found again afterwards."""
+def test_the_estimate_recovers_after_hours_of_random_input(load) -> None:
+    """Random input causes no overflow, and the SOC converges afterwards."""
     rng, garbage = np.random.default_rng(0), load[0].copy()
     garbage["current_a"] = rng.normal(0.0, 1.0, garbage.size) ** 9
     garbage["voltage_v"] = rng.normal(3.0, 2.0, garbage.size) ** 5
@@ -223,7 +223,7 @@ def test_garbage_for_hours(load) -> None:
     assert np.abs(trace["soc"] - load[1])[5400:].max() < 0.05
 
 
-def test_not_finite_goes_back_to_the_last_good_state(load) -> None:
+def test_a_non_finite_value_restores_the_last_good_state(load) -> None:
     block, true_soc = load
     estimator = Estimator(TRUTH, initial_soc=0.9)
     estimator.run(block[:3000])
@@ -238,7 +238,7 @@ def test_not_finite_goes_back_to_the_last_good_state(load) -> None:
     assert abs(trace["soc"][-1] - true_soc[-1]) < 0.015
 
 
-def test_single_samples_far_off_are_passed_over_but_a_new_level_is_taken(load) -> None:
+def test_single_outliers_are_rejected_but_a_new_level_is_accepted(load) -> None:
     block = load[0][:1000].copy()
     block["voltage_v"][500:502] = 2.6
     clean, glitched = Estimator(TRUTH, initial_soc=0.95), Estimator(TRUTH, initial_soc=0.95)
@@ -253,7 +253,7 @@ def test_single_samples_far_off_are_passed_over_but_a_new_level_is_taken(load) -
     assert moved.record["counters"]["reopened"][0] == 1
 
 
-def test_every_suspect_says_what_to_do() -> None:
+def test_every_diagnostic_contains_a_remedy() -> None:
     for suspect in InputFault:
         assert "check" in suspect.text
     both = InputFault.OFFSET | InputFault.CAPACITY
@@ -263,7 +263,7 @@ def test_every_suspect_says_what_to_do() -> None:
 
 
 @pytest.mark.parametrize("wrong_c", [-127.0, -300.0, 850.0, np.inf])
-def test_a_temperature_that_no_cell_has_is_none(wrong_c: float) -> None:
+def test_an_implausible_temperature_is_ignored(wrong_c: float) -> None:
     block = pulses()[0][:1200]
     block["temperature_c"][600:] = np.nan
     without = Estimator(TRUTH, initial_soc=0.9).run(block.copy())

@@ -1,4 +1,4 @@
-"""The filter's settings from a cell file and ``[identifier]``."""
+"""Settings of the filter from a cell file and ``[identifier]``."""
 
 import math
 
@@ -16,22 +16,24 @@ from bms_estimator.settings.observer import IdentifierSettings
 CELL = load_cell("ncr18650")
 
 
-def test_a_file_without_a_ladder_has_its_two_branches_in_it() -> None:
-    """The present elements, read from the ladder again, are those of the file."""
+def test_a_file_without_a_ladder_gets_one_equivalent_to_its_rc_pairs() -> None:
+    """The elements computed from the ladder are those of the file."""
     estimator = Estimator(CELL, identifier=IdentifierSettings(soc_std=0.005), initial_soc=0.5)
     estimator.step(0.0, 0.0, float(chen_mora.ocv(0.5, *(estimator.settings[0][n] for n in ("ocv_v", "ocv_slope_v")))))
     soc, a, elements = float(estimator.state["soc"][0]), CELL.a, present_elements(estimator.record[0])
     r_ts, r_tl = chen_mora.r_ts(soc, a), chen_mora.r_tl(soc, a)
     assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=1e-3)
     both = elements["r_ts_ohm"].value + elements["r_tl_ohm"].value
-    assert both == pytest.approx((1.0 + BEYOND_BRANCHES) * (r_ts + r_tl), rel=0.05)  # a load before is supposed
+    assert both == pytest.approx(
+        (1.0 + BEYOND_BRANCHES) * (r_ts + r_tl), rel=0.05
+    )  # the filter assumes a load before the first sample
     assert elements["r_ts_ohm"].value == pytest.approx(r_ts, rel=0.15)
     assert elements["c_ts_farad"].value == pytest.approx(chen_mora.c_ts(soc, a), rel=0.15)
     assert estimator.settings_record["filter"]["r_std"][0] == BRANCHES_STD
     assert all(math.isinf(element.age_s) for element in elements.values())
 
 
-def test_the_resistances_of_two_branches_are_kept_over_soc() -> None:
+def test_a_ladder_of_two_rc_pairs_has_their_resistances_over_soc() -> None:
     ohm, a = ladder_of_branches(CELL), CELL.a
     assert ohm.shape == (GRID, RESISTANCES)
     for soc, row in zip(SOC_GRID, ohm, strict=True):
@@ -40,7 +42,7 @@ def test_the_resistances_of_two_branches_are_kept_over_soc() -> None:
         assert row[1:].sum() == pytest.approx((1.0 + BEYOND_BRANCHES) * branches)
 
 
-def test_resistances_of_two_branches_grow_in_the_cold_as_those_of_cells_do() -> None:
+def test_resistances_of_two_rc_pairs_grow_in_the_cold_as_in_measured_cells() -> None:
     """In two fits the resistances are 2.4 times as large at 0 C as at 25 C in the middle, and more towards empty:
     4.6 (NCA) and 2.7 times (LFP) at SOC 0.1."""
     p = Estimator(CELL.model_copy(update={"ladder": None})).settings_record[0]["filter"]
@@ -62,7 +64,7 @@ def test_a_ladder_of_a_pack_is_interpolated() -> None:
     assert (p["r_std"], p["low_c"], p["high_c"], p["series"]) == (0.12, -10.0, 25.0, 3.0)
 
 
-def test_a_hysteresis_that_is_told_lifts_a_curve_that_is_that_after_discharge() -> None:
+def test_a_configured_hysteresis_raises_a_curve_after_discharge() -> None:
     soc, ocv_v = (0.0, 0.3, 0.7, 1.0), (3.0, 3.25, 3.3, 3.5)
     after = CELL.model_copy(update={"ocv": TableOcv(form="table", soc=soc, ocv_v=ocv_v)})
     midway = CELL.model_copy(
@@ -77,7 +79,7 @@ def test_a_hysteresis_that_is_told_lifts_a_curve_that_is_that_after_discharge() 
     assert without["hysteresis_v"].max() == pytest.approx(0.01)
 
 
-def test_states_are_switched_off_by_0_and_told_in_amperes() -> None:
+def test_a_std_of_0_disables_a_state_and_the_offset_std_is_in_amperes() -> None:
     off = IdentifierSettings(current_offset_std_a=0.0, capacity_std=0.0)
     p = Estimator(CELL, identifier=off).settings_record[0]["filter"]
     assert (p["offset_c"], p["capacity_std"]) == (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""A capture of the first version is read as it was then."""
+"""Captures of the first version give the values of that version."""
 
 import json
 from pathlib import Path
@@ -8,10 +8,10 @@ import pytest
 from bms_estimator import estimate, load_capture, load_cell
 
 ROUNDING = 1e-9
-"""Relative: another processor may round the last bits otherwise."""
+"""Relative tolerance, because other processors round differently."""
 
 
-def test_a_capture_of_the_first_version_is_read_as_it_was_then(data: Path) -> None:
+def test_a_capture_of_the_first_version_gives_the_values_of_that_version(data: Path) -> None:
     recorded = data / "simulated" / "board_0_1_0.bms"
     then = json.loads(recorded.with_suffix(".json").read_text())
     now = estimate(load_capture(recorded), load_cell("chen_mora"))

@@ -1,4 +1,4 @@
-"""A voltage or a current that stays the same to the last digit: found, taken back, and never where that is so by itself."""
+"""Frozen voltages and currents are detected and their effects reverted; plausibly constant values cause no fault."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ FROZEN = InputFault.VOLTAGE | InputFault.CURRENT
 
 
 def load_a(seconds: int, levels: tuple[float, ...], each_s: int = 60, seed: int = 1) -> np.ndarray:
-    """Levels at random [A]."""
+    """Return a current of random levels [A]."""
     return np.repeat(np.random.default_rng(seed).choice(levels, seconds // each_s), each_s)
 
 
@@ -55,7 +55,9 @@ VOLTAGE, BOTH = ("voltage_v",), ("voltage_v", "current_a")
     ],
     ids=["constant load", "gaps of 12 s", "a sample a minute", "at a pulse", "whole frames"],
 )
-def test_the_truth_stays_inside(fields: tuple[str, ...], during_a: np.ndarray, every: Callable[[int], bool]) -> None:
+def test_the_true_soc_stays_inside_the_interval(
+    fields: tuple[str, ...], during_a: np.ndarray, every: Callable[[int], bool]
+) -> None:
     samples, true_soc = measured(np.r_[DRIVE, during_a, AFTER], 0.8, np.random.default_rng(3))
     for name in fields:
         samples[name][STUCK] = samples[name][HOUR]
@@ -68,11 +70,11 @@ def test_the_truth_stays_inside(fields: tuple[str, ...], during_a: np.ndarray, e
     assert named.any()
     assert not (suspects[before] & FROZEN).any()
     assert suspects[-1] & FROZEN == 0
-    judged = named if fields is BOTH else ~before  # a current that is repeated counts until it is found
+    judged = named if fields is BOTH else ~before  # a repeated current is integrated until its detection
     assert (np.abs(soc - true_soc)[judged] < 2.5 * std[judged]).all()
 
 
-def test_what_a_dead_current_sensor_made_of_the_voltage_is_taken_back() -> None:
+def test_effects_of_a_dead_current_sensor_on_the_soc_are_reverted() -> None:
     samples, true_soc = measured(np.r_[DRIVE, PULSES, AFTER], 0.8, np.random.default_rng(3))
     samples["current_a"][STUCK] = 0.0
     soc, std, suspects = run(Estimator(TRUTH, initial_soc=0.7), samples)
@@ -82,7 +84,7 @@ def test_what_a_dead_current_sensor_made_of_the_voltage_is_taken_back() -> None:
 
 
 def lfp(current_a: np.ndarray, soc: float) -> SampleBlock:
-    """Samples of the generic cell, to the millivolt."""
+    """Return samples of the generic LFP cell with a resolution of 1 mV."""
     p = Estimator(load_cell("lfp", 2.3)).settings_record[0]["filter"]
     samples = np.zeros(current_a.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
@@ -104,22 +106,22 @@ def lfp(current_a: np.ndarray, soc: float) -> SampleBlock:
     ],
     ids=["to empty", "to full"],
 )
-def test_a_knee_under_a_constant_current_is_no_fault(samples: SampleBlock, soc: float) -> None:
-    """The voltage ramps by itself; where the charge ends, it falls with the current."""
+def test_a_knee_under_a_constant_current_causes_no_fault(samples: SampleBlock, soc: float) -> None:
+    """The voltage has ramps under a constant current, and falls with the current at the end of the charge."""
     assert np.ptp(samples["voltage_v"]) > 0.2
     assert not (
         run(Estimator(load_cell("lfp", 2.3), initial_soc=soc), samples)[2] & (FROZEN | InputFault.SIGN_OF_CURRENT)
     ).any()
 
 
-def test_a_charger_that_holds_the_voltage_is_no_fault() -> None:
+def test_a_constant_voltage_charge_causes_no_fault() -> None:
     current_a = np.r_[np.full(HOUR, -1.5), -1.5 * np.exp(-np.arange(HOUR) / 1200.0)]
     samples, _ = measured(current_a, 0.3, np.random.default_rng(3))
     samples["voltage_v"][HOUR:] = samples["voltage_v"][HOUR]
     assert not (run(Estimator(TRUTH, initial_soc=0.3), samples)[2] & FROZEN).any()
 
 
-def test_a_coarse_voltage_that_is_told_to_be_so_is_not_frozen() -> None:
+def test_a_coarse_voltage_with_a_configured_resolution_is_not_frozen() -> None:
     samples, _ = measured(load_a(2 * HOUR, (0.3, 0.6, 1.2)), 0.8, np.random.default_rng(3))
     samples["voltage_v"] = np.round(samples["voltage_v"], 1)
     estimator = Estimator(TRUTH, initial_soc=0.8, voltage_resolution_v=0.1)

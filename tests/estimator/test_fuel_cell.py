@@ -1,4 +1,4 @@
-"""The very step that takes a battery's samples takes a fuel cell's."""
+"""Fuel cells in the estimator."""
 
 import math
 
@@ -38,7 +38,7 @@ def learned(estimator: Estimator) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def ten_minutes() -> mann_stack.Record:
-    """The stack of the tests at 100 Hz: its contacts grow by 60 mohm in the middle."""
+    """Return samples of the test stack at 100 Hz, whose contact resistance increases by 60 mohm at 300 s."""
     time_s, current_a = mann_stack.random_steps(600.0, 500.0, seed=4)
     more_ohm = np.where(time_s < 300.0, 0.0, 0.06)
     return mann_stack.measured(time_s, current_a, seed=4, more_ohm=more_ohm).every(5)
@@ -64,7 +64,9 @@ def test_run_and_step_leave_the_same_state_to_the_last_bit(ten_minutes: mann_sta
     assert ran.state["samples"][0] == 2998
 
 
-def test_what_a_stack_has_not_is_nan_inside_and_null_outside(ten_minutes: mann_stack.Record) -> None:
+def test_values_that_a_stack_does_not_have_are_nan_in_the_trace_and_null_in_payloads(
+    ten_minutes: mann_stack.Record,
+) -> None:
     estimator = Estimator(PEM)
     trace = estimator.run(block(ten_minutes)[:500])
     for name in ("soc", "soc_coulomb", "soc_std", "soc_ocv", "delta_1", "delta_2", "stability_margin"):
@@ -80,8 +82,8 @@ def test_what_a_stack_has_not_is_nan_inside_and_null_outside(ten_minutes: mann_s
         estimator.set_soc(0.5)
 
 
-def test_a_resistance_that_grows_is_learned() -> None:
-    """Ten minutes as in the file, then 35 % more of one parameter alone: in ten minutes it is found, and the others again."""
+def test_a_growing_resistance_is_learned() -> None:
+    """One parameter increases by 35 % after ten minutes. Within ten minutes all parameters are learned again."""
     estimator, grown = Estimator(PEM), np.ones(16)
     grown[1 + NAMES.index("r_ohm")] = 1.35
     first, then = own_block(np.ones(16), 600.0), own_block(grown, 600.0, seed=1)
@@ -96,8 +98,9 @@ def test_a_resistance_that_grows_is_learned() -> None:
     assert last_v < 0.01
 
 
-def test_a_stack_that_is_more_than_the_model_is_followed_in_its_voltage(ten_minutes: mann_stack.Record) -> None:
-    """Its contacts grow by 60 mohm at 300 s: 180 mV off at once, 20 mV after four minutes; the resistance within 10 %."""
+def test_the_voltage_of_a_stack_with_unmodelled_effects_is_tracked(ten_minutes: mann_stack.Record) -> None:
+    """A contact resistance of 60 mohm at 300 s causes an error of 180 mV, which falls to 20 mV within four minutes. The
+    resistance is within 10 %."""
     estimator, late = Estimator(PEM), slice(-6000, None)
     trace = estimator.run(block(ten_minutes))
     grown_v = trace["innovation_v"][(ten_minutes.time_s > 300.0) & (ten_minutes.time_s < 310.0)]
@@ -107,8 +110,8 @@ def test_a_stack_that_is_more_than_the_model_is_followed_in_its_voltage(ten_minu
     assert (trace["lock"][late] == 1).all()
 
 
-def test_wrong_parameters_are_learned_and_said_to_be_known() -> None:
-    """The model itself from a wrong start, 5 to 50 % off: right to 3 % in ten minutes."""
+def test_wrong_parameters_are_learned_and_reported_as_identified() -> None:
+    """Samples of the model with initial parameter errors of 5 to 50 %: all are within 3 % after ten minutes."""
     truth = np.array([1.0, 1.5, 0.9, 1.05, 1.3, *[1.0] * 11])
     estimator = Estimator(PEM, voltage_resolution_v=1e-3)
     trace = estimator.run(own_block(truth, 600.0))
@@ -129,7 +132,7 @@ def test_wrong_parameters_are_learned_and_said_to_be_known() -> None:
 
 
 @pytest.mark.parametrize(("held", "printed"), [(0.0, 0.0), (math.nan, None), (math.inf, None)])
-def test_what_a_replay_prints_is_a_number_or_none(held: float, printed: float | None) -> None:
+def test_a_replay_prints_numbers_or_none(held: float, printed: float | None) -> None:
     estimator = Estimator(PEM)
     estimator.run(own_block(np.ones(16), 2.0))
     estimator.state["a"][0, 1] = held
@@ -137,7 +140,7 @@ def test_what_a_replay_prints_is_a_number_or_none(held: float, printed: float | 
     assert (r_ohm.value, r_ohm.std) == (printed, printed)
 
 
-def test_without_a_load_nothing_is_learned_but_the_voltage() -> None:
+def test_without_a_load_only_the_voltage_is_learned() -> None:
     samples = own_block(np.ones(16), 60.0)
     samples["current_a"], samples["voltage_v"] = 0.0, 13.1
     estimator = Estimator(PEM)
@@ -148,7 +151,7 @@ def test_without_a_load_nothing_is_learned_but_the_voltage() -> None:
     assert not fuel_cell_parameters(estimator, 0.0)["r_ohm"].valid
 
 
-def test_a_stack_is_learned_again_after_a_sensor_that_told_anything() -> None:
+def test_a_stack_is_learned_again_after_random_sensor_values() -> None:
     samples = own_block(np.ones(16), 720.0)
     broken = slice(6000, 12000)
     samples["voltage_v"][broken] = np.random.default_rng(1).uniform(2.0, 18.0, 6000)
@@ -160,7 +163,7 @@ def test_a_stack_is_learned_again_after_a_sensor_that_told_anything() -> None:
 
 
 @pytest.mark.parametrize("field", ["theta", "x", "dx", "information", "pull", "temperature_c"])
-def test_a_state_that_is_no_number_begins_anew(field: str) -> None:
+def test_a_non_finite_state_is_initialized_again(field: str) -> None:
     samples = own_block(np.ones(16), 90.0)
     estimator = Estimator(PEM)
     estimator.run(samples[:1000])
@@ -173,7 +176,7 @@ def test_a_state_that_is_no_number_begins_anew(field: str) -> None:
 
 @pytest.mark.parametrize("celsius", [-273.15, -300.0, -127.0, 1e6, np.inf])
 @pytest.mark.parametrize("first", [0, 500])
-def test_a_temperature_that_no_cell_has_counts_as_none(first: int, celsius: float) -> None:
+def test_an_implausible_temperature_is_not_used(first: int, celsius: float) -> None:
     samples = own_block(np.ones(16), 10.0)
     without, told = Estimator(PEM), Estimator(PEM)
     expected_v = without.run(samples)["voltage_estimate_v"].copy()
@@ -182,7 +185,7 @@ def test_a_temperature_that_no_cell_has_counts_as_none(first: int, celsius: floa
     assert np.isfinite(expected_v).all()
 
 
-def test_a_current_of_the_wrong_sign_teaches_nothing() -> None:
+def test_a_current_with_the_wrong_sign_does_not_change_parameters() -> None:
     samples = own_block(np.ones(16), 60.0)
     estimator = Estimator(PEM)
     estimator.run(samples[:2000])

@@ -1,4 +1,4 @@
-"""A simulated cell with the flat OCV of lithium iron phosphate, 30 mV higher after charge than after discharge."""
+"""Simulated cell with the flat OCV of LFP, 30 mV higher after charge than after discharge."""
 
 import numpy as np
 import pytest
@@ -18,12 +18,12 @@ OCV_V = (2.6, 2.95, 3.1, 3.19, 3.215, 3.235, 3.262, 3.274, 3.278, 3.282, 3.29, 3
 CELL = load_cell("ncr18650").model_copy(update={"ladder": None, "ocv": TableOcv(form="table", soc=SOC, ocv_v=OCV_V)})
 HYSTERESIS_V = 0.03
 TURN_SOC = 0.05
-"""Charge that leads from one branch of the OCV to the other, per unit of SOC."""
+"""Charge between the OCV after discharge and that after charge [SOC]."""
 CAPACITY_AS = CELL.cell.capacity_ah * 3600.0
 
 
 def load_a(rng: np.random.Generator, cycles: int) -> np.ndarray:
-    """Current at 1 Hz: random discharge to SOC 0.15, rest, random charge to 0.95, rest."""
+    """Return a current at 1 Hz: random discharge to SOC 0.15, rest, random charge to 0.95, rest [A]."""
     parts, soc = [], 1.0
     for _ in range(cycles):
         for choices, end in ((np.array([0.0, 0.75, 1.5, 3.0]), 0.15), (np.array([-0.75, -1.5]), 0.95)):
@@ -35,7 +35,7 @@ def load_a(rng: np.random.Generator, cycles: int) -> np.ndarray:
 
 
 def cycled(seed: int) -> tuple[SampleBlock, np.ndarray]:
-    """Samples with 0.5 mV of noise at 1 mV resolution, and the true SOC."""
+    """Return samples with 0.5 mV of noise and 1 mV resolution, and the true SOC."""
     rng = np.random.default_rng(seed)
     current_a = load_a(rng, 4)
     block = np.zeros(current_a.size, dtype=SAMPLE)
@@ -52,14 +52,14 @@ def cycled(seed: int) -> tuple[SampleBlock, np.ndarray]:
 
 
 def errors(block: SampleBlock, soc: np.ndarray, hysteresis_v: float) -> tuple[float, float]:
-    """RMS error of the SOC after two hours, and the share of time inside two standard deviations."""
+    """Return the RMS error of the SOC after two hours, and the share of time inside two standard deviations."""
     estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=hysteresis_v), initial_soc=1.0)
     trace = estimator.run(block)[7200:]
     error = trace["soc"] - soc[7200:]
     return float(np.sqrt(np.mean(error**2))), float(np.mean(np.abs(error) < 2.0 * trace["soc_std"]))
 
 
-def test_a_hysteresis_that_is_told_makes_the_soc_better_and_its_band_true() -> None:
+def test_a_configured_hysteresis_improves_soc_and_coverage() -> None:
     loads = [cycled(seed) for seed in range(1, 4)]
     told, untold = (np.mean([errors(*load, v) for load in loads], axis=0) for v in (HYSTERESIS_V, 0.0))
     assert told[0] < 0.012
@@ -68,8 +68,8 @@ def test_a_hysteresis_that_is_told_makes_the_soc_better_and_its_band_true() -> N
 
 
 @pytest.mark.parametrize("steps_s", [(1.0,), (10.0,), (1.0, 7.0), (1.0, 1.0, 1.0, 8.0)])
-def test_regeneration_does_not_turn_it(steps_s: tuple[float, ...]) -> None:
-    """Half an hour of 1.5 C and -1 C in turn, 20 s each: five times as much charge moves as the cell loses."""
+def test_regeneration_does_not_reverse_the_hysteresis(steps_s: tuple[float, ...]) -> None:
+    """Half an hour of 1.5 C and -1 C alternately, 20 s each: the throughput is five times the net discharge."""
     estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=0.0), initial_soc=0.8)
     time_s = np.concatenate([[0.0], np.cumsum(np.resize(steps_s, round(1800.0 / np.mean(steps_s))))])
     current_a = CELL.cell.capacity_ah * np.where(time_s % 40.0 < 20.0, 1.5, -1.0)
@@ -86,7 +86,7 @@ def test_regeneration_does_not_turn_it(steps_s: tuple[float, ...]) -> None:
     assert h[late].mean() == pytest.approx(counted[late].mean(), abs=0.1)
 
 
-def test_it_grows_in_the_cold() -> None:
+def test_hysteresis_grows_in_the_cold() -> None:
     """Return the filter's prediction after a charge minus that after a discharge."""
     seen_v = {}
     for h in (-1.0, 1.0):

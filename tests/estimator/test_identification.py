@@ -36,7 +36,7 @@ def test_step_and_run_leave_the_same_record_to_the_last_bit(load) -> None:
     assert whole.record.tobytes() == stepped.record.tobytes() == pieces.record.tobytes()
 
 
-def test_a_wrong_soc_and_wrong_resistances_are_found(load) -> None:
+def test_a_wrong_soc_and_wrong_resistances_are_corrected(load) -> None:
     block, true_soc = load
     estimator = Estimator(wrong_cell(2.0), identifier=ON, initial_soc=0.8)
     trace = estimator.run(block)
@@ -52,7 +52,7 @@ def test_a_wrong_soc_and_wrong_resistances_are_found(load) -> None:
         assert elements[name].relative_std < 0.4
 
 
-def test_the_identified_values_are_where_the_adaptation_law_leads(load) -> None:
+def test_the_limits_of_the_adaptive_law_are_the_identified_values(load) -> None:
     estimator = Estimator(wrong_cell(2.0), identifier=ON, initial_soc=0.8)
     estimator.run(load[0])
     record, a = estimator.record[0], estimator.state[0]["a"]
@@ -66,7 +66,7 @@ def test_the_identified_values_are_where_the_adaptation_law_leads(load) -> None:
         assert a[i] == pytest.approx(min(max(fit.value, bounds.lower), bounds.upper), rel=1e-3)
 
 
-def test_the_configured_bounds_stay_the_guard(load) -> None:
+def test_identified_values_are_limited_by_the_configured_bounds(load) -> None:
     cell = wrong_cell(1.0).model_copy(
         update={"adaptation": {"a3": TRUTH.bounds(3).model_copy(update={"upper": 0.01, "lower": 0.009})}}
     )
@@ -76,8 +76,8 @@ def test_the_configured_bounds_stay_the_guard(load) -> None:
     assert estimator.state[0]["a"][3] == pytest.approx(0.01, rel=1e-3)
 
 
-def test_a_bound_that_holds_one_parameter_leaves_the_element_where_the_data_are(load) -> None:
-    """R_s with an amplitude far too small for the truth: exponent and offset make up for it where the cell has been."""
+def test_a_bound_on_one_parameter_does_not_change_the_element_at_visited_soc(load) -> None:
+    """The bound limits the amplitude of R_s far below its true value. Exponent and offset compensate at visited SOCs."""
     bound = TRUTH.bounds(15).model_copy(update={"upper": 0.08, "lower": 0.07})
     estimator = Estimator(TRUTH.model_copy(update={"adaptation": {"a15": bound}}), identifier=ON, initial_soc=1.0)
     estimator.run(load[0])
@@ -99,7 +99,7 @@ def test_a_fit_that_is_negative_at_the_present_soc_is_not_handed_over(load) -> N
     assert np.array_equal(record["observer"]["target"], targets)
 
 
-def test_time_that_nobody_measured_teaches_the_map_nothing(load) -> None:
+def test_an_unmeasured_gap_adds_nothing_to_the_map(load) -> None:
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     estimator.run(load[0][:5000])
     before, gap_s = estimator.record[0]["map"]["weight"].copy(), 36000.0
@@ -114,10 +114,10 @@ def test_time_that_nobody_measured_teaches_the_map_nothing(load) -> None:
     left = np.exp(-gap_s / estimator.settings_record["map_memory_s"][0])
     known = before > 0.0
     kept = estimator.record[0]["map"]["weight"][known] / before[known]
-    assert np.median(kept) == pytest.approx(left, rel=2e-3)  # at the present SOC it learns on
+    assert np.median(kept) == pytest.approx(left, rel=2e-3)  # at the present SOC learning continues
 
 
-def test_a_long_pause_leaves_what_was_learned_of_capacity_and_of_the_sensor_what_stays(load) -> None:
+def test_a_long_gap_preserves_the_capacity_and_the_constant_part_of_the_offset(load) -> None:
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     estimator.run(load[0][:-1])
     f = estimator.record[0]["filter"]
@@ -136,7 +136,7 @@ def test_a_long_pause_leaves_what_was_learned_of_capacity_and_of_the_sensor_what
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2"])
-def test_laws_without_a_limit_get_none(load, law: str) -> None:
+def test_laws_without_limits_receive_no_identified_limits(load, law: str) -> None:
     estimator = Estimator(TRUTH, ObserverSettings(law=law), identifier=ON, initial_soc=1.0)
     targets = estimator.settings[0]["target"].copy()
     estimator.run(load[0])
@@ -151,7 +151,7 @@ def test_without_the_identifier_nothing_is_learned(load) -> None:
     assert (estimator.record[0]["fit"]["bins"] == 0).all()
 
 
-def test_a_saved_record_goes_on_as_if_nothing_had_happened(load) -> None:
+def test_a_saved_record_resumes_identically(load) -> None:
     block = load[0]
     straight, first, second = (Estimator(TRUTH, identifier=ON, initial_soc=0.9) for _ in range(3))
     straight.run(block)
@@ -161,7 +161,7 @@ def test_a_saved_record_goes_on_as_if_nothing_had_happened(load) -> None:
     assert straight.record.tobytes() == second.record.tobytes()
 
 
-def test_after_a_pause_the_soc_is_less_certain_and_found_again(load) -> None:
+def test_the_soc_is_less_certain_after_a_gap_and_converges_again(load) -> None:
     block, true_soc = load
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     before = estimator.run(block[:5000])["soc_std"][-1]
@@ -171,8 +171,8 @@ def test_after_a_pause_the_soc_is_less_certain_and_found_again(load) -> None:
     assert np.abs(after["soc"][1800:] - true_soc[8600:]).max() < 0.015
 
 
-def test_pauses_of_a_pack_do_not_add_up_how_its_cells_differ(load) -> None:
-    """The error exists once, however often the filter restarts from its SOC."""
+def test_gaps_do_not_accumulate_the_cell_imbalance_of_a_pack(load) -> None:
+    """The imbalance adds to the std once, for any number of restarts."""
     stds = []
     for series in (1, 6):
         block = load[0][:5000].copy()
@@ -186,7 +186,7 @@ def test_pauses_of_a_pack_do_not_add_up_how_its_cells_differ(load) -> None:
     assert stds[1] < 1.1 * stds[0]
 
 
-def test_a_soc_that_is_set_is_believed_but_not_blindly(load) -> None:
+def test_a_soc_set_by_the_user_is_used_unless_the_voltage_contradicts(load) -> None:
     block, true_soc = load
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=0.8)
     estimator.run(block[:10])
@@ -196,7 +196,7 @@ def test_a_soc_that_is_set_is_believed_but_not_blindly(load) -> None:
     assert np.abs(trace["soc"] - true_soc[10:600]).max() < 0.01
 
 
-def test_a_clock_set_back_and_repeated_stamps_harm_nothing(load) -> None:
+def test_a_clock_set_back_and_repeated_stamps_do_not_change_the_result(load) -> None:
     block, true_soc = load[0].copy(), load[1]
     block["time_s"][4000:] -= 2000.0
     block["time_s"][6000:6020] = block["time_s"][5999]
@@ -207,18 +207,18 @@ def test_a_clock_set_back_and_repeated_stamps_harm_nothing(load) -> None:
     assert abs(trace["soc"][-1] - true_soc[-1]) < 0.01
 
 
-def test_the_map_holds_nothing_before_its_first_sample() -> None:
+def test_the_map_is_empty_before_its_first_sample() -> None:
     estimator = Estimator(TRUTH, identifier=ON)
     assert [fitted_parameter(estimator.record[0], 3 * e + 1) for e in range(ELEMENTS)] == [None] * ELEMENTS
 
 
 @pytest.mark.parametrize("soc", [-0.1, 1.5, float("nan")])
-def test_a_soc_outside_0_to_1_is_refused(soc: float) -> None:
+def test_a_soc_outside_0_to_1_is_rejected(soc: float) -> None:
     with pytest.raises(ValueError, match="is outside"):
         Estimator(TRUTH, identifier=ON).set_soc(soc)
 
 
-def test_a_reset_after_a_pause_goes_back_to_the_soc_of_the_pause(load) -> None:
+def test_a_reset_after_a_gap_restores_the_soc_of_the_gap(load) -> None:
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     estimator.run(load[0][:5000])
     estimator.set_soc(0.7)

@@ -1,4 +1,4 @@
-"""Promises of the learning law: it learns under an informative load, stays bounded under any, and survives."""
+"""Learning law: convergence under an informative load, boundedness under any load, and recovery."""
 
 import itertools
 
@@ -32,7 +32,7 @@ STARTS = list(itertools.product((0.5, 2.0), repeat=5))[::5]
 OFF = (2.0, 0.5, 2.0, 0.5, 2.0)
 PRODUCTS = [2, 4]
 K_BOUND = 6.0
-"""gamma k is 0.1/s then."""
+"""Maximum of k, at which gamma k is 0.1/s."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def ten_hours() -> SampleBlock:
 
 
 @pytest.mark.parametrize("factors", STARTS, ids=str)
-def test_a_load_of_random_steps_tells_all_elements(ten_hours: SampleBlock, factors: tuple[float, ...]) -> None:
+def test_a_load_of_random_steps_determines_all_elements(ten_hours: SampleBlock, factors: tuple[float, ...]) -> None:
     estimator = learner(file_off_by(*factors))
     estimator.run(ten_hours)
     error = errors(estimator, factors)
@@ -49,8 +49,8 @@ def test_a_load_of_random_steps_tells_all_elements(ten_hours: SampleBlock, facto
     assert error[PRODUCTS].max() < 0.02
 
 
-def test_a_constant_current_does_not_tell_the_elements_apart() -> None:
-    """Once both branches have settled only the sum of the resistances shows, and no time constant."""
+def test_a_constant_current_determines_only_the_sum_of_the_resistances() -> None:
+    """In steady state only the sum of the resistances can be observed, and no time constant."""
     factors = (2.0, 0.5, 1.0, 2.0, 0.5)
     rng = np.random.default_rng(1)
     constant = measured(np.full(7200 * 2, 0.1 * RATED_A), NOISE_V, rng)
@@ -59,8 +59,8 @@ def test_a_constant_current_does_not_tell_the_elements_apart() -> None:
     assert errors(estimator, factors).max() > 0.4
 
 
-def test_noise_of_200_mv_leaves_the_voltage_near_the_cells() -> None:
-    """To within a fifth of the noise."""
+def test_the_estimated_voltage_is_near_the_true_one_with_200_mv_of_noise() -> None:
+    """The error is below a fifth of the noise."""
     noise_v = 0.2
     noisy, clean = random_steps(3.0, noise_v), random_steps(3.0)
     trace = learner(TRUTH).run(noisy)
@@ -69,7 +69,7 @@ def test_noise_of_200_mv_leaves_the_voltage_near_the_cells() -> None:
     assert np.sqrt(np.mean(np.square(error_v))) < 0.2 * noise_v
 
 
-def test_an_element_beyond_its_bounds_is_held_there(ten_hours: SampleBlock) -> None:
+def test_an_element_beyond_its_bounds_is_limited(ten_hours: SampleBlock) -> None:
     estimator = learner(file_off_by(8.0, 1.0, 1.0, 1.0, 1.0))
     estimator.run(ten_hours[:7200])
     assert estimator.record[0]["learning"]["theta"][0] == pytest.approx(np.log(0.25))
@@ -77,7 +77,7 @@ def test_an_element_beyond_its_bounds_is_held_there(ten_hours: SampleBlock) -> N
 
 
 @pytest.mark.parametrize("tau_factors", [(8.0, 0.1), (100.0, 1e-3)], ids=str)
-def test_a_file_whose_branches_are_in_the_other_order_is_allowed(tau_factors: tuple[float, float]) -> None:
+def test_a_file_with_reversed_time_constants_is_accepted(tau_factors: tuple[float, float]) -> None:
     short, long = tau_factors
     estimator = learner(file_off_by(1.0, 1.0, short, 1.0, long))
     q = estimator.settings_record[0]["learning"]
@@ -88,21 +88,21 @@ def test_a_file_whose_branches_are_in_the_other_order_is_allowed(tau_factors: tu
     assert theta[2] < 0.0 < theta[4]
 
 
-def test_the_dead_zone_keeps_k_still() -> None:
+def test_the_dead_zone_keeps_k_constant() -> None:
     block = random_steps(2.0, 0.1 * RESOLUTION_V)
     still, without = learner(TRUTH), learner(TRUTH, dead_zone_v=0.0, epsilon_v=4 * RESOLUTION_V)
     assert (still.run(block)["k"] == 1.0).all()
     assert without.run(block)["k"][-1] > 1.0
 
 
-def test_k_is_bounded_under_noise_that_goes_on() -> None:
+def test_k_is_bounded_under_persistent_noise() -> None:
     k = learner(TRUTH).run(random_steps(3.0, 0.05))["k"]
     assert 1.0 < k[600] < K_BOUND
     assert k[-1] == pytest.approx(K_BOUND)
 
 
-def test_a_k_beyond_its_bound_does_not_lead_what_is_learned_astray() -> None:
-    """As in a checkpoint after hours of noise."""
+def test_a_k_beyond_its_bound_does_not_disturb_the_parameters() -> None:
+    """A checkpoint after hours of noise may contain such a k."""
     estimator, block = learner(file_off_by(*OFF)), random_steps(10.0, 5e-3)
     estimator.run(block[:1])
     estimator.state["k"] = 113.0
@@ -111,7 +111,7 @@ def test_a_k_beyond_its_bound_does_not_lead_what_is_learned_astray() -> None:
     assert errors(estimator, OFF)[[0, *PRODUCTS]].max() < 0.03
 
 
-def test_a_jump_of_a_resistance_is_found_again() -> None:
+def test_a_jump_of_a_resistance_is_learned() -> None:
     rng = np.random.default_rng(2)
     current_a = held_currents(6.0, rng)
     half = len(current_a) // 2
@@ -138,8 +138,8 @@ def test_step_and_run_leave_the_same_state_to_the_last_bit(ten_hours: SampleBloc
     assert at_once.record.tobytes() == one_by_one.record.tobytes()
 
 
-def test_the_rate_of_samples_does_not_matter() -> None:
-    """1, 10 and 100 Hz of one run; at 1 Hz the current of a step is known to half a second."""
+def test_the_result_does_not_depend_on_the_sample_rate() -> None:
+    """One run is sampled at 1, 10 and 100 Hz. At 1 Hz the time of a current step is uncertain by half a second."""
     current_a = np.repeat(held_currents(2.0, np.random.default_rng(4)), 50)
     time_s = 0.01 * np.arange(len(current_a))
     voltage_v, _ = simulate_cell((FIRST_SOC, 0.0, 0.0), time_s, current_a, 0.275 * 3600.0, TRUTH.a)
@@ -155,7 +155,7 @@ def test_the_rate_of_samples_does_not_matter() -> None:
     assert found[2] == pytest.approx(found[0], abs=0.1)
 
 
-def test_a_pack_learns_as_its_cell_does(ten_hours: SampleBlock) -> None:
+def test_a_pack_learns_the_scaled_values_of_its_cell(ten_hours: SampleBlock) -> None:
     cell, settings = learner(file_off_by(*OFF)), ObserverSettings(law="learning")
     pack = Estimator(
         file_off_by(*OFF).pack(6, 1),
@@ -173,7 +173,7 @@ def test_a_pack_learns_as_its_cell_does(ten_hours: SampleBlock) -> None:
     assert pack.state["k"][0] == pytest.approx(cell.state["k"][0])
 
 
-def test_below_the_margins_nothing_is_learned() -> None:
+def test_learning_stops_below_the_margins() -> None:
     block = measured(np.full(4 * 7200, 0.1 * RATED_A), 0.0, np.random.default_rng(1))
     estimator = learner(file_off_by(*OFF), soc=0.02)
     estimator.run(block[:10])
@@ -189,7 +189,7 @@ def test_below_the_margins_nothing_is_learned() -> None:
 
 
 @pytest.mark.parametrize("law", ["improved", "learning"])
-def test_the_smallest_guard_keeps_capacitances_above_zero(law: str) -> None:
+def test_capacitances_are_positive_with_the_smallest_margin_guard(law: str) -> None:
     with pytest.raises(ValueError, match="margin_guard"):
         ObserverSettings.model_validate({"law": law, "margin_guard": 0.0})
     settings = ObserverSettings.model_validate({"law": law, "margin_guard": 1e-6})
@@ -199,7 +199,7 @@ def test_the_smallest_guard_keeps_capacitances_above_zero(law: str) -> None:
     assert estimator.state["adapting"][0] == 0
 
 
-def test_a_gap_teaches_nothing_and_the_law_goes_on() -> None:
+def test_a_gap_does_not_change_parameters_and_learning_continues() -> None:
     """Two hours at rest without samples."""
     rng = np.random.default_rng(5)
     parts = held_currents(2.0, rng), np.zeros(2 * 7200), held_currents(3.0, rng)
@@ -214,7 +214,7 @@ def test_a_gap_teaches_nothing_and_the_law_goes_on() -> None:
     assert errors(estimator, (1.0,) * 5)[[0, *PRODUCTS]].max() < 0.1
 
 
-def test_after_a_restart_under_load_what_was_learned_is_there_and_stays(ten_hours: SampleBlock) -> None:
+def test_learned_parameters_are_preserved_after_a_restart_under_load(ten_hours: SampleBlock) -> None:
     estimator = learner(file_off_by(*OFF))
     estimator.run(ten_hours[:28_800])
     before = errors(estimator, OFF)
@@ -228,7 +228,7 @@ def test_after_a_restart_under_load_what_was_learned_is_there_and_stays(ten_hour
 
 
 @pytest.mark.parametrize("field", ["theta", "x", "information", "offset_v"])
-def test_a_state_that_is_no_number_begins_anew(ten_hours: SampleBlock, field: str) -> None:
+def test_a_non_finite_state_is_initialized_again(ten_hours: SampleBlock, field: str) -> None:
     estimator = learner(file_off_by(*OFF))
     estimator.run(ten_hours[:600])
     estimator.record[0]["learning"][field] = np.nan
@@ -238,7 +238,7 @@ def test_a_state_that_is_no_number_begins_anew(ten_hours: SampleBlock, field: st
     assert trace["lock"][-1] == 1
 
 
-def test_samples_that_are_none_are_dropped(ten_hours: SampleBlock) -> None:
+def test_invalid_samples_are_dropped(ten_hours: SampleBlock) -> None:
     dirty, clean = learner(TRUTH), learner(TRUTH)
     clean.run(ten_hours[:600])
     dirty.run(ten_hours[:300])
@@ -248,7 +248,7 @@ def test_samples_that_are_none_are_dropped(ten_hours: SampleBlock) -> None:
     assert dirty.record["learning"].tobytes() == clean.record["learning"].tobytes()
 
 
-def test_beside_the_filter_the_law_has_its_soc_and_keeps_its_parameters(ten_hours: SampleBlock) -> None:
+def test_with_the_filter_the_law_uses_its_soc_and_has_its_own_parameters(ten_hours: SampleBlock) -> None:
     cell = file_off_by(*OFF)
     estimator = Estimator(
         cell,
@@ -264,7 +264,7 @@ def test_beside_the_filter_the_law_has_its_soc_and_keeps_its_parameters(ten_hour
     assert (estimator.state["target"] == estimator.settings["target"]).all()
 
 
-def test_what_was_learned_is_published_with_its_source(ten_hours: SampleBlock) -> None:
+def test_learned_parameters_are_published_with_their_source(ten_hours: SampleBlock) -> None:
     estimator = learner(file_off_by(*OFF))
     estimator.run(ten_hours)
     report = make_parameters_payload(estimator, 0.0)
@@ -274,8 +274,8 @@ def test_what_was_learned_is_published_with_its_source(ten_hours: SampleBlock) -
     assert report.a["a14"].source == "configured"
 
 
-def test_gamma_k_has_its_own_name_and_delta_is_said_to_be_configured(ten_hours: SampleBlock) -> None:
-    """A printed law beside it has N(k) and adapts the parameters of delta1 and delta2."""
+def test_gamma_k_has_its_own_field_and_delta_is_reported_as_configured(ten_hours: SampleBlock) -> None:
+    """A law of the thesis, in contrast, has N(k) and adapts the parameters of delta1 and delta2."""
     states = {}
     for law in ("learning", "improved"):
         estimator = Estimator(file_off_by(*OFF), ObserverSettings(law=law), identifier=None, initial_soc=FIRST_SOC)

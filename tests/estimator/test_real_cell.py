@@ -1,4 +1,4 @@
-"""The estimator on a real capture of the tests, from a wrong start."""
+"""Estimator on a real capture with a wrong initial SOC."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from tests.estimator.anywhere.score import score
 
 
 @pytest.mark.parametrize("first", [0, 3000, 6000], ids=["from full", "under 10 A", "mid way"])
-def test_soc_wrong_by_a_fifth_is_right_within_an_hour(data, first):
-    """Nissan Leaf, its own cell file; truth is the charge counted from full."""
+def test_an_initial_soc_wrong_by_0_2_is_corrected_within_an_hour(data, first):
+    """Nissan Leaf with its cell file. The true SOC is counted from full."""
     cell, whole = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
     drawn_as = np.r_[0.0, np.cumsum(whole["current_a"][:-1] * np.diff(whole["time_s"]))]
     soc = (1.0 - drawn_as / (3600.0 * cell.cell.capacity_ah))[first:]
@@ -23,8 +23,8 @@ def test_soc_wrong_by_a_fifth_is_right_within_an_hour(data, first):
 
 
 @pytest.mark.parametrize("wrong", [-0.2, 0.2])
-def test_errors_and_innovations_in_mid_load_are_of_the_size_of_their_std(data, wrong):
-    """Nissan Leaf from 35 % of its charge on: NIS of ten minutes, NEES, and a band that is narrow."""
+def test_nees_and_nis_in_mid_load_match_the_std(data, wrong):
+    """Nissan Leaf from 35 % of its charge on: NIS of ten minutes, NEES, and a limit of the std."""
     cell, samples = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz").rows
     drawn_as = np.r_[0.0, np.cumsum(samples["current_a"][:-1] * np.diff(samples["time_s"]))]
     soc, first = 1.0 - drawn_as / (3600.0 * cell.cell.capacity_ah), int(np.argmax(drawn_as >= 0.35 * drawn_as[-1]))
@@ -36,7 +36,7 @@ def test_errors_and_innovations_in_mid_load_are_of_the_size_of_their_std(data, w
     assert found.nees < 2.0
 
 
-def test_blocks_of_a_real_capture_leave_what_its_samples_leave_to_the_last_bit(data):
+def test_blocks_of_a_real_capture_give_exactly_the_state_of_single_samples(data):
     cell, capture = load_cell("leaf"), load_capture(data / "leaf" / "cc_1c.csv.gz")
     whole, stepped = Estimator(cell), Estimator(cell)
     whole.run(capture.rows)

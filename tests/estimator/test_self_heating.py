@@ -1,4 +1,4 @@
-"""Self-heating of a cell, compared with a measured one."""
+"""Modelled self-heating of a cell, compared with measurements."""
 
 import math
 from pathlib import Path
@@ -31,13 +31,13 @@ def taken_c(estimator):
 
 
 def loaded(estimator, seconds=600):
-    """Draw 1C of a cell of 5 Ah."""
+    """Process a load of 1C for a cell of 5 Ah."""
     for second in range(seconds):
         estimator.step(float(second), 5.0, 3.9)
     return taken_c(estimator)
 
 
-def test_without_a_sensor_a_cell_is_as_warm_as_one_that_was_measured() -> None:
+def test_the_modelled_temperature_matches_a_measured_one() -> None:
     samples = load_capture(HALF_C).rows
     measured_k = samples["temperature_c"] - samples["temperature_c"][0]
     samples["temperature_c"] = np.nan
@@ -46,7 +46,7 @@ def test_without_a_sensor_a_cell_is_as_warm_as_one_that_was_measured() -> None:
     assert np.sqrt(np.mean(error_k**2)) < 0.6
 
 
-def test_a_pack_is_as_warm_as_its_cells() -> None:
+def test_a_pack_has_the_temperature_of_its_cells() -> None:
     samples = np.zeros(900, dtype=SAMPLE)
     samples["time_s"], samples["temperature_c"] = np.arange(900.0), np.nan
     samples["current_a"], samples["voltage_v"] = 5.0, 3.9
@@ -57,14 +57,14 @@ def test_a_pack_is_as_warm_as_its_cells() -> None:
     assert rise_k(samples, cell.pack(4, 2)) == pytest.approx(of_cell, rel=0.02)
 
 
-def test_a_sensor_is_believed() -> None:
+def test_a_measured_temperature_replaces_the_model() -> None:
     samples = load_capture(HALF_C).rows
     samples["temperature_c"] = 10.0
     assert np.all(rise_k(samples) == 10.0 - REFERENCE_C)
 
 
 @pytest.mark.parametrize("unseen_s", [COOLING_S, 8 * 3600.0, math.inf], ids=["minutes", "a night", "nobody knows"])
-def test_a_cell_cools_while_nobody_measures(unseen_s: float) -> None:
+def test_a_cell_cools_in_a_gap(unseen_s: float) -> None:
     estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
     warm_k = loaded(estimator) - REFERENCE_C
     assert warm_k > 2.0
@@ -74,7 +74,7 @@ def test_a_cell_cools_while_nobody_measures(unseen_s: float) -> None:
     assert 0.0 <= taken_c(estimator) - REFERENCE_C < warm_k * (0.1 if unseen_s > COOLING_S else 0.9)
 
 
-def test_a_current_that_is_no_truth_makes_no_fire() -> None:
+def test_the_modelled_temperature_is_limited() -> None:
     estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
     for second in range(300):
         estimator.step(float(second), 99.0, 3.9)

@@ -22,13 +22,14 @@ from tests.calibration.simulated_load import TRUTH, capture, steps
 
 FIRST_SOC = 0.98
 WHOLE_BIN = 100
-"""Samples; a bin at the end of the capture holds fewer, and one of them on the other side of its edge matters."""
+"""Minimum number of samples of a compared bin. In bins with fewer samples, one sample beyond the edge changes the mean."""
 R_S_ERROR = 0.002
-"""Tolerance, measured 0.0008. Live (3.18) holds a1..a12 of the moment, `adapt` their mean (3.19), and live SOC is counted by the mean of two samples."""
+"""Relative tolerance; the measured difference is 0.0008. The live estimate uses the present a1..a12, `adapt` uses their
+mean (3.19), and the live SOC is counted by the mean of two samples."""
 
 
 def thesis() -> Estimator:
-    """The improved law without the identifier."""
+    """Return an estimator with the improved law and without the identifier."""
     return Estimator(
         TRUTH,
         ObserverSettings(law="improved"),
@@ -40,12 +41,12 @@ def thesis() -> Estimator:
 
 @pytest.fixture(scope="module")
 def load() -> SampleBlock:
-    """Five hours of random steps with rests, from rest, at 1 Hz."""
+    """Return samples of five hours of random steps with rests, from rest, at 1 Hz."""
     samples: SampleBlock = capture(steps(3), soc=FIRST_SOC)  # type: ignore[no-untyped-call]
     return samples
 
 
-def test_live_r_s_is_that_of_steps_2_and_3_on_the_same_capture(load: SampleBlock) -> None:
+def test_live_r_s_equals_that_of_steps_2_and_3_on_a_capture(load: SampleBlock) -> None:
     estimator = thesis()
     estimator.run(load)
     offline = steps_2_and_3(TRUTH, [Start(load, FIRST_SOC)], LOWEST_SOC)
@@ -65,7 +66,7 @@ def test_live_r_s_is_that_of_steps_2_and_3_on_the_same_capture(load: SampleBlock
     assert fit_series_resistance(found, LOWEST_SOC)(soc) == pytest.approx(offline.r_s(soc), rel=R_S_ERROR)
 
 
-def test_steps_and_a_run_leave_the_same_r_s_to_the_last_bit(load: SampleBlock) -> None:
+def test_step_and_run_give_bit_identical_r_s(load: SampleBlock) -> None:
     whole, single = thesis(), thesis()
     trace = whole.run(load[:3000])
     for time_s, current_a, voltage_v, *_ in load[:3000].tolist():
@@ -101,7 +102,7 @@ def test_r_s_is_published_as_of_4_2_and_null_until_a_current_flows(load: SampleB
     assert 0.0 < r_s.std < R_S_ERROR * r_s.value
 
 
-def test_a_checkpoint_goes_on_from_the_same_sums(load: SampleBlock) -> None:
+def test_a_checkpoint_restores_the_sums(load: SampleBlock) -> None:
     estimator, next_run = thesis(), thesis()
     estimator.run(load[:5000])
     saved = {name: field.copy() for name, field in fields(estimator.record)}
@@ -116,7 +117,7 @@ def test_a_checkpoint_goes_on_from_the_same_sums(load: SampleBlock) -> None:
     assert next_run.record["series_resistance"]["samples"].sum() > saved["series_resistance.samples"].sum()
 
 
-def test_a_damaged_or_foreign_sum_is_not_taken_up(load: SampleBlock) -> None:
+def test_a_damaged_or_foreign_sum_is_not_restored(load: SampleBlock) -> None:
     estimator = thesis()
     estimator.run(load[:5000])
     saved = {name: field.copy() for name, field in fields(estimator.record)}
@@ -125,8 +126,8 @@ def test_a_damaged_or_foreign_sum_is_not_taken_up(load: SampleBlock) -> None:
     assert restore_state(thesis(), saved, 5.0) == "product_va of the series_resistance is not finite"
 
 
-def test_nothing_is_summed_with_branches_that_nobody_knows(load: SampleBlock) -> None:
-    """A start under load, and a gap: x2 and x3 depend on a load that was not measured."""
+def test_nothing_is_summed_while_the_rc_voltages_are_unknown(load: SampleBlock) -> None:
+    """After a start under load and after a gap, x2 and x3 depend on an unmeasured load."""
     under_load = int(np.argmax(np.abs(load["current_a"]) > 0.5))
     estimator = thesis()
     estimator.run(load[under_load : under_load + 1000])
@@ -138,7 +139,7 @@ def test_nothing_is_summed_with_branches_that_nobody_knows(load: SampleBlock) ->
     assert after_gap.record["series_resistance"]["samples"].sum() == before
 
 
-def test_a_bin_forgets_so_that_r_s_can_age(load: SampleBlock) -> None:
+def test_a_bin_discounts_old_samples(load: SampleBlock) -> None:
     flowing = 5000 + int(np.argmax(np.abs(load["current_a"][5000:]) > 0.06))
     estimator = thesis()
     estimator.run(load[:flowing])

@@ -1,5 +1,4 @@
-"""Sources with little information: a sample each minute, current steps, a dead band of amperes, voltage and current
-apart."""
+"""Sources with little information: a sample each minute, coarse current, dead band, voltage and current at different times."""
 
 import numpy as np
 import pytest
@@ -32,14 +31,14 @@ def steady(current_a: float, samples: int, step_s: float = 1.0) -> SampleBlock:
     ],
     ids=lambda value: value.name if isinstance(value, Source) else "",
 )
-def test_the_band_is_true_where_little_is_told(source: Source, rmse: float, std: float) -> None:
+def test_the_interval_coverage_holds_with_little_information(source: Source, rmse: float, std: float) -> None:
     found = list(scores(source, seeds=range(1, 5)))
     assert np.mean([s.cover for s in found]) >= 95.0
     assert np.sqrt(np.mean([s.rmse**2 for s in found])) <= rmse
     assert np.mean([s.std for s in found]) <= std
 
 
-def test_a_sample_each_minute_is_no_gap_though_some_come_late_or_are_lost() -> None:
+def test_a_sample_each_minute_causes_no_gaps_with_late_or_lost_samples() -> None:
     block, _ = pulses(hours=3.0)
     slow = block[::60].copy()
     slow["time_s"] += np.random.default_rng(1).uniform(0.0, 3.0, slow.size)
@@ -70,9 +69,7 @@ def test_the_charge_between_samples_a_minute_apart_is_counted_as_straight_betwee
         (Sampling(1.0, 0.1, 0.6), 0.7, 0.1 / np.sqrt(12.0)),
     ],
 )
-def test_a_current_that_stays_the_same_is_wrong_by_the_same_all_the_time(
-    sampling: Sampling, current_a: float, error_a: float
-) -> None:
+def test_a_constant_reported_current_has_a_constant_error(sampling: Sampling, current_a: float, error_a: float) -> None:
     f, p = np.zeros(1, dtype=EKF_STATE)[0], np.zeros(1, dtype=EKF_SETTINGS)[0]
     p["current_step_a"], p["dead_band_a"] = sampling.current_resolution_a, sampling.current_dead_band_a
     f["current_a"] = current_a
@@ -80,16 +77,16 @@ def test_a_current_that_stays_the_same_is_wrong_by_the_same_all_the_time(
     assert variance_as2 == pytest.approx((error_a * 3600.0) ** 2)
     assert rounding_charge_variance(f, p, 1.0, current_a + 1.0) == pytest.approx(
         0.1**2 / 12.0
-    )  # another current errs on its own
+    )  # the error of another current is independent
 
 
-def test_a_board_is_as_it_was() -> None:
+def test_settings_of_a_board_have_the_default_resolution() -> None:
     block, _ = pulses(hours=0.5)
     told, untold = Estimator(TRUTH, sampling=Settings().sampling), Estimator(TRUTH)
     assert told.run(block).tobytes() == untold.run(block).tobytes()
 
 
-def test_what_a_source_resolves_comes_from_its_protocol_unless_it_is_told() -> None:
+def test_the_resolution_of_a_source_is_that_of_its_protocol_unless_configured() -> None:
     shunt = Settings.model_validate({"sensor": {"protocol": "pylontech", "current_dead_band_a": 0.0}})
     assert shunt.sampling == Sampling(2.0, 0.01, 0.0)
     assert Settings().sampling == Sampling(0.01)

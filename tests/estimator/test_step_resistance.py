@@ -18,7 +18,7 @@ FILES = {"of another such cell": Case("R_s"), "generic": Case("R_s", file_c="gen
 
 @pytest.fixture(scope="module")
 def pulses() -> tuple[SampleBlock, Floats]:
-    """Levels of some seconds, which change at any time between the samples of a slower sensor; and the true SOC."""
+    """Return samples under levels of some seconds, which change between the samples of a slow sensor, and the true SOC."""
     rng = np.random.default_rng(9)
     count = round(3600 * HOURS * FULL_HZ)
     level_a = OXIDE.capacity_ah * rng.choice([-0.5, 0.0, 0.5, 1.0, 1.5], count)
@@ -49,7 +49,7 @@ def seen_by_all(samples: SampleBlock) -> Floats:
 
 @pytest.mark.parametrize("file", FILES)
 @pytest.mark.parametrize("rate_hz", [1, 10, 100])
-def test_r_s_is_what_steps_of_the_current_show(pulses, file: str, rate_hz: int) -> None:
+def test_r_s_matches_the_resistance_of_current_steps(pulses, file: str, rate_hz: int) -> None:
     samples = pulses[0][:: FULL_HZ // rate_hz].copy()
     shown_ohm = np.median(seen_by_all(samples))
     noise_v = np.random.default_rng(10).normal(0.0, 1e-3, samples.size)
@@ -58,14 +58,15 @@ def test_r_s_is_what_steps_of_the_current_show(pulses, file: str, rate_hz: int) 
     trace = estimator.run(samples)
     late = trace["time_s"] > 0.5 * trace["time_s"][-1]
     r_s, std = trace["r_s_ohm"][late], trace["r_s_std_ohm"][late]
-    # at 1 Hz a part of what a step shows is the fastest branches, which in the cold a generic file does not know
+    # at 1 Hz a step includes a part of the fastest RC pairs, which a generic file does not describe in the cold
     assert np.abs(r_s / shown_ohm - 1.0).max() < (0.12 if (file, rate_hz) == ("generic", 1) else 0.1)
     assert (np.abs(r_s - shown_ohm) < 2.0 * std).mean() > 0.95
     assert (std < 0.2 * r_s).all()
 
 
 def learned_of(rows: list[tuple[float, float, float]]) -> float:
-    """ln(R_s / R_0 of the file) after a minute without current and then these rows: time [s], current [A], voltage [V]."""
+    """Return ln(R_s / R_0 of the file) after a minute without current and these rows: time [s], current [A], voltage
+    [V]."""
     estimator = Estimator(cell_file(FILES["generic"]), initial_soc=0.5)
     for n in range(60):
         estimator.step(float(n), 0.0, 3.7)
@@ -75,14 +76,14 @@ def learned_of(rows: list[tuple[float, float, float]]) -> float:
 
 
 @pytest.mark.parametrize("back_a", [0.0, 0.004])
-def test_a_step_that_was_none_in_the_end_teaches_nothing(back_a: float) -> None:
-    """A sample that is not believed, or a clock set back, between the current's step and its return."""
+def test_an_interrupted_step_does_not_change_r_s(back_a: float) -> None:
+    """A rejected sample or a clock set back lies between the current step and its return."""
     not_believed = [(60.0, 3.0, 3.55), (60.5, 0.0, 2.6), (61.0, back_a, 3.69)]
     set_back = [(60.0, 3.0, 3.55), (59.0, 0.0, 3.7), (60.0, back_a, 3.7)]
     assert learned_of(not_believed) == learned_of(set_back) == 0.0
 
 
-def test_a_load_that_never_jumps_leaves_r_s_to_the_filter(pulses) -> None:
+def test_without_current_steps_r_s_is_that_of_the_filter(pulses) -> None:
     smooth = pulses[0][::FULL_HZ].copy()
     smooth["current_a"] = OXIDE.capacity_ah * (0.5 + 0.4 * np.sin(smooth["time_s"] / 200.0))
     estimator = Estimator(cell_file(FILES["generic"]), initial_soc=0.7)

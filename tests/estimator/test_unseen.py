@@ -35,22 +35,22 @@ def outside(trace: np.ndarray, true_soc: np.ndarray) -> float:
 @pytest.mark.parametrize("initial_soc", [0.7, 1.0])
 @pytest.mark.parametrize("age_s", [2, 60])
 @pytest.mark.parametrize("load", ["pulses", "constant"])
-def test_kills_under_load_leave_the_true_soc_in_the_band(load: str, age_s: int, initial_soc: float) -> None:
-    """Every 100 s, with checkpoints that are up to a minute old and 12 s until the next start."""
+def test_the_true_soc_stays_in_the_interval_after_kills_under_load(load: str, age_s: int, initial_soc: float) -> None:
+    """The process is killed every 100 s, with checkpoints up to a minute old and a downtime of 12 s."""
     constant = np.full(2000, FULL_LOAD_A)
     block, true_soc = pulses() if load == "pulses" else measured(constant, 0.9, np.random.default_rng(1))
     assert outside(killed(block, 100, age_s, 12, initial_soc), true_soc) < 0.02
 
 
-def test_a_crash_loop_before_the_soc_is_known_does_not_make_it_known() -> None:
-    """Each start sees the same polarisation, and must not take it for news."""
+def test_a_crash_loop_before_convergence_does_not_reduce_the_std() -> None:
+    """Each start measures the same polarization, which is no independent information."""
     block, true_soc = measured(np.full(1500, FULL_LOAD_A), 0.9, np.random.default_rng(2))
     assert outside(killed(block, 40, 2, 12, 0.7), true_soc) < 0.02
 
 
 @pytest.mark.parametrize("every_s", [60, 600, 3600])
-def test_restarts_at_rest_change_nothing(every_s: int) -> None:
-    """However often: an error of the OCV is one error, not a new one with each start."""
+def test_restarts_at_rest_do_not_change_the_soc(every_s: int) -> None:
+    """An error of the OCV is not independent between restarts, for any number of restarts."""
     block = measured(np.zeros(4 * 3600), 0.6, np.random.default_rng(3))[0]
     block["voltage_v"] += 0.02
     straight = Estimator(TRUTH, initial_soc=0.5).run(block)[-1]
@@ -61,8 +61,8 @@ def test_restarts_at_rest_change_nothing(every_s: int) -> None:
 
 @pytest.mark.parametrize("unseen_s", [40, 400, 1500])
 @pytest.mark.parametrize("restart", [False, True], ids=["gap", "restart"])
-def test_a_load_in_a_gap_is_inside_the_band(unseen_s: int, restart: bool) -> None:
-    """At rest before and after, and the earlier load in the gap."""
+def test_the_true_soc_after_a_load_in_a_gap_is_inside_the_interval(unseen_s: int, restart: bool) -> None:
+    """The cell rests before and after the gap, and the earlier load flows in the gap."""
     load_a = np.repeat([0.0, 3.0, 0.0, 3.0, 0.0], [1200, 1200, 1200, unseen_s, 600])
     block, true_soc = measured(load_a, 0.9, np.random.default_rng(4))
     estimator = Estimator(TRUTH, initial_soc=0.9)
@@ -75,8 +75,8 @@ def test_a_load_in_a_gap_is_inside_the_band(unseen_s: int, restart: bool) -> Non
     assert error[-1] < 0.02
 
 
-def test_what_was_measured_before_a_gap_tells_nothing_of_what_flowed_in_it() -> None:
-    """At 10 Hz a second's samples are one update: it is no matter after how many of them the gap begins."""
+def test_samples_before_a_gap_give_no_information_on_its_charge() -> None:
+    """At 10 Hz an update uses the samples of a second. The gap may begin after any number of them."""
     load_a = np.repeat([0.3, 1.0, 0.3], [3000, 1000, 100]) * TRUTH.cell.capacity_ah
     block, true_soc = measured(load_a, 0.5, np.random.default_rng(8), step_s=0.1)
     found = []
@@ -103,7 +103,7 @@ def test_slow_sampling_is_no_gap(period_s: int) -> None:
     assert estimator.state["gaps"][0] == 1  # the first step: nothing is known of the pace
 
 
-def test_a_hole_after_a_restart_is_a_gap() -> None:
+def test_missing_samples_after_a_restart_are_a_gap() -> None:
     block = measured(np.zeros(2000), 0.6, np.random.default_rng(7))[0]
     estimator = Estimator(TRUTH, initial_soc=0.6)
     estimator.run(block[:300])
@@ -112,7 +112,7 @@ def test_a_hole_after_a_restart_is_a_gap() -> None:
     assert estimator.state["gaps"][0] == 1
 
 
-def test_while_the_sign_of_the_current_is_wrong_a_gap_narrows_nothing() -> None:
+def test_a_gap_does_not_reduce_the_std_during_a_sign_fault() -> None:
     block = pulses()[0][:6000].copy()
     block["current_a"] *= -1.0
     estimator = Estimator(TRUTH, initial_soc=1.0)

@@ -19,7 +19,8 @@ FINE_A = 0.002
 
 
 def offset_after(shown_a, sampling=None, smallest_a=FINE_A):
-    """Offset and its std [A] after ten minutes of load, which shows ``smallest_a`` once, and two of ``shown_a``."""
+    """Return the offset and its std [A] after ten minutes of load, with one report of ``smallest_a``, and two minutes
+    of ``shown_a``."""
     rng = np.random.default_rng(1)
     samples = np.zeros(720, dtype=SAMPLE)
     samples["time_s"] = np.arange(720.0)
@@ -39,13 +40,13 @@ def offset_found(estimator, samples):
     return f["mean"][f["best"], OFFSET], np.sqrt(f["covariance"][f["best"], OFFSET, OFFSET])
 
 
-def test_a_sensor_that_shows_no_current_at_rest_has_no_offset() -> None:
+def test_a_sensor_that_reports_no_current_at_rest_has_no_offset() -> None:
     offset_a, std_a = offset_after(0.0)
     assert abs(offset_a) < 1e-3
     assert ZERO_STD_A <= std_a < 1.2 * ZERO_STD_A
 
 
-def test_noise_of_the_sensor_hides_no_zero() -> None:
+def test_a_zero_current_is_detected_with_noise() -> None:
     noise_a = np.random.default_rng(2).normal(0.0, 5e-3, 120)
     offset_a, std_a = offset_after(noise_a, smallest_a=1.0)
     assert abs(offset_a) < 2e-3
@@ -64,7 +65,7 @@ def test_noise_of_the_sensor_hides_no_zero() -> None:
     ],
     ids=["50 mA", "-50 mA", "20 mA", "nothing small was ever shown", "dead band", "coarse steps"],
 )
-def test_what_may_be_a_load_or_hidden_tells_nothing(unknown) -> None:
+def test_a_possible_load_or_hidden_current_gives_no_information(unknown) -> None:
     assert offset_after(**unknown)[1] > 0.7 * FIRST_STD_A
 
 
@@ -72,7 +73,7 @@ LOAD = (100, 1.0, 1), (20, FINE_A, 1), (100, 1.0, 1)
 
 
 def offset_of(steps, estimator=None):
-    """Offset and its std [A] after steps of (duration [s], current [A], pause between samples [s]), if new behind a load."""
+    """Return the offset and its std [A] after steps of (duration [s], current [A], sample period [s])."""
     steps = [*LOAD, *steps] if estimator is None else steps
     estimator = estimator or Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6)
     time_s, times, currents = 0.0, [], []
@@ -87,14 +88,14 @@ def offset_of(steps, estimator=None):
     return offset_found(estimator, samples)
 
 
-def test_samples_on_both_sides_of_zero_are_no_rest() -> None:
-    """A minute apart, as with changing clouds: the mean is zero, but no zero was reported."""
+def test_samples_of_both_signs_are_no_rest() -> None:
+    """Samples a minute apart have a mean of zero, as with changing clouds, but none reports zero."""
     crossing = [(60, current_a, 60) for current_a in (2.0, -2.0) * 10]
     assert offset_of(crossing)[1] > 0.7 * FIRST_STD_A
 
 
-def test_one_odd_small_sample_does_not_show_what_the_sensor_can() -> None:
-    """The mean over an edge may be anything; two in a row are a current."""
+def test_a_single_small_sample_does_not_determine_the_resolution() -> None:
+    """A single sample may be a mean over a step. Two successive ones are a current."""
     edge = [(100, 1.0, 1), (1, FINE_A, 1), (100, 1.0, 1), (120, 0.0, 1)]
     estimators = [Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6) for _ in range(2)]
     assert offset_of(edge, estimators[0])[1] > 0.7 * FIRST_STD_A
@@ -102,7 +103,7 @@ def test_one_odd_small_sample_does_not_show_what_the_sensor_can() -> None:
 
 
 @pytest.mark.parametrize("behind", [(), LOAD], ids=["nothing shown", "shown again"])
-def test_after_a_restart_the_sensor_may_be_another_and_shows_anew_what_it_can(behind) -> None:
+def test_the_resolution_is_determined_again_after_a_restart(behind) -> None:
     estimator = Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6)
     offset_of([*LOAD, (50, 0.0, 1)], estimator)
     estimator.resume(3600.0)
@@ -113,12 +114,12 @@ def test_after_a_restart_the_sensor_may_be_another_and_shows_anew_what_it_can(be
         assert std_a > 0.7 * FIRST_STD_A
 
 
-def test_a_small_load_that_begins_after_a_long_rest_is_judged_by_itself() -> None:
-    """Hours of zero before do not make its mean small: the smallest of all loads, C/150, is no offset."""
+def test_a_small_load_after_a_long_rest_is_not_averaged_with_the_rest() -> None:
+    """Hours of zero current before the load do not reduce its mean: the smallest load, C/150, is no offset."""
     assert abs(offset_of([(7200, 0.0, 1), (3600, 0.02, 1)])[0]) < 2e-3
 
 
-def test_a_standing_load_that_looks_like_an_offset_stays_in_the_band() -> None:
+def test_a_constant_small_load_stays_in_the_interval() -> None:
     """C/600 of an LFP cell on its plateau for a day, reported correctly: it may be an offset, and the interval
     includes that."""
     hours, capacity_ah = 24.0, 100.0
@@ -133,7 +134,7 @@ def test_a_standing_load_that_looks_like_an_offset_stays_in_the_band() -> None:
     assert (np.abs(trace["soc"] - (0.6 - drawn)) < 2.0 * trace["soc_std"])[60:].all()
 
 
-def test_a_state_that_is_observed_is_a_textbook_update() -> None:
+def test_a_direct_update_of_a_state_equals_the_kalman_update() -> None:
     rng = np.random.default_rng(3)
     s = np.zeros(1, EKF_STATE)[0]
     mixed = rng.standard_normal((STATES, STATES))
@@ -147,8 +148,9 @@ def test_a_state_that_is_observed_is_a_textbook_update() -> None:
     assert (s["covariance"][0] == s["covariance"][0].T).all()
 
 
-def test_a_plateau_is_counted_through_when_rests_show_no_current() -> None:
-    """Nine hours of LFP from full, five minutes of rest in each half hour: without them the offset alone may be 9 %."""
+def test_zero_current_rests_keep_the_soc_on_a_plateau() -> None:
+    """Nine hours of an LFP cell from full with five minutes of rest in each half hour. Without rests, the offset would
+    cause an error of up to 9 %."""
     case = Case("LFP, rests", **LFP, load_c=0.1, hours=9.0, soc=1.0, unseen_h=0.0, capacity=1.0, seed=32)
     seconds = round(3600.0 * case.hours)
     current_a = load_a(case, seconds)

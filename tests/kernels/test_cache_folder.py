@@ -1,4 +1,4 @@
-"""Location of compiled kernels: a folder named by all their sources, or none without space."""
+"""Cache folder of compiled kernels, named by a hash of all their sources, and operation without a cache."""
 
 import ast
 import os
@@ -20,7 +20,7 @@ ELF, HEADER_BYTES = b"\x7fELF", 64
 
 
 def imported(source: Path) -> set[Path]:
-    """Files of the package that one of its files imports."""
+    """Return the files of the package that one of its files imports."""
     names = [node.module for node in ast.walk(ast.parse(source.read_text())) if isinstance(node, ast.ImportFrom)]
     paths = [PACKAGE.parent / f"{name.replace('.', '/')}.py" for name in names if name]
     return {path for path in paths if path.is_relative_to(PACKAGE) and path.is_file()}
@@ -46,7 +46,7 @@ def test_every_kernel_takes_njit_from_the_cache() -> None:
 
 
 def crc16_with_cache_in(folder: Path) -> str:
-    """Compile a kernel in another process, and check its result. Returns what was written on stderr."""
+    """Compile a kernel in another process and check its result; return the text on stderr."""
     homes = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), str(folder))
     script = "import numpy; from bms_estimator.protocols.firmware.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
     command = [sys.executable, "-c", script]
@@ -55,12 +55,12 @@ def crc16_with_cache_in(folder: Path) -> str:
     return done.stderr
 
 
-def test_a_kernel_runs_where_there_is_no_room_to_keep_it(full_disk: Path) -> None:
+def test_a_kernel_runs_without_space_for_its_cache(full_disk: Path) -> None:
     said = crc16_with_cache_in(full_disk)
     assert "RuntimeWarning: compiled kernels are not kept: No space left on device" in said
 
 
-def test_a_kernel_runs_where_no_folder_can_be_made_to_keep_it_in(disk_without_files: Path) -> None:
+def test_a_kernel_runs_without_a_folder_for_its_cache(disk_without_files: Path) -> None:
     said = crc16_with_cache_in(disk_without_files)
     assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in said
 
@@ -78,7 +78,7 @@ def emptied(_: bytes) -> bytes:
 
 
 def zeros_in_its_code(content: bytes) -> bytes:
-    """Damage by a power failure on a file system that knew the length: the rest can be read, and would run."""
+    """Replace machine code with zeros, as a power failure may on a file system that preserves the length of files."""
     code = content.index(ELF) + HEADER_BYTES
     return content[:code] + bytes(64) + content[code + 64 :]
 
@@ -93,7 +93,7 @@ def zeros_in_its_code(content: bytes) -> bytes:
         ("nbc", zeros_in_its_code),
     ],
 )
-def test_a_kept_kernel_that_was_damaged_is_compiled_and_kept_again(
+def test_a_damaged_kernel_in_the_cache_is_compiled_again(
     tmp_path: Path, kind: str, damaged: Callable[[bytes], bytes]
 ) -> None:
     assert crc16_with_cache_in(tmp_path) == ""

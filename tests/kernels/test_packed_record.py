@@ -1,4 +1,4 @@
-"""Packed records: every bit returns, and invalid bytes are rejected."""
+"""Packed records: packing is lossless, and invalid bytes are rejected."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def packed(words, mirror=MIRROR):
     return out[: pack(words, mirror, out)].copy()
 
 
-def test_what_lies_below_a_diagonal_mirrors_what_lies_above() -> None:
+def test_words_below_a_diagonal_map_to_words_above() -> None:
     record = np.zeros(1, LAYOUT)
     words = record.view(np.uint64)
     words[:] = np.arange(SIZE)
@@ -38,14 +38,14 @@ def test_what_lies_below_a_diagonal_mirrors_what_lies_above() -> None:
 
 
 @given(words_of)
-def test_every_bit_comes_back(words) -> None:
+def test_packing_is_lossless(words) -> None:
     back = np.full_like(words, 77)
     assert unpack(packed(words), MIRROR, back)
     assert (back == words).all()
 
 
 @given(words_of)
-def test_a_symmetric_matrix_is_kept_once(words) -> None:
+def test_a_symmetric_matrix_is_stored_once(words) -> None:
     record = words.view(LAYOUT)
     for matrix in record["part"]["matrix"][0]:
         matrix[...] = np.triu(matrix) + np.triu(matrix, 1).T
@@ -53,7 +53,7 @@ def test_a_symmetric_matrix_is_kept_once(words) -> None:
 
 
 @given(words_of, st.data())
-def test_what_is_cut_or_lengthened_is_refused(words, data) -> None:
+def test_truncated_or_lengthened_data_are_rejected(words, data) -> None:
     whole = packed(words)
     back = np.zeros_like(words)
     assert not unpack(whole[: data.draw(st.integers(0, whole.size - 1))], MIRROR, back)
@@ -61,15 +61,15 @@ def test_what_is_cut_or_lengthened_is_refused(words, data) -> None:
 
 
 @given(words_of, st.integers(0, BITMAP * WORD_BITS - 1))
-def test_a_bit_of_the_bitmap_that_flips_is_refused(words, bit: int) -> None:
+def test_a_flipped_bit_of_the_bitmap_is_rejected(words, bit: int) -> None:
     whole = packed(words)
     whole[bit // WORD_BITS] ^= np.uint64(1 << bit % WORD_BITS)
     assert not unpack(whole, MIRROR, np.zeros_like(words))
 
 
 @given(hnp.arrays(np.uint64, st.integers(0, SIZE + 9)))
-def test_no_bytes_harm(noise) -> None:
-    """Accepted bytes are the only encoding of their record."""
+def test_random_bytes_are_rejected_or_canonical(noise) -> None:
+    """Bytes that are accepted are the unique encoding of their record."""
     back = np.zeros(SIZE, np.uint64)
     if unpack(noise, MIRROR, back):
         assert (packed(back) == noise).all()
@@ -78,12 +78,12 @@ def test_no_bytes_harm(noise) -> None:
 @pytest.mark.parametrize(
     "dtype", [np.dtype([("a", "f8"), ("b", "i4")]), np.dtype([("a", "i1"), ("b", "f8")], align=True)]
 )
-def test_a_record_that_has_no_whole_words_is_refused(dtype) -> None:
+def test_a_record_without_whole_words_is_rejected(dtype) -> None:
     with pytest.raises(ValueError, match="word"):
         symmetry_map(dtype)
 
 
-def test_an_estimator_that_has_found_its_soc_needs_a_fifth_of_its_record() -> None:
+def test_a_converged_estimator_packs_to_a_fifth_of_its_record() -> None:
     estimator = Estimator(load_cell("ncr18650"))
     estimator.run(pulses(hours=1.0)[0])
     assert estimator.record["filter"]["count"] == 1

@@ -1,4 +1,4 @@
-"""Events from one snapshot to the next."""
+"""Events from the differences between two snapshots."""
 
 import itertools
 from typing import Any
@@ -24,25 +24,25 @@ def unseen(seconds: float) -> Snapshot:
     return with_health(total=ONE.health.total.model_copy(update={"unseen_s": seconds}))
 
 
-def test_a_start_says_what_became_of_the_checkpoint():
+def test_a_start_event_contains_the_outcome_of_the_checkpoint():
     start, *_ = events(None, with_health(checkpoint="restored: SOC 0.5"))
     assert (start.name, start.text) == ("start", "checkpoint: restored: SOC 0.5")
 
 
-def test_a_start_without_a_sensor_is_no_loss_of_it():
+def test_a_start_without_a_sensor_causes_no_offline_event():
     silent = with_health(sensor_online=False, sensor_message="no board")
     assert names(None, silent) == ["start"]
     assert names(silent, with_health(sensor_online=True)) == ["sensor_online"]
 
 
-def test_a_lost_sensor_is_told_once_with_its_reason():
+def test_a_lost_sensor_causes_one_event_with_its_reason():
     lost = with_health(sensor_online=False, sensor_message="no board")
     [event] = events(ONE, lost)
     assert (event.name, event.text, event.time) == ("sensor_offline", "no board", lost.health.publish_time)
     assert names(lost, with_health(sensor_online=False, sensor_message="silent for 9 s")) == []
 
 
-def test_a_suspicion_is_told_when_it_comes_and_when_it_goes_and_not_when_its_numbers_change():
+def test_diagnostics_cause_events_at_start_and_end_but_not_for_changed_numbers():
     states = [with_health(suspects=suspects) for suspects in ([], [WARM], [WARMER], [WARMER, "x"], ["x"], [])]
     told = [events(*pair) for pair in itertools.pairwise(states)]
     assert [[(event.name, event.text) for event in each] for each in told] == [
@@ -54,29 +54,29 @@ def test_a_suspicion_is_told_when_it_comes_and_when_it_goes_and_not_when_its_num
     ]
 
 
-def test_a_checkpoint_that_cannot_be_saved_is_told_and_one_that_can_again():
+def test_failed_and_recovered_checkpoints_cause_events():
     states = ["saved", "cannot be saved: full", "not saved: the disk hangs", "saved", "saved"]
     told = [names(with_health(checkpoint=a), with_health(checkpoint=b)) for a, b in itertools.pairwise(states)]
     assert told == [["checkpoint_fails"], [], ["checkpoint_saved"], []]
 
 
-def test_time_that_nobody_measured_is_told_with_its_length():
+def test_a_gap_causes_an_event_with_its_duration():
     [event] = events(unseen(2.0), unseen(14.5))
-    assert (event.name, event.text) == ("unseen", "nobody measured for 12.5 s")
+    assert (event.name, event.text) == ("unseen", "no measurements for 12.5 s")
     assert events(unseen(2.0), unseen(2.5)) == []
 
 
-def test_time_that_nobody_measured_before_the_start_is_told_whether_the_first_health_counts_it_or_a_later_one():
+def test_a_gap_before_the_start_causes_one_event():
     at_once = with_health(unseen_s=3600.0, total=unseen(3600.0).health.total)
     assert [(event.name, event.text) for event in events(None, at_once)][:2] == [
         ("start", f"checkpoint: {ONE.health.checkpoint}"),
-        ("unseen", "nobody measured for 3600.0 s"),
+        ("unseen", "no measurements for 3600.0 s"),
     ]
     assert events(at_once, unseen(3600.0)) == []
     assert "unseen" not in names(None, with_health(unseen_s=None, total=unseen(60.0).health.total))
     assert "unseen" not in names(None, with_health(unseen_s=0.5))
 
 
-def test_nothing_happens_between_equal_snapshots():
+def test_equal_snapshots_cause_no_events():
     assert events(ONE, ONE) == []
     assert events(ONE, with_health()) == []

@@ -1,4 +1,4 @@
-"""A fuel cell's file: the shipped one, scaling, rejected ones, and writing and reading."""
+"""Fuel cell files: the shipped one, scaling, invalid files, writing and reading."""
 
 from pathlib import Path
 
@@ -20,13 +20,13 @@ def voltage_v(model: FuelCellModel, current_a: float) -> float:
     return float(polarisation(model.a, np.zeros(8), np.array([current_a]), np.array([np.nan]))[0][0])
 
 
-def test_the_shipped_stack_gives_30_w() -> None:
+def test_the_shipped_stack_delivers_30_w() -> None:
     assert shipped_fuel_cells() == ["pem_30w"]
     assert 3.25 * voltage_v(PEM, 3.25) == pytest.approx(30.3, abs=0.1)
     assert voltage_v(PEM, 3.25) == pytest.approx(PEM.cell.nominal_voltage_v, abs=0.05)
 
 
-def test_the_shipped_stack_is_that_of_the_coefficients_that_it_names() -> None:
+def test_the_shipped_stack_has_the_published_coefficients() -> None:
     kelvin = 273.15 + PEM.fuel_cell.temperature_c
     f, n = PEM.fuel_cell, mann_stack.CELLS
     assert f.tafel_slope_v == pytest.approx(-mann_stack.XI_4 * kelvin * n, rel=1e-3)
@@ -43,14 +43,14 @@ def test_stacks_in_series_and_parallel_share_voltage_and_current() -> None:
     assert PEM.pack(1, 1) is PEM
 
 
-def test_stacks_in_parallel_whose_exchange_current_is_too_large_are_refused() -> None:
+def test_stacks_in_parallel_with_too_large_an_exchange_current_are_rejected() -> None:
     large = PEM.model_copy(update={"fuel_cell": PEM.fuel_cell.model_copy(update={"exchange_current_a": 0.4})})
     assert large.pack(1, 2).activation_v > 0.0
     with pytest.raises(UserError, match=r"^pem_30w: exchange_current_a of 3 in parallel is 1\.2: must be less than 1$"):
         large.pack(1, 3)
 
 
-def test_a_written_file_is_read_again(tmp_path: Path) -> None:
+def test_a_written_file_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     a = PEM.a
     a[1 : 1 + len(NAMES)] *= 1.25
@@ -74,7 +74,7 @@ def test_a_written_file_is_read_again(tmp_path: Path) -> None:
         ("voltage_min_v = 2.0", "voltage_min_v = 20.0", r"must increase in this order"),
     ],
 )
-def test_a_wrong_value_is_named(tmp_path: Path, text: str, edit: str, message: str) -> None:
+def test_an_invalid_value_is_named(tmp_path: Path, text: str, edit: str, message: str) -> None:
     shipped = Path(mann_stack.__file__).parents[1] / "bms_estimator/model/cells/fuel_cell/pem_30w.toml"
     path = tmp_path / "mine.toml"
     path.write_text(shipped.read_text().replace(text, edit, 1))
@@ -82,7 +82,7 @@ def test_a_wrong_value_is_named(tmp_path: Path, text: str, edit: str, message: s
         load_fuel_cell(path)
 
 
-def test_what_needs_a_battery_refuses_a_fuel_cell(tmp_path: Path) -> None:
+def test_functions_for_batteries_reject_a_fuel_cell(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^pem_30w is a fuel cell, which has no state of charge"):
         load_cell("pem_30w")
     with pytest.raises(UserError, match=r"no capacity"):

@@ -15,7 +15,7 @@ from bms_estimator.model.sample import (
     SAMPLE,
     CurrentSign,
     SampleBlock,
-    forget_beyond,
+    remove_implausible,
 )
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
 from bms_estimator.protocols.base.reading import Reading
@@ -56,14 +56,14 @@ class ReadingProtocol(DeviceProtocol):
             readings.append(reading)
             self._last_reading, self._fault_text = reading, None
         self.cells = cell_block([reading.cells_v for reading in readings])
-        self._counts["implausible"] += forget_beyond(self.cells, MIN_CELL_V, MAX_CELL_V)
+        self._counts["implausible"] += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
         if readings:
             self._counts["frames_received"] += len(readings)
             block["voltage_v"] = [reading.voltage_v for reading in readings]
             block["current_a"] = [self._sign * reading.current_a + 0.0 for reading in readings]  # no -0
             block["temperature_c"] = [reading.temperature_c for reading in readings]
-            self._counts["implausible"] += forget_beyond(block["temperature_c"], MIN_C, MAX_C)
+            self._counts["implausible"] += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
             block["status"] = 0
             block["time_s"] = self._spaced_times(arrival_s, len(readings))
         return block

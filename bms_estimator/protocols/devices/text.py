@@ -14,7 +14,7 @@ from bms_estimator.model.sample import (
     SAMPLE,
     CurrentSign,
     SampleBlock,
-    forget_beyond,
+    remove_implausible,
 )
 from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.device_clock import DeviceClock
@@ -91,14 +91,14 @@ class TextProtocol(DeviceProtocol):
             self._begin_overlong(self._rest)
             self._rest, self._overlong = b"", True
         self.cells = cell_block([reading.cells_v for reading in readings])
-        self._implausible += forget_beyond(self.cells, MIN_CELL_V, MAX_CELL_V)
+        self._implausible += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
         if readings:
             self._samples += len(readings)
             block["voltage_v"] = [reading.voltage_v for reading in readings]
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
             block["temperature_c"] = [reading.temperature_c for reading in readings]
-            self._implausible += forget_beyond(block["temperature_c"], MIN_C, MAX_C)
+            self._implausible += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
             block["status"] = 0
             block["time_s"] = self._times(arrival_s, readings)
         return block

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import MAX_C, MIN_C, SAMPLE, CurrentSign, SampleBlock, forget_beyond
+from bms_estimator.model.sample import MAX_C, MIN_C, SAMPLE, CurrentSign, SampleBlock, remove_implausible
 
 BLOCK_ROWS = 65_536
 MAX_SHOWN_CHARACTERS = 40
@@ -295,4 +295,4 @@ def _block(values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns:
     block["current_a"] = columns.discharge_sign * values[1]
     block["voltage_v"] = values[2]
     block["temperature_c"] = values[3] if len(values) > 3 else np.nan
-    return block, forget_beyond(block["temperature_c"], MIN_C, MAX_C)
+    return block, remove_implausible(block["temperature_c"], MIN_C, MAX_C)

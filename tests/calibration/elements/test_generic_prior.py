@@ -1,4 +1,4 @@
-"""Properties that captures do not show are those of the most similar generic cell."""
+"""Prior from the most similar generic cell."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ SOC = np.linspace(0.0, 1.0, 51)
 
 @pytest.mark.parametrize("name", ["lfp", "lto", "nca"])
 @pytest.mark.parametrize("series_count", [1, 4])
-def test_a_curve_is_most_like_the_generic_one_of_its_kind(name, series_count):
+def test_nearest_generic_cell_has_the_chemistry_of_the_curve(name, series_count):
     off_v = 0.01 * series_count * np.sin(9.0 * SOC)
     found = nearest_generic_cell(
         SOC, series_count * np.interp(SOC, *curve(load_cell(name, 1.0), "ocv_v")) + off_v, 7.0, series_count
@@ -26,12 +26,12 @@ def test_a_curve_is_most_like_the_generic_one_of_its_kind(name, series_count):
     assert found == load_cell(name, 7.0).pack(series_count, 1)
 
 
-def test_a_real_layered_oxide_is_no_lfp(data):
+def test_nearest_generic_cell_of_a_real_layered_oxide_is_nca_or_nmc(data):
     soc, ocv_v, _ = read_curve(data / "lgm50" / "ocv_25c.csv")
     assert nearest_generic_cell(soc, ocv_v, 5.0, 1).cell.name in {"nca", "nmc"}
 
 
-def test_rests_say_how_large_resistances_are_and_the_generic_cell_how_they_go():
+def test_ladder_has_the_resistances_of_the_rests_and_the_shape_of_the_generic_cell():
     generic = load_cell("nmc", 3.0)
     assert scaled_generic_ladder(generic, None) == generic.ladder
     found = scaled_generic_ladder(
@@ -49,8 +49,9 @@ def test_rests_say_how_large_resistances_are_and_the_generic_cell_how_they_go():
     assert (found.std, found.temperature_c) == (RESTS_STD, generic.ladder.temperature_c)
 
 
-def test_resistances_of_cold_rests_are_brought_to_25_c():
-    """An 18650 NCA cell's: 29 and 39 mohm by rests at 25 C, 62 and 101 at 0 C, of which the generic growth leaves 27 and 37."""
+def test_resistances_of_cold_rests_are_converted_to_25_c():
+    """Rests of an 18650 NCA cell give 29 and 39 mohm at 25 C, 62 and 101 mohm at 0 C, which the generic growth reduces
+    to 27 and 37."""
     generic = load_cell("nca", 2.9)
     cold = scaled_generic_ladder(
         generic, InitialElements(r_s_ohm=0.0619, r_ts_ohm=0.05, tau_ts_s=9.0, r_tl_ohm=0.0507, tau_tl_s=300.0), 0.0

@@ -42,14 +42,14 @@ def errors_mv(cell, samples):
     return 1e3 * validate(Columns(samples, "other"), cell).above.voltage_rms_v
 
 
-def test_resistances_are_found_at_25_c(identified):
+def test_identified_resistances_at_25_c_are_within_their_errors(identified):
     for name, ohm in OHM.items():
         value, std = identified.elements[0.5][name]
         assert value == pytest.approx(ohm, rel=0.05 if name == "r_s" else 0.15)
         assert abs(value - ohm) < 2.0 * std < 0.6 * ohm
 
 
-def test_captures_at_two_temperatures_tell_of_those_between(identified, warm):
+def test_captures_at_two_temperatures_predict_a_temperature_between(identified, warm):
     between = ladder_capture(steps(7), 10.0)
     assert identified.cell.ladder.temperature_c == (COLD_C, WARM_C)
     assert errors_mv(identified.cell, between) < 6.0
@@ -58,7 +58,7 @@ def test_captures_at_two_temperatures_tell_of_those_between(identified, warm):
     assert errors_mv(from_warm, between) > 1.5 * errors_mv(identified.cell, between)
 
 
-def test_at_one_temperature_the_parts_are_shared_as_in_the_file_given(identified, warm):
+def test_at_one_temperature_the_weak_share_is_that_of_the_given_file(identified, warm):
     found = identify([warm], identified.cell).cell.ladder
     ladders = found, identified.cell.ladder
     weak, strong = (np.array([getattr(x, part) for x in ladders]) for part in ("weak_ohm", "strong_ohm"))
@@ -77,7 +77,7 @@ def growth(ladder):
     return ohm[0] / np.interp(0.65, ladder.soc, ohm)
 
 
-def test_towards_empty_resistances_go_between_level_and_as_in_the_file_where_no_capture_was(warm):
+def test_growth_near_empty_without_data_is_between_constant_and_that_of_the_file(warm):
     above = Columns(warm.rows[: int(np.argmax(np.cumsum(warm.rows["current_a"]) > 0.6 * 3600.0 * 3.0))], "above")
     found = {}
     for name, times in (("level", 1.0), ("growing", 4.0)):
@@ -87,17 +87,17 @@ def test_towards_empty_resistances_go_between_level_and_as_in_the_file_where_no_
         once = identify([above], given, refine_ocv=False).cell
         found[name] = growth(once.ladder)
         again = growth(identify([above], once, refine_ocv=False).cell.ladder)
-        assert again == pytest.approx(found[name], rel=0.1)  # what was identified does not wear away
+        assert again == pytest.approx(found[name], rel=0.1)  # repeated identification preserves the growth
     assert 1.5 * found["level"] < found["growing"] < 3.0
 
 
-def test_a_capture_that_tells_little_makes_a_ladder_that_says_so(warm):
+def test_a_capture_with_little_information_gives_a_larger_std(warm):
     short = Columns(warm.rows[:700], "short")
     stds = [identify([capture], wrong_start(), refine_ocv=False).cell.ladder.std for capture in (warm, short)]
     assert module.LADDER_STD < stds[0] < 1.3 * module.LADDER_STD < 1.5 * stds[0] < stds[1]
 
 
-def test_the_two_branches_of_the_file_are_those_of_the_ladder(identified):
+def test_elements_of_the_file_are_equivalent_to_the_ladder(identified):
     ladder, a = identified.cell.ladder, identified.cell.a
     for soc in (0.35, 0.5, 0.9):
         rows = np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)
@@ -117,8 +117,8 @@ def test_capacitances_of_a_flat_ladder_are_positive_down_to_empty():
         assert 0.0 < made[name].amplitude_farad < made[name].offset_farad
 
 
-def test_branches_that_a_slow_capture_does_not_tell_are_written_all_the_same():
-    """Samples a minute apart leave those of seconds at nothing."""
+def test_rc_pairs_that_a_slow_capture_does_not_determine_have_small_positive_resistances():
+    """A sample period of a minute gives a resistance of 0 for RC pairs of seconds."""
     untold = LADDER.model_copy(
         update={"weak_ohm": tuple((0.0 if 0 < k < 4 else 0.02,) * 3 for k in range(7)), "strong_ohm": ((0.0,) * 3,) * 7}
     )
@@ -127,7 +127,7 @@ def test_branches_that_a_slow_capture_does_not_tell_are_written_all_the_same():
     assert 1.0 < made["r_ts"].offset_ohm * made["c_ts"].offset_farad < 30.0
 
 
-def test_captures_of_about_one_temperature_judge_cells_that_did_not_see_them(warm, cold):
+def test_captures_at_similar_temperatures_are_held_back_from_the_fit_that_they_score(warm, cold):
     other = Columns(ladder_capture(steps(5), WARM_C + 3.0), "other")
     found = identify([warm, cold, other], wrong_start())
     assert [c.held_back for c in found.captures] == [True, False, True]
@@ -139,7 +139,7 @@ def test_captures_of_about_one_temperature_judge_cells_that_did_not_see_them(war
         assert mean == pytest.approx(gmean(of_each))
 
 
-def test_what_makes_replays_worse_is_refused_with_their_scores(warm, monkeypatch):
+def test_identification_that_makes_replays_worse_is_rejected_with_the_scores(warm, monkeypatch):
     given = wrong_start()
     monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell is given else 5.25)
     with pytest.raises(UserError, match=r"^nothing is written: .* from 1\.50 to 5\.25 % of SOC") as caught:
@@ -147,7 +147,7 @@ def test_what_makes_replays_worse_is_refused_with_their_scores(warm, monkeypatch
     assert "warm: 1.50 before, 5.25 after" in str(caught.value)
 
 
-def test_the_ocv_is_kept_where_that_makes_replays_better(warm, monkeypatch):
+def test_the_given_ocv_is_used_if_replays_are_better_with_it(warm, monkeypatch):
     given = wrong_start()
     monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell.ocv is given.ocv else 5.25)
     found = identify([warm], given)
@@ -155,13 +155,13 @@ def test_the_ocv_is_kept_where_that_makes_replays_better(warm, monkeypatch):
     assert found.ocv_correction_v == 0.0
 
 
-def test_captures_too_short_for_a_replay_are_identified_all_the_same():
+def test_captures_too_short_for_a_replay_are_identified_without_score():
     found = identify([Columns(ladder_capture(steps()[:1200], WARM_C), "short")], wrong_start())
     assert np.isnan(found.score_before)
     assert np.isnan(found.captures[0].score_after)
 
 
-def test_the_score_is_worse_for_a_band_that_is_wrong():
+def test_the_score_is_larger_for_a_wrong_interval():
     load = clean_capture("steps", capture(steps()), TRUTH)
     soc = 0.98 - load.discharged_ah / TRUTH.cell.capacity_ah
     good = interval_score(TRUTH, load, soc)
@@ -181,8 +181,8 @@ def test_a_wrong_ocv_is_corrected(warm):
     assert (np.diff(found.ocv_v) > 0.0).all()
 
 
-def test_what_may_be_hysteresis_is_no_error_of_the_curve(warm):
-    """The mean of two branches 25 mV apart to both sides: a drive 8 mV off says nothing of the other branch."""
+def test_a_possible_error_of_hysteresis_does_not_change_the_curve(warm):
+    """With a hysteresis of +-25 mV, an error of 8 mV in a discharge gives no information on the curve after charge."""
     soc = np.linspace(0.0, 1.0, 101)
     true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
     moved_v = {}
@@ -201,7 +201,7 @@ def test_what_may_be_hysteresis_is_no_error_of_the_curve(warm):
     assert abs(moved_v["branches"]) < 0.5 * abs(moved_v["one"])
 
 
-def test_charge_that_the_rows_of_a_capture_miss_is_found(warm):
+def test_the_miscount_of_a_capture_is_identified(warm):
     lacking = warm.rows.copy()
     lacking["current_a"] *= 0.98
     found = {
@@ -209,16 +209,16 @@ def test_charge_that_the_rows_of_a_capture_miss_is_found(warm):
         for name, rows in (("whole", warm.rows), ("lacking", lacking))
     }
     assert abs(found["whole"]) < 0.001
-    assert 0.005 < found["lacking"] < 0.02  # two per cent, pulled to nothing: it is five of its std
+    assert 0.005 < found["lacking"] < 0.02  # true value 0.02, reduced by the prior, whose std is 0.004
 
 
-def test_ocv_and_its_growth_with_temperature_are_kept_when_asked(warm, cold):
+def test_refine_ocv_false_keeps_the_ocv_and_its_temperature_coefficient(warm, cold):
     found = identify([warm, cold], wrong_start(), refine_ocv=False)
     assert found.cell.ocv == wrong_start().ocv
     assert found.ocv_correction_v == 0.0
 
 
-def test_a_pack_is_identified_as_well_as_a_cell():
+def test_a_pack_is_identified_with_the_accuracy_of_a_cell():
     pack = TRUTH.pack(6, 2)
     samples = capture(2.0 * steps(), cell=pack, noise_v=3e-3)
     found = identify([Columns(samples, "pack")], wrong_start().pack(6, 2))
@@ -226,7 +226,7 @@ def test_a_pack_is_identified_as_well_as_a_cell():
     assert errors_mv(found.cell, samples) < 36.0
 
 
-def test_glitches_do_no_harm(warm):
+def test_glitches_do_not_change_the_result(warm):
     samples = warm.rows.copy()
     rng = np.random.default_rng(5)
     places = rng.choice(np.arange(100, samples.size - 100), 60, replace=False)
@@ -242,20 +242,20 @@ def test_glitches_do_no_harm(warm):
         assert found.elements[0.5][name][0] == pytest.approx(clean.elements[0.5][name][0], rel=0.05)
 
 
-def test_a_gap_at_rest_is_stepped_over():
+def test_a_gap_at_rest_is_accepted():
     samples = ladder_capture(np.r_[steps()[:6000], np.zeros(3600), steps()[6000:]], WARM_C)
     found = identify([Columns(np.delete(samples, np.s_[6060:9540]), "gap")], wrong_start())
     assert found.elements[0.5]["r_s"][0] == pytest.approx(OHM["r_s"], rel=0.05)
 
 
-def test_captures_that_tell_nothing_of_resistances_are_left_out(warm):
+def test_captures_without_excitation_are_left_out(warm):
     slow = Columns(capture(constant(0.15, 20_000)), "slow")
     found = identify([slow, warm], wrong_start())
     assert found.left_out == ("slow",)
     assert [c.name for c in found.captures] == ["warm"]
 
 
-def test_without_a_sensor_the_temperature_is_as_told(cold):
+def test_without_a_sensor_the_given_temperature_is_used(cold):
     samples = cold.rows.copy()
     samples["temperature_c"] = np.nan
     told = identify([Columns(samples, "cold")], wrong_start(), temperature_c=COLD_C)
@@ -268,7 +268,7 @@ def test_without_a_sensor_the_temperature_is_as_told(cold):
         identify([Columns(samples, "cold")], wrong_start(), temperature_c=298.0)
 
 
-def test_the_first_soc_can_be_given_and_a_cold_rest_near_full_is_full():
+def test_the_initial_soc_can_be_given_and_a_cold_rest_near_full_is_full():
     samples = ladder_capture(steps(), COLD_C, soc=1.0)
     samples["voltage_v"] -= 0.015
     assert identify([Columns(samples, "cold")], wrong_start()).captures[0].initial_soc == 1.0
@@ -309,11 +309,11 @@ def in_hours(samples):
         (flipped(capture(constant())), TRUTH, ["sign is wrong", "Ah drawn while the voltage went from"]),
         (capture(steps()), with_capacity(2.0), ["outside 0..1", "capacity of 2 Ah"]),
         (capture(steps()), with_capacity(5.0), ["charge and voltage disagree", "capacity of 5 Ah"]),
-        (stuck(capture(steps()), 0), TRUTH, ["the voltage does not move", "no old value was repeated"]),
-        (stuck(capture(steps()), 2000), TRUTH, ["the voltage moves by 0.000 mV per ampere"]),
+        (stuck(capture(steps()), 0), TRUTH, ["the voltage is constant", "check the column for repeated old values"]),
+        (stuck(capture(steps()), 2000), TRUTH, ["the voltage changes by 0.000 mV per ampere"]),
         (in_hours(capture(steps())[:9000]), TRUTH, ["it lasts 2.5 s", "is time_s in seconds?"]),
         (with_gap(capture(steps())), TRUTH, ["a gap of 3601 s", "A: the charge drawn in it is unknown"]),
-        (capture(steps()), load_cell("thunder_power_6s"), ["lie within the cell's limits", "is it this cell's?"]),
+        (capture(steps()), load_cell("thunder_power_6s"), ["lie within the cell's limits", "check the cell file"]),
     ],
     ids=[
         "rest",
@@ -328,14 +328,14 @@ def in_hours(samples):
         "another cell",
     ],
 )
-def test_bad_input_is_named_with_its_numbers(samples, cell, words):
+def test_errors_contain_the_fault_and_its_numbers(samples, cell, words):
     with pytest.raises(UserError) as caught:
         identify([Columns(samples, "bad.csv")], cell)
     assert str(caught.value).startswith("bad.csv: ")
     assert all(word in str(caught.value) for word in words)
 
 
-def test_a_good_capture_contradicts_nothing_but_an_soc_that_it_does_not_start_at():
+def test_a_good_capture_contradicts_only_a_wrong_initial_soc():
     load = clean_capture("good", capture(steps()), TRUTH)
     start = initial_soc(load, TRUTH)
     assert capture_contradictions(load, TRUTH, start) == []
@@ -343,13 +343,13 @@ def test_a_good_capture_contradicts_nothing_but_an_soc_that_it_does_not_start_at
     assert "outside 0..1" in line
 
 
-def test_a_capture_that_stays_empty_tells_nothing_of_resistances():
+def test_a_capture_that_stays_empty_is_rejected():
     current_a = np.tile(np.r_[np.full(20, 2.0), np.full(20, -2.0)], 50)
     with pytest.raises(UserError, match=r"near.csv: no sample between SOC 0.02 and 1.01"):
         identify([Columns(capture(current_a, soc=0.5), "near.csv")], TRUTH, initial_soc=0.0)
 
 
-def test_real_cell_from_its_relaxation_test_predicts_random_steps(shared_data):
+def test_a_cell_identified_from_a_real_relaxation_test_predicts_random_steps(shared_data):
     folder = shared_data / "ncr18650"
     found = identify([load_capture(folder / "cell5_relaxation_c2.csv.gz")], TRUTH)
     errors = validate(load_capture(folder / "cell5_random_steps.csv.gz"), found.cell).above
@@ -358,7 +358,7 @@ def test_real_cell_from_its_relaxation_test_predicts_random_steps(shared_data):
 
 
 def test_a_real_cell_is_identified_from_a_wrong_start_and_predicts_another_load(data):
-    """Nissan Leaf: pulses and rests, then cycles at 1C which the fit never saw."""
+    """Nissan Leaf: the fit uses pulses and rests; the prediction is tested on cycles at 1C."""
     leaf = load_cell("leaf")
     table = leaf.model_dump() | {"ladder": None}
     for name in ("r_s", "r_ts", "r_tl"):

@@ -1,4 +1,4 @@
-"""(2.10) through points of a known curve."""
+"""Fit of (2.10) to points of a known curve."""
 
 import numpy as np
 import pytest
@@ -22,14 +22,14 @@ def points(soc, ocv_v, std_v=1e-3, **ends):
 
 
 @pytest.mark.parametrize("a", [TABLE_1, TABLE_8], ids=["Table 1", "Table 8"])
-def test_exact_points_give_the_parameters_back(a):
+def test_exact_points_give_the_true_parameters(a):
     soc = np.linspace(0.005, 1.0, 60)
     fit = fit_chen_mora(points(soc, chen_mora(np.array(a), soc)))
     assert fit.a == pytest.approx(a, rel=1e-4)
     assert max_v(fit.residual_v) < 1e-7
 
 
-def test_shipped_cell_is_the_same_curve():
+def test_shipped_cell_has_the_curve_of_table_1():
     ocv = load_cell("chen_mora").ocv
     assert ocv.a == pytest.approx(TABLE_1)
     x = 0.37
@@ -37,8 +37,8 @@ def test_shipped_cell_is_the_same_curve():
     assert chen_mora(np.array(TABLE_1), np.array([x]))[0] == pytest.approx(by_hand, rel=1e-15)
 
 
-def test_standard_errors_are_those_of_the_scatter():
-    """Forty noisy sets: the fits scatter by their stated errors."""
+def test_standard_errors_equal_the_scatter_of_the_fits():
+    """The scatter of fits to 40 noisy sets of points equals their standard errors."""
     rng, soc = np.random.default_rng(0), np.linspace(0.01, 1.0, 80)
     exact = chen_mora(np.array(TABLE_1), soc)
     fits = [fit_chen_mora(points(soc, exact + 1e-3 * rng.standard_normal(soc.size))) for _ in range(40)]
@@ -48,7 +48,7 @@ def test_standard_errors_are_those_of_the_scatter():
     assert np.mean([rms_v(fit.residual_v) for fit in fits]) == pytest.approx(1e-3, rel=0.1)
 
 
-def test_points_that_end_on_their_way_down_leave_a_curve_above_0_v():
+def test_points_that_end_above_the_knee_give_a_positive_voltage_at_soc_0():
     """Without points below SOC 0.07 the amplitude of the exponential is limited by the highest point."""
     soc = np.linspace(0.07, 1.0, 19)
     ocv_v = 3.2 + 0.1 * soc
@@ -66,8 +66,8 @@ def test_a_parameter_at_its_bound_has_no_standard_error():
     assert max_v(fit.residual_v) < 1e-5
 
 
-def test_joint_fit_of_several_runs_beats_the_mean_of_their_parameters():
-    """(5.1)-(5.2) average parameters that lean on each other."""
+def test_joint_fit_of_several_runs_is_better_than_the_mean_of_their_parameters():
+    """(5.1)-(5.2) average strongly correlated parameters."""
     rng, exact = np.random.default_rng(4), np.array(TABLE_1)
     runs = []
     for count in (9, 10, 12):
@@ -96,7 +96,7 @@ def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
 
 
 @pytest.mark.parametrize("fit", [fit_chen_mora, fit_table])
-def test_too_few_points_or_too_small_a_span_are_refused_with_their_numbers(fit):
+def test_too_few_points_or_too_small_a_span_are_rejected_with_their_numbers(fit):
     with pytest.raises(UserError, match=r"5 points of the open-circuit voltage; \(2.10\) has 6 parameters"):
         fit(points(np.linspace(0.0, 1.0, 5), np.linspace(3.4, 4.1, 5)))
     with pytest.raises(UserError, match=r"points span SOC 0.50 to 0.70 only"):

@@ -19,7 +19,7 @@ from tests.calibration.simulated_relaxation import BAD, FIRST_REST_S, LOAD_S, RE
 
 CAPACITY_AH = TRUTH.cell.capacity_ah
 ROUNDS = 19
-"""5 % of the charge each, until the cell is empty."""
+"""Number of loads, each of 5 % of the charge."""
 
 
 def true_ocv(soc):
@@ -43,7 +43,7 @@ def test_every_rest_is_found_at_its_time_and_soc(noisy):
     assert noisy.full_v == pytest.approx(true_ocv([1.0])[0], abs=2e-3)
 
 
-def test_its_temperature_is_that_of_the_rests_that_tell_one(noisy):
+def test_temperature_is_the_mean_of_the_rests_with_a_sensor(noisy):
     rests = [replace(rest, temperature_c=c) for rest, c in zip(noisy.rests, (-10.0, -12.0, np.nan), strict=False)]
     assert replace(noisy, rests=tuple(rests)).temperature_c == pytest.approx(-11.0)
     assert np.isnan(replace(noisy, rests=tuple(rests[2:])).temperature_c)
@@ -55,7 +55,7 @@ def test_points_lie_on_the_open_circuit_voltage(noisy):
     assert np.sqrt(np.mean(error_v**2)) < 1e-3
 
 
-def test_extrapolation_to_infinite_rest_is_nearer_than_the_end_and_knows_how_near():
+def test_extrapolation_is_nearer_than_the_end_voltage_and_within_its_std():
     seen, at_end, within = [], [], []
     for seed in range(4):
         found = relaxation_test(relaxation(seed=seed), CAPACITY_AH, name="mine")
@@ -78,13 +78,13 @@ def test_without_noise_a_long_rest_is_extrapolated_to_a_fifth_of_a_millivolt():
 
 
 @pytest.mark.parametrize("rest_s", [240, 400, 3600])
-def test_rests_of_any_length(rest_s):
+def test_rests_of_any_length_are_within_their_std(rest_s):
     found = relaxation_test(relaxation(rest_s=rest_s, rounds=ROUNDS), CAPACITY_AH, name="mine")
     assert len(found.rests) + len(found.rejected) == 1 + ROUNDS
-    assert len(found.rejected) <= (rest_s < 400)  # the last, where the elements rise
+    assert len(found.rejected) <= (rest_s < 400)  # the last rest, at a low SOC where the elements rise
     error_v = np.abs(found.ocv_v - true_ocv(found.soc))
     assert error_v.max() < {240: 0.016, 400: 8e-3, 3600: 1e-3}[rest_s]
-    assert np.sqrt(np.mean((error_v / found.std_v) ** 2)) < 1.3  # and they know it
+    assert np.sqrt(np.mean((error_v / found.std_v) ** 2)) < 1.3  # errors match their std
 
 
 def test_a_longer_rest_is_more_certain():
@@ -97,7 +97,7 @@ def test_a_longer_rest_is_more_certain():
 
 @pytest.mark.parametrize("noise_v", [1e-3, 2e-3, 5e-3])
 def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
-    """Noise that hides the time constant: up to five times the remaining relaxation at a rest's end."""
+    """The noise is up to five times the remaining relaxation at a rest's end, so that the time constant is uncertain."""
     score, error_v = [], []
     for seed in range(3):
         found = relaxation_test(relaxation(noise_v=noise_v, seed=seed), CAPACITY_AH, name="mine")
@@ -109,7 +109,7 @@ def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
 
 
 @pytest.mark.parametrize("every", [10, 30])
-def test_slow_sampling(every):
+def test_slow_sampling_gives_points_on_the_ocv(every):
     found = relaxation_test(relaxation()[::every], CAPACITY_AH, name="mine")
     assert len(found.rests) >= ROUNDS
     error_v = found.ocv_v - true_ocv(found.soc)
@@ -118,7 +118,7 @@ def test_slow_sampling(every):
 
 
 def test_real_rests_cut_in_half_are_extrapolated_towards_their_end(shared_data):
-    """Half-hour rests of an NCR18650, of which the first quarter of an hour is shown."""
+    """Half-hour rests of an NCR18650, cut to their first quarter of an hour."""
     samples = load_capture(shared_data / "ncr18650" / "cell1_dst.csv.gz").rows
     whole = relaxation_test(samples, 3.1, initial_soc=1.0, name="mine")
     cut = np.zeros(samples.size, dtype=bool)
@@ -134,7 +134,7 @@ def test_real_rests_cut_in_half_are_extrapolated_towards_their_end(shared_data):
     assert np.sqrt(np.mean((left / std_v) ** 2)) < 1.5
 
 
-def test_blips_of_the_current_sensor_do_not_end_a_rest():
+def test_glitches_of_the_current_sensor_do_not_end_a_rest():
     samples = relaxation()
     inside = FIRST_REST_S + LOAD_S + 300
     samples["current_a"][inside] = 0.05
@@ -144,8 +144,8 @@ def test_blips_of_the_current_sensor_do_not_end_a_rest():
 
 
 @pytest.mark.parametrize(("noise_a", "step_a"), [(0.02, 1e-4), (0.05, 1e-4), (0.1, 1e-4), (0.025, 0.05), (0.002, 0.05)])
-def test_noise_and_rounding_of_the_current_sensor(noisy, noise_a, step_a):
-    """Up to seven times the current that counts as rest, and steps of a common ten-bit sensor."""
+def test_rests_are_found_with_noise_and_rounding_of_the_current_sensor(noisy, noise_a, step_a):
+    """Noise up to seven times the maximum current of a rest, and the resolution of a common ten-bit sensor."""
     samples = relaxation()
     noise = noise_a * np.random.default_rng(8).standard_normal(samples.size)
     samples["current_a"] = np.rint((samples["current_a"] + noise) / step_a) * step_a
@@ -182,7 +182,7 @@ def test_charge_is_counted_over_uneven_steps():
 
 
 @pytest.mark.parametrize("why", BAD)
-def test_bad_input_is_refused_with_its_numbers(why):
+def test_bad_input_is_rejected_with_its_numbers(why):
     make, capacity_ah, message = BAD[why]
     samples = make()
     with pytest.raises(UserError) as refused:
@@ -200,15 +200,15 @@ def test_short_rests_are_listed_with_their_lengths():
     ("voltage_v", "message"),
     [(0.0, "mine: none of 900 samples has a voltage above 0 V"), (np.nan, "mine: none of 900 samples has finite")],
 )
-def test_a_dead_instrument(voltage_v, message):
+def test_captures_of_a_dead_instrument_are_rejected(voltage_v, message):
     samples = relaxation(rounds=1)[:900]
     samples["voltage_v"] = voltage_v
     with pytest.raises(UserError, match=message):
         relaxation_test(samples, CAPACITY_AH, name="mine")
 
 
-def test_several_captures_in_one_file_are_none():
-    """Pulses at several SOCs in one file, each from 0 s, with unknown charge between them."""
+def test_several_captures_in_one_file_are_rejected():
+    """A file with pulses at several SOCs, each from 0 s, has unknown charge between them."""
     pulse = relaxation(rounds=2)
     for more in (1, 2):
         together = np.concatenate([pulse] * (1 + more))
@@ -217,5 +217,5 @@ def test_several_captures_in_one_file_are_none():
         ):
             remove_glitches(together, "mine")
     late = pulse.copy()
-    late["time_s"][50] -= 30.0  # one stamp
+    late["time_s"][50] -= 30.0  # one wrong time stamp
     assert remove_glitches(late, "mine").size == pulse.size - 1

@@ -1,4 +1,4 @@
-"""Recognized kinds of captures, and their joint result."""
+"""Recognition of kinds of captures, and OCV from several of them."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def off_v(found):
 
 @pytest.mark.parametrize("files", [1, 2])
 def test_a_pair_gives_mean_hysteresis_and_capacity(files):
-    """In one file or two."""
+    """Discharge and charge are in one file or in two."""
     found = of(slow((1.0, -1.0))) if files == 1 else of(slow((1.0,)), slow((-1.0,)))
     (source,) = found.sources
     assert source.kind.startswith("C/20 discharge and charge, 2.99")
@@ -45,11 +45,11 @@ def test_a_pair_gives_mean_hysteresis_and_capacity(files):
     assert np.abs(off_v(found)).max() < 2e-3
     assert found.hysteresis_v[INSIDE] == pytest.approx(
         0.7 * hysteresis_v(NODES[INSIDE]), abs=2e-3
-    )  # the rest polarisation
+    )  # the remainder is polarization
 
 
 @pytest.mark.parametrize("noise_a", [0.01, 0.04])
-def test_a_noisy_current_sensor_and_a_charge_before_the_discharge(noise_a):
+def test_a_noisy_current_sensor_and_a_charge_before_the_discharge_are_accepted(noise_a):
     samples = slow((-1.0, 1.0))
     samples["current_a"] += noise_a * np.random.default_rng(1).standard_normal(samples.size)
     samples["current_a"][[700, 4000]] = 0.5
@@ -59,7 +59,7 @@ def test_a_noisy_current_sensor_and_a_charge_before_the_discharge(noise_a):
     assert np.abs(off_v(found)).max() < 3e-3
 
 
-def test_a_lone_discharge_is_off_by_its_hysteresis_and_knows_it():
+def test_an_unpaired_discharge_has_the_hysteresis_in_its_error():
     found = of(slow((1.0,)))
     fit = fit_table(found.points)
     assert found.sources[0].kind.startswith("C/20 discharge, 2.99")
@@ -69,7 +69,7 @@ def test_a_lone_discharge_is_off_by_its_hysteresis_and_knows_it():
 
 
 @pytest.mark.parametrize(("direction", "lifted"), [(1.0, 1.0), (-1.0, -1.0)])
-def test_a_lone_branch_is_brought_to_the_middle_of_what_is_usual(direction, lifted):
+def test_an_unpaired_curve_is_moved_by_half_of_a_typical_hysteresis(direction, lifted):
     found, usual_v = of(slow((direction,)), capacity_ah=CAPACITY_AH), hysteresis_v(NODES)
     moved = center_on_typical_hysteresis(found, usual_v)
     plain, points = found.points, moved.points
@@ -81,8 +81,8 @@ def test_a_lone_branch_is_brought_to_the_middle_of_what_is_usual(direction, lift
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize("rested", [True, False])
-def test_what_branches_take_of_a_lone_curve_is_taken_out(direction, rested):
-    """With the ohmic drop if no step to or from a rest shows it."""
+def test_the_overpotential_of_an_unpaired_curve_is_subtracted(direction, rested):
+    """The ohmic drop is subtracted too if no step to or from a rest determines it."""
     samples, ladder = slow((direction,)), load_cell("nca", CAPACITY_AH).ladder
     found = of(samples if rested else samples[samples["current_a"] != 0.0], capacity_ah=CAPACITY_AH)
     plain, (source,) = found.points, without_branches(found, ladder).sources
@@ -93,7 +93,7 @@ def test_what_branches_take_of_a_lone_curve_is_taken_out(direction, rested):
     assert source.notes[-1].startswith(f"{1e3 * drop_v.mean():.0f} mV")
 
 
-def test_a_cold_lone_curve_is_further_from_rest():
+def test_a_cold_unpaired_curve_has_a_larger_overpotential():
     samples, ladder = slow((1.0,)), load_cell("nca", CAPACITY_AH).ladder
     lifted_v = []
     for temperature_c in (25.0, 0.0):
@@ -103,13 +103,13 @@ def test_a_cold_lone_curve_is_further_from_rest():
     assert 1.5 < lifted_v[1] / lifted_v[0] < 5.0
 
 
-def test_pairs_rests_and_given_curves_have_nothing_to_take_out():
+def test_nothing_is_subtracted_from_pairs_rests_and_given_curves():
     soc, ladder = np.linspace(0.0, 1.0, 101), load_cell("nca", CAPACITY_AH).ladder
     found = of(slow((1.0, -1.0)), relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)])
     assert without_branches(found, ladder) == found
 
 
-def test_rests_after_a_discharge_and_a_curve_given_without_hysteresis_are_brought_there_too():
+def test_rests_and_given_curves_without_hysteresis_are_moved_to_the_mean():
     soc = np.linspace(0.0, 1.0, 101)
     found = of(relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)], capacity_ah=TRUTH.cell.capacity_ah)
     moved = center_on_typical_hysteresis(found, np.full(NODES.size, 0.01))
@@ -118,14 +118,14 @@ def test_rests_after_a_discharge_and_a_curve_given_without_hysteresis_are_brough
         assert after.points.std_v == pytest.approx(before.points.std_v)
 
 
-def test_a_charge_that_lacks_much_of_what_came_out_is_left_out_and_said():
+def test_an_incomplete_charge_is_left_out_with_a_note():
     found = of(slow((1.0,)), slow((-1.0,), part=0.85))
     assert found.hysteresis_v is None
     assert len(found.sources) == 1
     assert "charge run1 left out: 2.5" in found.sources[0].notes[0]
 
 
-def test_a_slow_curve_of_an_older_cell_is_counted_against_its_own_capacity():
+def test_a_slow_curve_of_an_aged_cell_uses_its_measured_capacity():
     found = of(slow((1.0, -1.0), capacity_ah=2.7), capacity_ah=CAPACITY_AH)
     assert found.capacity_ah == CAPACITY_AH
     assert found.measured_ah == pytest.approx(2.7, rel=2e-3)
@@ -133,7 +133,7 @@ def test_a_slow_curve_of_an_older_cell_is_counted_against_its_own_capacity():
     assert np.abs(off_v(found)).max() < 2e-3
 
 
-def test_a_given_curve_and_its_hysteresis():
+def test_a_given_curve_and_its_hysteresis_are_used_unchanged():
     soc = np.linspace(0.0, 1.0, 101)
     found = of(curves=[ExternalCurve("book", soc, true_v(soc), hysteresis_v(soc))], capacity_ah=5.0)
     assert [source.kind for source in found.sources] == ["given curve, 101 points"]
@@ -142,7 +142,7 @@ def test_a_given_curve_and_its_hysteresis():
 
 
 @pytest.mark.parametrize("share", [0.4, 1.0])
-def test_rests_tell_how_much_of_the_hysteresis_they_keep_and_are_moved_by_it(share):
+def test_rests_determine_the_remaining_fraction_of_the_hysteresis(share):
     soc, rests = np.linspace(0.0, 1.0, 101), relaxation()
     plain = of(rests, capacity_ah=TRUTH.cell.capacity_ah).points
     book = ExternalCurve("book", soc, fit_table(plain)(soc) + share * 0.02, np.full(soc.size, 0.02))
@@ -162,8 +162,8 @@ def test_a_capture_that_starts_lower_is_aligned_by_its_first_rest():
     assert alone.tests[0].start_soc == 0.93
 
 
-def test_charge_within_a_test_is_counted_and_its_rests_are_less_certain():
-    """Regeneration: some rounds of the test put charge back."""
+def test_rests_after_charge_within_a_test_are_less_certain():
+    """Some rounds of the test contain regeneration."""
     current_a = schedule(rounds=17)
     is_load = current_a > 0.0
     current_a[is_load & (np.cumsum(np.diff(is_load, prepend=False) & is_load) % 5 == 4)] *= -0.5
@@ -178,7 +178,7 @@ def test_charge_within_a_test_is_counted_and_its_rests_are_less_certain():
     assert points.std_v[by_soc].min() > np.median(points.std_v[~by_soc])
 
 
-def test_entropy_from_pairs_at_several_temperatures():
+def test_pairs_at_several_temperatures_determine_de_dt():
     per_kelvin_v = 3e-4
     runs = [slow((1.0, -1.0), temperature_c=t, off_v=per_kelvin_v * (t - 25.0)) for t in (10.0, 25.0, 45.0)]
     fit = fit_table(of(*runs).points)
@@ -196,19 +196,19 @@ def test_entropy_from_pairs_at_several_temperatures():
         (lambda: capture(np.full(7200, 1.5), soc=1.0), 3.0, "no rests in 1.94 h"),
     ],
 )
-def test_what_cannot_be_used_is_refused_with_its_numbers(samples, capacity_ah, message):
+def test_unusable_captures_are_rejected_with_their_numbers(samples, capacity_ah, message):
     with pytest.raises(UserError, match=message):
         of(samples(), capacity_ah=capacity_ah)
 
 
-def test_a_slow_discharge_of_the_wrong_sign_is_refused():
+def test_a_slow_discharge_with_the_wrong_sign_is_rejected():
     samples = slow((1.0,))
     samples["current_a"] *= -1.0
     with pytest.raises(UserError, match=r"wrong sign: charge from 3600 s on .*--current-sign"):
         of(samples)
 
 
-def test_lfp_pairs_at_three_temperatures(shared_data):
+def test_lfp_pairs_at_three_temperatures_give_one_curve(shared_data):
     folder = shared_data / "a123"
     names = [f"c30_{way}_{at}.csv.gz" for at in ("p25", "p05", "n15") for way in ("dis", "chg")]
     found = find_sources([Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=None)
@@ -224,7 +224,7 @@ def test_lfp_pairs_at_three_temperatures(shared_data):
     assert np.abs(fit(warm.soc) - warm.ocv_v)[plateau].max() < 3e-3
 
 
-def test_the_hysteresis_of_a_cold_pair_is_brought_to_25_c(shared_data):
+def test_the_hysteresis_of_a_cold_pair_is_converted_to_25_c(shared_data):
     folder, mean_v = shared_data / "a123", {}
     for at in ("p25", "n15"):
         names = [f"c30_{way}_{at}.csv.gz" for way in ("dis", "chg")]

@@ -1,4 +1,4 @@
-"""The smooth table through points of a known curve, with known errors and entropy."""
+"""Fit of the OCV table to points of a known curve with known errors and entropy."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def true_v(soc):
 
 
 def source(soc, *, noise_v=0.0, off_v=0.0, std_v=1e-3, common_v=2e-3, temperature_c=np.nan, seed=0):
-    """Points of one capture of the cell of Table 1."""
+    """Return points of one capture of the cell of Table 1."""
     ocv_v = true_v(soc) + off_v + noise_v * np.random.default_rng(seed).standard_normal(soc.size)
     everywhere = np.ones(soc.size)
     return Points(
@@ -44,7 +44,7 @@ def test_table_is_increasing_and_near_the_true_curve(noise_v, within_v):
 
 
 def test_slopes_between_clustered_noisy_points_are_those_of_the_curve():
-    """Points 0.004 apart that are 3 mV off each: a line through them has slopes of volts."""
+    """Points 0.004 apart with errors of 3 mV: a line through them would have slopes of several volts."""
     soc = np.concatenate([z + np.array([0.0, 0.004, 0.008, 0.02]) for z in np.arange(0.05, 0.95, 0.05)])
     points = source(soc, noise_v=3e-3, std_v=5e-4, common_v=2e-3)
     assert np.abs(np.diff(points.ocv_v) / np.diff(soc)).max() > 1.5
@@ -53,7 +53,7 @@ def test_slopes_between_clustered_noisy_points_are_those_of_the_curve():
     assert slope_v(fit_table(points), inside) == pytest.approx(true_slope_v, abs=0.15)
 
 
-def test_a_falling_stretch_is_levelled():
+def test_points_that_fall_give_an_increasing_table():
     soc = np.linspace(0.0, 1.0, 41)
     points = Points(soc, 3.4 + 0.7 * soc - 0.2 * ((soc > 0.4) & (soc < 0.6)), np.full(soc.size, 1e-3))
     fit = fit_table(points)
@@ -61,7 +61,7 @@ def test_a_falling_stretch_is_levelled():
     assert (slope_v(fit, GRID) >= 0.0).all()
 
 
-def test_the_curves_error_is_what_the_fits_scatter_by():
+def test_the_error_of_the_curve_equals_the_scatter_of_the_fits():
     soc = np.linspace(0.05, 0.98, 30)
     fits = [fit_table(source(soc, noise_v=2e-3, std_v=2e-3, common_v=1e-4, seed=seed)) for seed in range(40)]
     inside = (NODES > 0.15) & (NODES < 0.95)
@@ -82,14 +82,14 @@ def test_error_grows_in_a_gap_beyond_the_points_and_with_disagreement():
     assert disagree.deviation_v == pytest.approx([0.015, 0.015], rel=0.5)
 
 
-def test_the_surer_source_decides():
+def test_the_more_certain_source_determines_the_curve():
     soc = np.linspace(0.05, 0.98, 45)
     fit = fit_table(joined([source(soc, common_v=1e-3), source(soc, off_v=0.02, common_v=0.02)]))
     inside = (NODES > 0.15) & (NODES < 0.95)
     assert max_v((fit.ocv_v - true_v(NODES))[inside]) < 2e-3
 
 
-def test_ends_are_reached_by_what_is_known_of_them_else_on_the_line():
+def test_known_end_voltages_are_reached_and_unknown_ones_extrapolated():
     soc = np.linspace(0.1, 0.9, 33)
     points = Points(soc, 3.4 + 0.7 * soc, np.full(soc.size, 1e-3))
     line = fit_table(points)
@@ -100,7 +100,7 @@ def test_ends_are_reached_by_what_is_known_of_them_else_on_the_line():
 
 
 @pytest.mark.parametrize("per_kelvin_v", [3e-4, -2e-4])
-def test_entropy_is_found_between_temperatures_and_pulled_to_nothing(per_kelvin_v):
+def test_de_dt_is_between_its_true_value_and_0(per_kelvin_v):
     soc = np.linspace(0.05, 0.98, 45)
     warm = [source(soc, off_v=per_kelvin_v * (t - 25.0), temperature_c=t, common_v=5e-4) for t in (15.0, 25.0, 45.0)]
     found = fit_table(joined(warm)).per_kelvin_v
@@ -110,18 +110,20 @@ def test_entropy_is_found_between_temperatures_and_pulled_to_nothing(per_kelvin_
     cold = replace(cold, cold_v=np.full(soc.size, 0.016))
     less = fit_table(joined([warm[1], cold])).per_kelvin_v
     assert less is not None
-    assert (np.abs(less[10:-10]) < 0.6 * abs(per_kelvin_v)).all()  # as likely, the cold cell had not relaxed
+    assert (
+        np.abs(less[10:-10]) < 0.6 * abs(per_kelvin_v)
+    ).all()  # incomplete relaxation in the cold is an equally likely cause
 
 
 @pytest.mark.parametrize("temperatures_c", [(25.0, 30.0), (np.nan, np.nan)])
-def test_no_entropy_without_a_span_of_temperatures(temperatures_c):
+def test_de_dt_requires_a_temperature_span(temperatures_c):
     soc = np.linspace(0.05, 0.98, 45)
     fit = fit_table(joined([source(soc, temperature_c=t) for t in temperatures_c]))
     assert fit.per_kelvin_v is None
     assert fit.table().per_kelvin_v is None
 
 
-def test_cells_in_series_scale():
+def test_cells_in_series_scale_the_table():
     soc = np.linspace(0.05, 0.98, 45)
     one = source(soc, noise_v=1e-3)
     six = replace(one, ocv_v=6.0 * one.ocv_v, std_v=6.0 * one.std_v, common_v=6.0 * one.common_v)

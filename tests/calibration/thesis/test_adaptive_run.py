@@ -20,21 +20,21 @@ DISTURBED_V, DISTURBED = 0.3, 500
 
 
 def settings(law, **others):
-    """The printed law: no dead zone, no fresh start of k, no watch for lock."""
+    """Return settings of the printed law: no dead zone, no rearming of k, no loss of lock."""
     printed = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "lock_error_v": 100.0}
     return ObserverSettings.model_validate(printed | others)
 
 
 @pytest.fixture(scope="module")
 def disturbed():
-    """Half a minute at 1C and 100 Hz, its first seconds with an error of the voltage."""
+    """Return samples of half a minute at 1C and 100 Hz, the first seconds with a voltage error."""
     samples = discharge(CELL, 0.275, 0.01)[:3000]
     samples["voltage_v"][:DISTURBED] -= DISTURBED_V
     return samples
 
 
 def moved(law, samples, cell=CELL):
-    """Change of a1..a15 at index 1..15, and of k: the integral of e^2 over the run (3.13)."""
+    """Return the change of a1..a15 at index 1..15, and that of k, the integral of e^2 over the run (3.13)."""
     estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     estimator.run(samples)
     change = estimator.state["a"][0] - estimator.settings["a_initial"][0]
@@ -42,19 +42,19 @@ def moved(law, samples, cell=CELL):
 
 
 @pytest.mark.parametrize("every", [1, 10, 100])
-def test_scheme_1_moves_every_parameter_by_the_integral_of_the_squared_error_that_k_grows_by(disturbed, every):
+def test_scheme_1_changes_every_parameter_by_the_increase_of_k(disturbed, every):
     """(3.16) and (3.13) integrate the same e^2, at 100, 10 and 1 Hz."""
     change, integral = moved("scheme-1", disturbed[::every])
     assert integral > 1e-3
     assert change[1:] == pytest.approx(np.full(15, integral), rel=1e-6)
 
 
-def test_scheme_2_draws_the_small_parameters_back(disturbed):
+def test_scheme_2_returns_small_parameters_to_their_initial_values(disturbed):
     change, integral = moved("scheme-2", disturbed)
     assert change[LARGE] == pytest.approx(np.full(10, integral), rel=1e-6)
     assert np.abs(change[SMALL]).max() < 1e-3 * integral
     while_disturbed, _ = moved("scheme-2", disturbed[:3])
-    assert (while_disturbed[SMALL] > 1e-4).all()  # drawn back, not held
+    assert (while_disturbed[SMALL] > 1e-4).all()  # the parameters return afterwards and were not constant
     assert while_disturbed[1] == pytest.approx(while_disturbed[3], rel=1e-9)
 
 
@@ -68,7 +68,7 @@ def test_scheme_2_holds_what_lies_below_its_epsilon(disturbed):
 
 @pytest.mark.parametrize(("law", "last"), [("scheme-3", 15), ("improved", 12)])
 @pytest.mark.parametrize("factor", [0.05, 1.0, 40.0])
-def test_bounded_laws_go_to_their_limits_from_anywhere(disturbed, law, last, factor):
+def test_bounded_laws_converge_to_their_limits_from_any_initial_value(disturbed, law, last, factor):
     """(3.18): the limit of Lemma 4.1.3 once the error is gone."""
     bounds = {
         i: CELL.bounds(i).model_copy(update={"initial": factor * CELL.bounds(i).limit}) for i in range(1, last + 1)
@@ -81,7 +81,7 @@ def test_bounded_laws_go_to_their_limits_from_anywhere(disturbed, law, last, fac
     assert found[last + 1 : 16] == pytest.approx(CELL.a[last + 1 : 16], rel=1e-15)  # a13..a15 come from (4.2)
 
 
-def test_scheme_3_goes_to_the_limits_of_table_4(disturbed):
+def test_scheme_3_converges_to_the_limits_of_table_4(disturbed):
     table_4 = {1: (0.30, 0.25), 3: (0.045, 0.03), 6: (0.05, 0.04), 13: (0.15, 0.1), 15: (0.07, 0.04)}
     bounds = {i: Bounds(upper=u, lower=low, weight_upper=100.0, weight_lower=1.0) for i, (u, low) in table_4.items()}
     estimator = Estimator(
@@ -148,7 +148,7 @@ def test_conditions_of_figure_19_meet_their_parameters_at_the_crossings(converge
         assert (own[below] < condition[below]).all()
 
 
-def test_algorithm_1_says_why_it_did_not_converge():
+def test_algorithm_1_reports_why_it_did_not_converge():
     samples = discharge(CELL, 0.0275, 10.0)
     noisy = samples.copy()
     noisy["voltage_v"] += 0.02 * np.random.default_rng(3).standard_normal(noisy.size)
@@ -164,7 +164,7 @@ def test_algorithm_1_says_why_it_did_not_converge():
     assert outcome(noisy, epsilon_v=0.2) == "converged"
 
 
-def test_error_of_a_run_is_that_of_the_observer_while_the_identifier_runs_too():
+def test_error_of_a_run_is_that_of_the_observer_with_the_identifier_enabled():
     samples = discharge(CELL, 0.055, 1.0)[:150]  # every sample is a snapshot
     once, again = (
         Estimator(CELL, settings("improved"), identifier=IdentifierSettings(), initial_soc=0.9) for _ in range(2)
@@ -174,7 +174,7 @@ def test_error_of_a_run_is_that_of_the_observer_while_the_identifier_runs_too():
     assert adaptive_run(once, samples).error_v.tolist() == trace["tracking_error_v"].tolist()  # (3.15)
 
 
-def test_a_capture_outside_the_limits_is_refused():
+def test_a_capture_outside_the_limits_is_rejected():
     samples = discharge(CELL, 0.0275, 100.0)
     samples["voltage_v"] = 0.0
     with pytest.raises(UserError, match=f"none of {samples.size} samples is within the cell's limits"):

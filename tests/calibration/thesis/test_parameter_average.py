@@ -22,7 +22,7 @@ def run(samples, **given):
 
 
 def find(error_v=None, voltage_v=None, margin=None, a=None, **given):
-    """Run ``averaging_window`` on a thousand seconds with the given events only."""
+    """Return the averaging window of a run of 1000 s that contains only the given events."""
     return averaging_window(
         TIME_S,
         np.zeros(TIME_S.size) if error_v is None else error_v,
@@ -36,15 +36,15 @@ def find(error_v=None, voltage_v=None, margin=None, a=None, **given):
 
 @pytest.fixture(scope="module")
 def samples():
-    """A simulated discharge at C/5, 10 Hz."""
+    """Return samples of a simulated discharge at C/5 and 10 Hz."""
     return discharge(CELL, 0.055, 0.1)
 
 
-def test_a_simulated_discharge_is_averaged_from_where_it_settles_to_where_it_turns_unstable(samples):
+def test_a_simulated_discharge_is_averaged_from_settling_to_instability(samples):
     found = run(samples)
     window = found.window
     assert 0.0 < window.t_int_s < 60.0  # a1 to a12 start far from their limits
-    assert window.start_reason == "99 % of the errors from here on are within 1.00 mV"
+    assert window.start_reason == "99 % of the later errors are within 1.00 mV"
     assert window.end_reason == "knee of the voltage"
     assert 0.9 * samples["time_s"][-1] < window.t_unst_s < found.crossings[1].time_s
     limits = [CELL.bounds(i).limit for i in range(1, 13)]
@@ -62,7 +62,7 @@ def test_override_of_both_ends():
         assert found.average[i] - bounds.limit == pytest.approx(way, rel=0.15)  # trapezoids at 100 Hz
 
 
-def test_override_of_one_end_leaves_the_other_found(samples):
+def test_override_of_one_end_does_not_change_the_other(samples):
     automatic = run(samples).window
     later = run(samples, t_int_s=1000.0).window
     assert (later.t_int_s, later.start_reason) == (1000.0, "given")
@@ -82,20 +82,20 @@ def test_override_of_one_end_leaves_the_other_found(samples):
         ({"t_int_s": 500.0, "t_unst_s": 400.0}, "t_int = 500 s: must lie within 0 to 400 s of the run"),
     ],
 )
-def test_override_outside_the_run_is_refused(given, message):
+def test_override_outside_the_run_is_rejected(given, message):
     with pytest.raises(UserError, match=message):
         find(**given)
 
 
-def test_t_int_is_where_the_error_has_settled():
+def test_t_int_is_the_time_at_which_the_error_has_settled():
     window = find(error_v=np.where(TIME_S < 120.0, 5e-3, 2e-4))
-    assert window.t_int_s == pytest.approx(112.0, abs=9.0)  # one sample in a hundred may still be beyond
-    assert "99 % of the errors from here on are within 1.00 mV" in window.start_reason
+    assert window.t_int_s == pytest.approx(112.0, abs=9.0)  # one sample in a hundred may be beyond the limit
+    assert "99 % of the later errors are within 1.00 mV" in window.start_reason
     spikes = np.where((TIME_S < 50.0) | (TIME_S % 300.0 == 299.0), 5e-3, 0.0)
     assert 40.0 <= find(error_v=spikes).t_int_s <= 50.0
 
 
-def test_t_int_waits_for_the_parameters():
+def test_t_int_is_after_the_settling_of_the_parameters():
     a = np.ones((TIME_S.size, 16))
     a[:, 4] += 10.0 * np.exp(-TIME_S / 20.0)
     window = find(a=a)
@@ -103,7 +103,7 @@ def test_t_int_waits_for_the_parameters():
     assert "every a_i is within 0.1 % of its median" in window.start_reason
 
 
-def test_an_error_that_never_settles():
+def test_an_error_that_never_settles_leaves_no_window():
     window = find(error_v=np.full(TIME_S.size, 0.0123))
     assert window.start_reason == "the error never settles within 1.00 mV"
     assert window.t_int_s == TIME_S[-1]
@@ -118,7 +118,7 @@ def test_t_unst_is_the_first_of_margin_knee_and_end():
     assert window.end_reason == "knee of the voltage"
     assert window.t_unst_s == pytest.approx(800.0, abs=12.0)
     dip = np.linspace(4.2, 3.6, TIME_S.size) - np.where((TIME_S > 500.0) & (TIME_S < 520.0), 0.3, 0.0)
-    assert find(voltage_v=dip).end_reason == "end of the run"  # a load that comes and goes is no knee
+    assert find(voltage_v=dip).end_reason == "end of the run"  # a temporary load is no knee
 
 
 def test_mean_over_uneven_steps_is_the_integral():
@@ -129,7 +129,7 @@ def test_mean_over_uneven_steps_is_the_integral():
     assert found == pytest.approx(np.full(16, 0.5 * (inside[0] + inside[-1])), rel=1e-9)
 
 
-def test_mean_over_nothing_is_the_last_value():
+def test_mean_over_an_empty_window_is_the_last_value():
     a = np.tile(TIME_S[:, None], (1, 16))
     assert averaged(TIME_S, a, AveragingWindow(5000.0, 6000.0, "given", "given"))[1] == TIME_S[-1]
     assert averaged(TIME_S, a, AveragingWindow(10.0, 10.5, "given", "given"))[1] == 10.0

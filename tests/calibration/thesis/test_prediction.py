@@ -24,7 +24,7 @@ LOADS = {"constant": constant(1.5, 7000), "pulse": pulses(), "variable steps": s
 
 
 @pytest.mark.parametrize("load", LOADS)
-def test_the_true_model_predicts_every_load_to_the_noise(load):
+def test_the_error_of_the_true_model_is_the_noise(load):
     run = predict(TRUTH, capture(LOADS[load]), 0.98)
     assert np.sqrt(np.mean(run.error_v**2)) == pytest.approx(0.5e-3, rel=0.05)
     assert run.mean_percent < 0.02
@@ -32,7 +32,7 @@ def test_the_true_model_predicts_every_load_to_the_noise(load):
 
 
 @pytest.mark.parametrize("load", LOADS)
-def test_percents_of_table_11_are_of_the_measured_voltage(load):
+def test_percentages_of_table_11_are_relative_to_the_measured_voltage(load):
     run = predict(wrong_start(), capture(LOADS[load]), 0.98, lowest_soc=0.1)
     percent = 100.0 * np.abs(run.voltage_v - run.predicted_v) / run.voltage_v
     assert run.mean_percent == pytest.approx(percent.mean(), rel=1e-12)
@@ -40,7 +40,7 @@ def test_percents_of_table_11_are_of_the_measured_voltage(load):
     assert 0.1 < run.mean_percent < run.max_percent < 10.0
 
 
-def test_a_voltage_that_is_off_by_one_percent_reads_one_percent():
+def test_a_voltage_error_of_one_percent_is_reported_as_one_percent():
     samples = capture(LOADS["pulse"], noise_v=0.0)
     samples["voltage_v"] /= 1.01
     run = predict(TRUTH, samples, 0.98)
@@ -58,7 +58,7 @@ def test_static_elements_are_those_of_one_soc_everywhere(frozen_at):
 
 
 @pytest.mark.parametrize("load", ["pulse", "variable steps"])
-def test_the_dynamic_model_beats_the_static_one_where_elements_rise(load):
+def test_the_dynamic_model_is_better_than_the_static_one_where_elements_rise(load):
     samples = capture(LOADS[load])
     dynamic = predict(TRUTH, samples, 0.98)
     static = predict(TRUTH, samples, 0.98, a=static_elements(TRUTH.a, 0.5))
@@ -66,17 +66,17 @@ def test_the_dynamic_model_beats_the_static_one_where_elements_rise(load):
     low = static.soc < 0.15
     assert static.error_percent[low].mean() > 3.0 * static.error_percent[~low].mean()
     near = np.abs(static.soc - 0.5) < 0.02
-    assert np.abs(static.error_v[near]).max() < 4e-3  # where it was frozen both are right
+    assert np.abs(static.error_v[near]).max() < 4e-3  # near the SOC of the static model both agree
 
 
-def test_parameters_given_take_the_place_of_the_cells():
+def test_given_parameters_replace_those_of_the_cell():
     samples = capture(LOADS["pulse"])
     given = predict(TRUTH, samples, 0.98, a=wrong_start().a, lowest_soc=0.1)
     own = predict(wrong_start(), samples, 0.98, lowest_soc=0.1)
     assert np.array_equal(given.predicted_v, own.predicted_v)
 
 
-def test_prediction_ends_before_a_capacitance_turns_negative():
+def test_prediction_ends_before_a_capacitance_is_negative():
     samples = discharge(CELL, 0.275, 1.0)
     worst = max(delta(CELL.a[8], CELL.a[9], CELL.a[7]), delta(CELL.a[11], CELL.a[12], CELL.a[10]))
     assert worst == pytest.approx(0.011156, abs=1e-6)  # E13
@@ -88,7 +88,7 @@ def test_prediction_ends_before_a_capacitance_turns_negative():
 
 
 @pytest.mark.parametrize(("lowest_soc", "floor"), [(0.02, "0.020"), (0.0, "0.012")])  # delta2 is 0.011, E13
-def test_a_start_below_the_lowest_soc_is_refused(lowest_soc, floor):
+def test_a_start_below_the_lowest_soc_is_rejected(lowest_soc, floor):
     samples = discharge(CELL, 0.275, 1.0)
     message = rf"{CELL.cell.name}: SOC is 0\.010 at the first sample, and the prediction ends below {floor}"
     with pytest.raises(UserError, match=message):
@@ -104,7 +104,7 @@ def test_glitches_and_lost_samples_are_left_out():
     assert run.max_percent < 0.5
 
 
-def test_open_circuit_is_the_kernels_curve():
+def test_open_circuit_equals_the_curve_of_the_kernels():
     soc = np.random.default_rng(0).uniform(-0.02, 1.02, 500)
     grid = ocv_grid(TRUTH)
     assert open_circuit(TRUTH, soc) == pytest.approx([ocv(x, *grid) for x in soc], abs=1e-9)
@@ -112,14 +112,14 @@ def test_open_circuit_is_the_kernels_curve():
 
 @pytest.mark.parametrize("load", LOADS)
 def test_soc_by_interpolation_agrees_with_counting(load):
-    """(7.1): beside coulomb counting, as in Figs. 41 and 42."""
+    """SOC by (7.1) is compared with coulomb counting, as in Figs. 41 and 42."""
     run = predict(TRUTH, capture(LOADS[load], noise_v=0.0), 0.98)
     soc, e_o = soc_by_interpolation(TRUTH, run)
     assert soc == pytest.approx(run.soc, abs=2e-3)
     assert e_o == pytest.approx(open_circuit(TRUTH, run.soc), abs=1e-6)
 
 
-def test_soc_by_interpolation_finds_a_wrong_start_that_counting_keeps():
+def test_soc_by_interpolation_corrects_a_wrong_start_unlike_counting():
     samples = capture(LOADS["pulse"], soc=0.90, noise_v=0.0)
     run = predict(TRUTH, samples, 0.95)  # counting begins 5 % too high
     true_soc = run.soc - 0.05

@@ -1,4 +1,4 @@
-"""Step 3: R_s by (4.2) and its curve (2.9) on a cell that is known."""
+"""Step 3: R_s by (4.2) and its fit (2.9) for a known cell."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def true_ohm(soc, cell=CELL):
 
 
 def curve(current_a, noise_v=0.0):
-    """R_s by (4.2) from one constant load, a1..a12 known."""
+    """Return R_s by (4.2) from one constant load with the true a1..a12."""
     samples = discharge(CELL, current_a, 1.0)
     samples["voltage_v"] += noise_v * np.random.default_rng(1).standard_normal(samples.size)
     return series_resistance(CELL, predict(CELL, samples, 1.0, lowest_soc=0.02))
@@ -55,8 +55,8 @@ def test_fit_to_several_noisy_currents_is_within_2_percent(curves):
     assert fit.element.a == pytest.approx(tuple(fit.a))
 
 
-def test_steps_with_rests_serve_as_well():
-    """Another cell, 1 Hz, half a millivolt of noise: only the samples under load count."""
+def test_steps_with_rests_give_the_series_resistance():
+    """Another cell at 1 Hz with 0.5 mV of noise. Only samples under load contribute."""
     samples = capture(steps(3), soc=0.98)
     run = predict(TRUTH, samples, 0.98, lowest_soc=0.05)
     found = series_resistance(TRUTH, run)
@@ -66,7 +66,7 @@ def test_steps_with_rests_serve_as_well():
     assert fit(soc) == pytest.approx(true_ohm(soc, TRUTH), rel=0.02)
 
 
-def test_mean_over_the_currents_weighs_each_by_its_square_where_any_has_data():
+def test_mean_over_currents_is_weighted_by_the_squared_current():
     first = SeriesResistance(np.array([0.205, 0.305, 0.405]), np.full(3, 1.0), np.full(3, 3.0))
     second = SeriesResistance(np.array([0.305, 0.405, 0.505]), np.full(3, 3.0), np.full(3, 1.0))
     both = mean_of([first, second])
@@ -75,7 +75,7 @@ def test_mean_over_the_currents_weighs_each_by_its_square_where_any_has_data():
     assert both.weight == pytest.approx([3.0, 4.0, 4.0, 1.0])
 
 
-def test_an_error_of_the_open_circuit_voltage_counts_by_the_current_that_it_is_divided_by():
+def test_an_error_of_the_open_circuit_voltage_has_the_weight_of_its_current():
     """10 mV are 65 mohm at C/20 of a cell of 3 Ah (E19): beside 1.5 A they move R_s by their share of the squares."""
     cell = TRUTH.model_copy(
         update={"ocv": TRUTH.ocv.model_copy(update={"ocv_v": tuple(v + 0.01 for v in TRUTH.ocv.ocv_v)})}
@@ -93,8 +93,8 @@ def test_an_error_of_the_open_circuit_voltage_counts_by_the_current_that_it_is_d
     assert np.median(both.r_s_ohm - true_ohm(both.soc, TRUTH)) == pytest.approx(expected, rel=0.01)
 
 
-def test_what_the_branches_have_wrong_goes_into_r_s():
-    """On a slow load only the sum of the resistances counts (Table 6)."""
+def test_errors_of_the_rc_pairs_become_part_of_r_s():
+    """Under a slow load only the sum of the resistances is determined (Table 6)."""
     a = np.array(CELL.a)
     a[3] += 0.02  # R_ts too high by 20 mohm
     samples = discharge(CELL, 0.1, 1.0)
@@ -103,7 +103,7 @@ def test_what_the_branches_have_wrong_goes_into_r_s():
     assert found.r_s_ohm[settled] == pytest.approx(true_ohm(found.soc)[settled] - 0.02, abs=5e-4)
 
 
-def test_a_flat_resistance_has_no_rise_and_says_so():
+def test_a_constant_resistance_has_no_amplitude_and_no_std():
     soc = np.linspace(0.05, 0.95, 60)
     fit = fit_series_resistance(SeriesResistance(soc, np.full(60, 0.08), np.ones(60)))
     assert fit(soc) == pytest.approx(np.full(60, 0.08), rel=1e-6)
@@ -111,7 +111,7 @@ def test_a_flat_resistance_has_no_rise_and_says_so():
     assert fit.element.amplitude_ohm > 0.0
 
 
-def test_no_current_and_too_little_soc_are_refused_with_their_numbers():
+def test_no_current_and_too_small_a_soc_range_are_rejected_with_their_numbers():
     resting = capture(np.full(600, 0.001))
     with pytest.raises(UserError, match=r"none above 0\.060 A, the largest is 0\.001 A"):
         series_resistance(TRUTH, predict(TRUTH, resting, 0.98))

@@ -74,7 +74,7 @@ def test_no_rests_are_refused_with_what_to_do(tmp_path, capsys):
     capture = save(tmp_path / "loaded.csv", samples)
     code, text, err = run(capsys, "capacity", capture, "--cell", "ncr18650")
     assert (code, text) == (2, "")
-    assert "error: no capacity: no two rests tell the SOC" in err
+    assert "error: no capacity: no two rests give an SOC" in err
     assert "rest the cell for half an hour" in err
 
 
@@ -88,12 +88,12 @@ def test_a_wrong_sign_is_named_and_no_longer_rest_advised(capsys, capture):
 @pytest.mark.parametrize(
     ("cell", "said"),
     [
-        ("lto", "rests, at 3.322..4.160 V, are beyond the curve of the cell, 1.500..2.700 V: is it this cell's"),
+        ("lto", "rests, at 3.322..4.160 V, are beyond the curve of the cell, 1.500..2.700 V: check the cell file"),
         (
             "lfp",
             "0.02 of SOC apart, the charge between them is 0.90 of the declared capacity: is the curve this cell's",
         ),
-        ("lmo", "anchors disagree, by 5.3 times what their errors explain: is the curve this cell's"),
+        ("lmo", "anchors disagree by 5.3 times their expected errors: check the curve of the cell file"),
     ],
 )
 def test_a_wrong_cell_is_named_and_no_longer_rest_advised(capsys, capture, cell, said):

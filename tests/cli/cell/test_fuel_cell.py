@@ -82,7 +82,7 @@ def test_what_the_fit_leaves_is_told_of_each_file_though_two_have_one_name(capsy
 def test_identify_says_what_the_data_do_not_tell(capsys, curve: Path, tmp_path: Path) -> None:
     code, printed, _ = run(capsys, "identify", curve, "--cell", "pem_30w", "--out", tmp_path / "mine.toml")
     assert code == 0
-    assert "c_dl_farad: not known at all from these data; it needs steps of the current" in " ".join(printed.split())
+    assert "c_dl_farad: not determined by these data; it needs steps of the current" in " ".join(printed.split())
 
 
 @pytest.mark.parametrize("as_curve", [True, False])

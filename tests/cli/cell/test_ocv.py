@@ -236,7 +236,7 @@ def test_a_lone_slow_curve_of_a_layered_oxide_is_brought_to_rest(tmp_path, capsy
     out, folder = tmp_path / "lone.toml", data / "lgm50"
     code, text, _ = run(capsys, "ocv", folder / "rate_0p1c_25c.csv.gz", "--out", out)
     assert code == 0
-    assert "taken out for" in text
+    assert "subtracted for" in text
     found = load_cell(out).ocv
     assert found.hysteresis_v is None
     published = np.genfromtxt(folder / "ocv_25c.csv", delimiter=",", names=True)

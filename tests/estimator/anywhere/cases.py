@@ -1,8 +1,8 @@
-"""Short captures of each kind that a user may have, identical on every machine.
+"""Short simulated captures of typical loads and conditions, identical on every machine.
 
-The estimator is switched on in mid-load, at an SOC that is 0.2 too low and 0.2 too high. The cell file comes from the
-impedance of the truth at the temperatures that it is made for, as far as a ladder can follow it, and errs as much as it
-says: an OCV wrong by some millivolts and some SOC, the resistances of another such cell, a capacity off by a percent.
+The estimator starts in mid-load with an SOC 0.2 too low or 0.2 too high. The cell file's ladder is fitted to the true
+impedance at the file's temperatures. The file has errors of the size that it declares: an OCV error of some millivolts and
+some SOC, resistances of another cell of the make, a capacity error of a percent.
 """
 
 from dataclasses import dataclass, replace
@@ -59,17 +59,17 @@ VOLT_STEP, AMPERE_STEP, KELVIN_STEP = 1e-3, 1e-3, 0.1
 
 @dataclass(frozen=True)
 class Case:
-    """One capture, and the estimator's description of its cell."""
+    """Parameters of one capture and of the estimator's cell file."""
 
     name: str
     truth: Truth = OXIDE
     load: Literal["drive", "constant", "rest"] = "drive"
-    """A drive, a constant load, or a drive with 30 min of rest from 5 min after switch-on."""
+    """Kind of load: a drive, a constant load, or a drive with 30 min of rest from 5 min after switch-on."""
     load_c: float = 0.5
     """Mean of the load [C]."""
     temperature_c: float = 25.0
     rising_k: float = 0.0
-    """Temperature rise."""
+    """Temperature rise over the capture [K]."""
     rate_hz: float = 1.0
     hours: float = 1.3
     unseen_h: float = 0.5
@@ -77,18 +77,18 @@ class Case:
     soc: float = 0.9
     """SOC at the start of the load, from rest; 1: just charged."""
     file_c: tuple[float, ...] | Literal["generic"] = (25.0, 10.0, 0.0, -10.0)
-    """Temperatures that the cell file is made for; or a generic one."""
+    """Temperatures of the cell file [C], or a generic cell file."""
     gain: float = 1.0
     offset_a: float = 0.0
     capacity: float = 1.01
     """Capacity in the cell file over the true one."""
     curve_error: float = 1.0
-    """Error of the OCV in the cell file over that of a common one; a capacity can be learned no better than it allows."""
+    """Error of the OCV in the cell file over that of a typical one. It limits the accuracy of a learned capacity."""
     weak_cell: float = 1.0
-    """Below 1: six cells in series, one with this part of the capacity of the others."""
+    """Below 1: six cells in series, one with this fraction of the capacity of the others."""
     sensed: bool = True
     warms_k: float = 0.0
-    """Temperature rise for a loss of 1 W."""
+    """Temperature rise for a loss of 1 W [K]."""
     after_s: float = 900.0
     seed: int = 1
 
@@ -141,7 +141,7 @@ CASES: tuple[Case, ...] = (
     Case("6S one cell -20%", weak_cell=0.8, seed=35),
 )
 WRONG = (-0.2, 0.2)
-"""Error of the initial SOC."""
+"""Errors of the initial SOC."""
 
 
 @dataclass(frozen=True)
@@ -150,12 +150,12 @@ class Capture:
 
     samples: SampleBlock
     soc: Floats
-    """At each sample; of the emptiest cell."""
+    """True SOC of the weakest cell at each sample."""
     cell: CellModel
 
 
 def load_a(case: Case, seconds: int) -> Floats:
-    """Current at 1 Hz [A]: levels of some seconds, stops, some regeneration where it is warm."""
+    """Return the current at 1 Hz [A]: levels of some seconds, stops, and some regeneration in warm cells."""
     rng = np.random.default_rng(case.seed)
     one_c = case.truth.capacity_ah
     if case.load == "constant":
@@ -172,7 +172,7 @@ def load_a(case: Case, seconds: int) -> Floats:
 
 
 def capture(case: Case, current_a: Floats | None = None) -> Capture:
-    """Simulate one; under ``current_a`` at ``rate_hz`` [A], where it is given."""
+    """Simulate a capture of one case; under ``current_a`` at ``rate_hz`` [A] if given."""
     assert not (case.sensed and case.warms_k), "the sensor shows the room"
     rng = np.random.default_rng(1000 + case.seed)
     if current_a is None:
@@ -203,7 +203,7 @@ def capture(case: Case, current_a: Floats | None = None) -> Capture:
 
 
 def cell_file(case: Case) -> CellModel:
-    """Return the estimator's cell file."""
+    """Return the cell file of the estimator."""
     kind = "nmc" if case.truth.ocv_v is OXIDE.ocv_v else "lfp"
     generic = load_cell(kind, case.capacity * case.truth.capacity_ah)
     if case.file_c == "generic":
@@ -213,7 +213,7 @@ def cell_file(case: Case) -> CellModel:
     std_v, std_soc_v = case.curve_error * OCV_STD_V[kind], case.curve_error * OCV_STD_SOC * slope_v
     wrong_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
     told_v = rising((case.truth.ocv_v + wrong_v)[OCV_NODES])
-    hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # everywhere: an error that `ocv` allows for
+    hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # constant over SOC, an error within the std of `ocv`
     table = {
         "soc": GRID[OCV_NODES],
         "ocv_v": told_v + 1e-6 * np.arange(OCV_NODES.size),
@@ -225,13 +225,15 @@ def cell_file(case: Case) -> CellModel:
 
 
 def rising(curve_v: Floats) -> Floats:
-    """The same, level where it falls, from the middle outwards: an end that is wrong by its steepness moves nothing else."""
+    """Return the curve with falling parts made constant, from the middle outwards, so that errors of the ends stay
+    local."""
     half = curve_v.size // 2
     return np.r_[np.minimum.accumulate(curve_v[half - 1 :: -1])[::-1], np.maximum.accumulate(curve_v[half:])]
 
 
 def ladder(truth: Truth, temperatures_c: tuple[float, ...], rng: np.random.Generator) -> Ladder:
-    """The ladder nearest to the impedance of the truth at each SOC, in relative squares, no resistance below 0; of another cell."""
+    """Return the ladder of another cell, fitted to the true impedance at each SOC by relative non-negative least
+    squares."""
     branches = 1.0 / (1.0 + 1j * RAD_S[:, None] * np.array([0.0, *TAU_S]))
     another = np.exp(R_STD * rng.standard_normal())
     weak_ohm, strong_ohm = [], []

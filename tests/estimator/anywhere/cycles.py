@@ -1,8 +1,8 @@
-"""Full cycles and charges from empty: the first day of a cell of which only chemistry and capacity are known.
+"""Full cycles and charges from empty: first day of a cell with known chemistry and capacity only.
 
-The estimator has the generic cell file and no initial SOC. The true cell has the OCV of another make, as far as a capture of
-one is at hand (LG M50, NCR18650, Leaf), that of the LFP test cell, or one up to 1.5 std off (LCO, LTO). Its resistances are 0.7
-to 3 times those of the generic cell.
+The estimator has the generic cell file and no initial SOC. The true cell has the OCV of a measured cell (LG M50, NCR18650,
+Leaf, the LFP test cell) or a random OCV with errors up to 1.5 std (LCO, LTO). Its resistances are 0.7 to 3 times those of
+the generic cell.
 """
 
 import csv
@@ -26,7 +26,7 @@ from tests.estimator.anywhere.use import drive
 
 CAPACITY_AH = 3.0
 AFTER_S = 300.0
-"""Time after switch-on that is not judged [s]."""
+"""Time after switch-on that is not scored [s]."""
 EMPTY_SOC = 0.02
 REST_S = 900
 """Rest between two phases [s]."""
@@ -44,7 +44,7 @@ class Cycle:
     """True: a discharge at 1C to empty comes first; False: the charge, from empty."""
     resistance: float
     soc: float
-    """At the first sample, from rest."""
+    """SOC at the first sample, from rest."""
     charge_c: float = 1.0
     seed: int = 1
 
@@ -55,7 +55,7 @@ class Cycle:
 
 
 def cycles(chemistry: str) -> tuple[Cycle, ...]:
-    """Captures of one generic cell."""
+    """Return the cycles of one generic cell."""
     down = [Cycle(chemistry, "discharge", r, s, seed=n) for n, (r, s) in enumerate(DISCHARGES)]
     up = [Cycle(chemistry, "charge", r, s, c, seed=20 + n) for n, (r, s, c) in enumerate(CHARGES)]
     return (*down, *up)
@@ -68,12 +68,12 @@ CHARGES = ((0.7, 0.03, 1.0), (1.0, 0.05, 0.3), (2.0, 0.02, 0.5), (3.0, 0.05, 1.0
 THREE_TIMES_PHOSPHATE = Cycle("lfp", "discharge", 1.815, 0.41)
 """A cell with three times the resistances of ``PHOSPHATE``, for its capacity."""
 WORST_STDS = 1.5
-"""Largest error of a true curve that is drawn, in std of the generic one."""
+"""Maximum error of a random true curve, in std of the generic one."""
 CHEMISTRIES = ("nmc", "nca", "lfp", "lmo", "lco", "lto")
 
 
 def true_curve(cycle: Cycle) -> Floats:
-    """OCV of the true cell at ``GRID`` [V]."""
+    """Return the OCV of the true cell at ``GRID`` [V]."""
     if cycle.chemistry == "nmc":
         return measured_curve()
     if cycle.chemistry == "lfp":
@@ -100,7 +100,7 @@ def load(cycle: Cycle, rng: np.random.Generator, charge_s: int) -> Floats:
 
 
 def capture(cycle: Cycle) -> tuple[SampleBlock, Floats]:
-    """Samples at 1 Hz, and the true SOC at each, until the cell is empty again."""
+    """Return samples at 1 Hz until the cell is empty again, and the true SOC at each."""
     truth = PHOSPHATE if cycle.chemistry in ("lfp", "lto") else OXIDE
     ocv_v, generic = true_curve(cycle), load_cell(cycle.chemistry, CAPACITY_AH)
     scale = cycle.resistance * total_ohm(generic) / truth.ohm[GRID.size // 2].sum()
@@ -126,7 +126,7 @@ def capture(cycle: Cycle) -> tuple[SampleBlock, Floats]:
 
 
 def total_ohm(cell: CellModel) -> float:
-    """Sum of a cell's resistances at SOC 0.5 and 25 C [ohm]."""
+    """Return the sum of a cell's resistances at SOC 0.5 and 25 C [ohm]."""
     ladder = cell.ladder
     assert ladder is not None
     return float(sum(np.interp(0.5, ladder.soc, row) for row in (*ladder.weak_ohm, *ladder.strong_ohm)))
@@ -134,7 +134,7 @@ def total_ohm(cell: CellModel) -> float:
 
 @dataclass(frozen=True)
 class CycleRow:
-    """The estimator on one capture."""
+    """Result of the estimator on one capture."""
 
     cycle: Cycle
     score: Score
@@ -145,7 +145,7 @@ class CycleRow:
 
     @property
     def line(self) -> list[str]:
-        """Line of the checked-in summary."""
+        """Return the line of the checked-in summary."""
         values = (self.score.rmse, self.score.cover, self.score.std, self.score.score, self.capacity)
         return [self.cycle.name, *(f"{value:.1f}" for value in values)]
 
@@ -166,11 +166,11 @@ def row(cycle: Cycle) -> CycleRow:
 
 
 def rows(chemistry: str) -> list[CycleRow]:
-    """All captures of one generic cell."""
+    """Return the results of all captures of one generic cell."""
     return [row(cycle) for cycle in cycles(chemistry)]
 
 
 def write(table: Iterable[CycleRow]) -> None:
-    """Write the summary that is checked in."""
+    """Write the checked-in summary."""
     with PATH.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([HEAD, *(r.line for r in table)])

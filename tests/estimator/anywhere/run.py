@@ -1,4 +1,4 @@
-"""The estimator over a capture, with its innovations."""
+"""Run of the estimator over a capture, with innovations."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,13 @@ from bms_estimator.model.sample import SampleBlock
 BLOCK_S = 600.0
 """Duration over which innovations are summed: model errors of this duration disturb the SOC."""
 WHOLE = 0.5
-"""A block with less than this part of the updates of the fullest is left out."""
+"""Minimum number of updates of a block, as a fraction of the fullest block."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """At each sample, arrays of shape (n,); the innovation is that of the last update, ``updated`` where it was."""
+    """Results at each sample, arrays of shape (n,). The innovation is that of the last update; ``updated`` marks
+    updates."""
 
     time_s: Floats
     soc: Floats
@@ -29,7 +30,8 @@ class Run:
     updated: NDArray[np.bool_]
 
     def nis(self, after_s: float) -> float:
-        """Mean over ten minutes each of (sum of the innovations)^2 / (sum of their variances S), from ``after_s`` on."""
+        """Return the mean of (sum of innovations)^2 / (sum of their variances S) over blocks of ten minutes, from
+        ``after_s`` on."""
         elapsed_s = self.time_s - self.time_s[0] - after_s
         judged = self.updated & (elapsed_s >= 0.0)
         block = (elapsed_s[judged] / BLOCK_S).astype(int)
@@ -40,7 +42,7 @@ class Run:
 
 
 def run_of(estimator: Estimator, samples: SampleBlock) -> Run:
-    """Take all samples."""
+    """Run the estimator over all samples."""
     f, p = estimator.record["filter"], estimator.settings_record[0]["filter"]
     soc, innovation_v, variance_v2 = (f[n] for n in ("soc", "innovation_v", "innovation_variance"))
     gathered = f["window"]["samples"]

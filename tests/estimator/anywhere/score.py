@@ -1,4 +1,4 @@
-"""Quality of an SOC with its error."""
+"""Scores of an estimated SOC with its standard deviation."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 from bms_estimator.model.arrays import Floats
 
 MAX_S = 60.0
-"""A pause counts as no longer."""
+"""Maximum weight of a pause between two samples [s]."""
 LOWEST_SOC = 0.05
 MIN_ROWS = 10
 
@@ -19,21 +19,21 @@ class Score:
     rmse: float
     bias: float
     cover: float
-    """Time that the truth is inside soc +- 2 soc_std."""
+    """Share of time with the true SOC inside soc +- 2 soc_std [%]."""
     std: float
-    """Mean of soc_std."""
+    """Mean of soc_std [%]."""
     score: float
-    """Interval score of that band as of 95 %: its width plus 40 times what lies outside (Gneiting and Raftery 2007,
-    eq. 43). Neither a wider nor a narrower band than is true betters it."""
+    """Interval score of soc +- 2 soc_std as a 95 % interval: width plus 40 times the distance of the true SOC outside
+    (Gneiting and Raftery 2007, eq. 43)."""
     nees: float
-    """Mean of (error / soc_std)^2: 1 where the std is right."""
+    """Mean of (error / soc_std)^2; 1 for a correct std."""
 
 
 def score(time_s: Floats, soc: Floats, soc_std: Floats, truth: Floats, after_s: float = 900.0) -> Score | None:
     """Score a run from ``after_s`` on, above ``LOWEST_SOC``. Arrays of shape (n,).
 
     Returns:
-        None where that leaves too little.
+        None if too few samples remain.
     """
     judged = (time_s - time_s[0] >= after_s) & (truth >= LOWEST_SOC)
     weight = np.clip(np.diff(time_s, append=time_s[-1]), 0.0, MAX_S)[judged]

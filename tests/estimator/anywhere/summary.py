@@ -19,7 +19,7 @@ DIGITS = 2
 
 @dataclass(frozen=True)
 class Row:
-    """Result of one case with the initial error ``wrong``."""
+    """Result of one case with the initial SOC error ``wrong``."""
 
     case: str
     wrong: float
@@ -27,9 +27,9 @@ class Row:
     nis: float
     """``Run.nis``."""
     capacity: float
-    """Learned over true, less 1 [%]."""
+    """Learned over true capacity, less 1 [%]."""
     reopened: int
-    """Times that the filter forgot the SOC again."""
+    """Number of re-initializations of the SOC."""
 
 
 def rows(cases: Iterable[Case] = CASES) -> list[Row]:
@@ -57,7 +57,7 @@ def numbers(r: Row) -> tuple[float, ...]:
 
 
 def write(table: list[Row]) -> None:
-    """Write the table as it is checked in."""
+    """Write the checked-in table."""
     with PATH.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(HEAD)
@@ -66,7 +66,7 @@ def write(table: list[Row]) -> None:
 
 
 def read() -> dict[tuple[str, float], tuple[float, ...]]:
-    """``numbers`` as they are checked in, by case and start."""
+    """Return the checked-in ``numbers`` by case and start."""
     with PATH.open() as file:
         lines = list(csv.reader(file))[1:]
     return {(line[0], float(line[1])): tuple(map(float, line[2:])) for line in lines}

@@ -1,4 +1,4 @@
-"""Promises of the SOC and its interval for any start, on cells that differ from the model."""
+"""Accuracy of the SOC and its interval for any start, on cells that differ from the model."""
 
 import numpy as np
 import pytest
@@ -50,13 +50,14 @@ LIMITS = {
     "6S one cell -10%": (None, 95, 7.2),
     "6S one cell -20%": (None, 95, 6.1),
 }
-"""RMSE [%], share of time inside two std [%], mean std [%]; no RMSE where only the band is promised.
+"""Limits of RMSE [%], share of time inside two std [%], and mean std [%]; None: no limit of the RMSE.
 
-The OCV of the cell file is wrong by 0.7 % of SOC and 4 mV, which an estimator cannot know: RMSE is that and its own.
+The OCV of the cell file has an error of 0.7 % of SOC and 4 mV, which an estimator cannot correct and which is part of the
+RMSE.
 """
 LAST_DIGITS = 0.02
-"""Tolerance of the numbers: they are rounded to 0.01, and exp and log of other processors differ in the last bit.
-1e-9 V on every voltage changes none of them by more than 0.005."""
+"""Tolerance of the numbers. They are rounded to 0.01, and exp and log of other processors differ in the last bit. A change of
+every voltage by 1e-9 V changes the numbers by at most 0.005."""
 NIS_BOUNDS = 0.2, 2.0
 
 
@@ -79,7 +80,7 @@ def test_the_summary_is_as_checked_in(table) -> None:
 
 
 @pytest.mark.parametrize("case", LIMITS)
-def test_the_soc_is_right_and_its_band_true_and_narrow(table, case: str) -> None:
+def test_the_soc_error_coverage_and_std_are_within_their_limits(table, case: str) -> None:
     most, cover, std = LIMITS[case]
     both = [r.score for r in table if r.case == case]
     assert len(both) == 2
@@ -90,26 +91,26 @@ def test_the_soc_is_right_and_its_band_true_and_narrow(table, case: str) -> None
 
 
 @pytest.mark.parametrize("case", ["capacity +20%", "capacity -20%"])
-def test_a_capacity_that_is_wrong_by_a_fifth_is_found(table, case: str) -> None:
+def test_a_capacity_wrong_by_20_percent_is_corrected(table, case: str) -> None:
     assert [abs(r.capacity) < 3.0 for r in table if r.case == case] == [True, True]
 
 
-def test_errors_are_of_the_size_of_their_std(table) -> None:
-    """NEES: errors within one capture are correlated, so each capture is one degree of freedom.
+def test_nees_matches_the_std(table) -> None:
+    """Errors within one capture are correlated, so that each capture is one degree of freedom of the NEES.
 
-    The packs are left out: their one weak cell is not drawn from what is common. A band that is too wide is the lesser fault,
-    and every file is given more than these captures hold: the lower bound is at 0.1 %.
+    Packs are excluded, because their weak cell is not a random draw. The lower bound is at 0.1 %, because too wide an
+    interval is a smaller fault, and the std covers effects that these captures do not contain.
     """
     nees = [np.mean([r.score.nees for r in table if r.case == case.name]) for case in CASES if case.weak_cell == 1.0]
     low, high = chi2.ppf([0.001, 0.975], len(nees))
     assert low <= np.sum(nees) <= high
 
 
-def test_innovations_are_of_the_size_of_their_std_over_ten_minutes(table) -> None:
-    """NIS of means.
+def test_nis_of_ten_minutes_matches_the_std(table) -> None:
+    """S must match the mean innovation of ten minutes.
 
-    R is the error of the model, which stays for minutes, as if it were white: 50 mV in a second is 2 mV in ten minutes.
-    One innovation is far below its S, therefore; the mean of ten minutes is what S must be right for.
+    R treats the error of the model, which persists for minutes, as white: 50 mV in a second correspond to 2 mV in ten
+    minutes. A single innovation is therefore far below its S.
     """
     nis = np.mean([r.nis for r in table])
     assert NIS_BOUNDS[0] <= nis <= NIS_BOUNDS[1]

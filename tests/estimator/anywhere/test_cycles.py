@@ -43,7 +43,7 @@ def test_the_summary_is_as_checked_in(table) -> None:
 
 
 @pytest.mark.parametrize("chemistry", CHEMISTRIES)
-def test_the_interval_holds_through_a_full_cycle(table, chemistry: str) -> None:
+def test_the_interval_contains_the_true_soc_through_a_full_cycle(table, chemistry: str) -> None:
     mean_cover, worst_cover, rmse = LIMITS[chemistry]
     scores = [r.score for r in table[chemistry]]
     assert np.mean([s.cover for s in scores]) >= mean_cover
@@ -52,13 +52,14 @@ def test_the_interval_holds_through_a_full_cycle(table, chemistry: str) -> None:
 
 
 @pytest.mark.parametrize("chemistry", CHEMISTRIES)
-def test_no_cycle_teaches_an_impossible_capacity(table, chemistry: str) -> None:
-    """The declared capacity is right. A charge once left 67 % too much."""
+def test_no_cycle_causes_an_implausible_capacity(table, chemistry: str) -> None:
+    """The declared capacity is correct. An earlier version learned 67 % too much in a charge."""
     assert max(abs(r.capacity) for r in table[chemistry]) < 25.0
 
 
-def test_a_charge_from_empty_neither_teaches_a_capacity_nor_initializes_the_filter_again() -> None:
-    """The filter once began again as the charge did, was limited at full too early, and learned 36 % too much capacity there."""
+def test_a_charge_from_empty_does_not_change_the_capacity_or_reinitialize_the_filter() -> None:
+    """An earlier version re-initialized the filter at the start of the charge, reached full too early, and learned 36 %
+    too much capacity."""
     cycle = row(THREE_TIMES_PHOSPHATE)
     assert cycle.initializations == 0
     assert abs(cycle.capacity) < 5.0
@@ -68,5 +69,5 @@ def test_a_charge_from_empty_neither_teaches_a_capacity_nor_initializes_the_filt
 
 @pytest.mark.parametrize("chemistry", ["nmc", "nca", "lfp", "lmo"])
 def test_no_capture_of_these_initializes_the_filter_again(table, chemistry: str) -> None:
-    """Some of lco and lto do, in the middle of a charge or at rest after the discharge."""
+    """Some captures of lco and lto do, in the middle of a charge or at rest after the discharge."""
     assert [r.cycle.name for r in table[chemistry] if r.initializations] == []

@@ -1,8 +1,8 @@
-"""Cells that differ from the estimator's model: their samples and true values.
+"""Simulation of cells that differ from the estimator's model.
 
-Eight processes with time constants of their own between those of the ladder, which slow down in the cold, each with an
-activation energy of its own; one of them obeys Butler-Volmer kinetics, so its resistance falls with the current; two
-kinds of hysteresis, one fast and one slow; entropy; resistances that rise towards empty and full.
+A cell has eight processes with time constants between those of the ladder, each with its own activation energy. One process
+has Butler-Volmer kinetics, so that its resistance falls with the current. The OCV has a fast and a slow hysteresis and an
+entropy term. Resistances rise towards empty and full.
 """
 
 import math
@@ -17,41 +17,41 @@ from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.numba_cache import njit
 
 GRID = np.linspace(0.0, 1.0, 401)
-"""SOC of all that is given along it."""
+"""SOC grid of the true cells."""
 TAU_S = np.array([0.0, 0.4, 3.0, 17.0, 70.0, 300.0, 1200.0, 4000.0])
-"""At 25 C [s]; the first is the series resistance."""
+"""Time constants at 25 C [s]; the first is that of the series resistance."""
 ENERGY_J = np.array([10e3, 42e3, 48e3, 38e3, 30e3, 28e3, 26e3, 24e3])
-"""Activation energies of the resistances [J/mol]; time constants go with half of it."""
+"""Activation energies of the resistances [J/mol]; those of the time constants are half as large."""
 KINETIC = 2
-"""The process of 3 s: charge transfer."""
+"""Index of the process with kinetics: charge transfer, 3 s."""
 KINETIC_V = 0.051
-"""2 R T / F: where its resistance begins to fall [V]."""
+"""Overpotential 2 R T / F above which the kinetic resistance falls [V]."""
 COOLING_S = 900.0
-"""Time constant in which a cell gets warm [s]."""
+"""Thermal time constant of a cell [s]."""
 GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 TAPER_C = 0.05
 """Current at which a charger ends its charge [C]."""
 LOOPS_SOC, FAST_LOOP = (0.015, 0.15), 0.6
-"""Charge that leads halfway from one branch of the hysteresis to the other, fast and slow, and the share of the fast one:
-stop operators (Prandtl), which regeneration takes no further from the branch than its own charge does."""
+"""Charge constants of the fast and the slow hysteresis [SOC], and share of the fast one. Both are stop operators (Prandtl),
+so that regeneration moves the hysteresis only by its own charge."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """A cell. Arrays of shape (401,) are over ``GRID``."""
+    """True cell. Arrays of shape (401,) are over ``GRID``."""
 
     capacity_ah: float
     ocv_v: Floats
     per_kelvin_v: Floats
     hysteresis_v: Floats
-    """Half the difference between charge and discharge."""
+    """Half of the OCV after charge less the OCV after discharge [V]."""
     ohm: Floats
-    """At 25 C and small currents, shape (401, 8)."""
+    """Resistances at 25 C and small currents, shape (401, 8) [ohm]."""
 
 
 @njit
 def along(soc, values):
-    """Linear between the points of ``GRID``."""
+    """Interpolate linearly between the points of ``GRID``."""
     position = min(max(soc, 0.0), 1.0) * (len(values) - 1)
     i = min(int(position), len(values) - 2)
     return values[i] + (position - i) * (values[i + 1] - values[i])
@@ -80,7 +80,7 @@ def simulate(
     """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
     x, fast, slow, rise_k = np.zeros(len(TAU_S)), branch, branch, 0.0
-    stopped = 0.0  # sign of the current that was stopped
+    stopped = 0.0  # sign of the current that a limit has stopped
     for n in range(len(current_a)):
         i, celsius = current_a[n], room_c[n] + rise_k
         if i * stopped > 0.0:
@@ -116,7 +116,7 @@ def simulate(
 
 
 def impedance(truth: Truth, node: int, temperature_c: float, rad_s: Floats, current_a: float) -> Floats:
-    """Complex, at ``GRID[node]`` and each of ``rad_s`` [1/s], with the kinetics at ``current_a`` [ohm]."""
+    """Return the complex impedance at ``GRID[node]`` and ``rad_s`` [1/s], with the kinetics at ``current_a`` [ohm]."""
     cold = np.exp(ENERGY_J / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K))
     ohm = truth.ohm[node] * cold
     at = ohm[KINETIC] * current_a / KINETIC_V
@@ -125,18 +125,18 @@ def impedance(truth: Truth, node: int, temperature_c: float, rad_s: Floats, curr
 
 
 def rising(low: float, high: float) -> Floats:
-    """A factor over ``GRID`` that rises towards empty and full."""
+    """Return a factor over ``GRID`` that rises towards empty and full."""
     return 1.0 + low * np.exp(-GRID / 0.07) + high * np.exp((GRID - 1.0) / 0.05) + 0.15 * np.cos(5.0 * GRID)
 
 
 def resistances(milliohm: tuple[float, ...]) -> Floats:
-    """Shape (401, 8) [ohm], from those in the middle."""
+    """Return the resistances over SOC from those at mid SOC, shape (401, 8) [ohm]."""
     shapes = [rising(0.4, 0.0), rising(1.0, 0.3), rising(2.5, 0.8), rising(2.0, 0.5), *4 * [rising(3.0, 0.2)]]
     return 1e-3 * np.array(milliohm) * np.column_stack(shapes)
 
 
 def smooth(rng: np.random.Generator, length_soc: float) -> Floats:
-    """A normal process of variance 1 over ``GRID``, that forgets within ``length_soc``."""
+    """Return a normal process of variance 1 over ``GRID`` with the correlation length ``length_soc``."""
     k = np.pi * np.arange(0.0, 4.0 / length_soc / np.pi)
     part = np.exp(-0.25 * (k * length_soc) ** 2)
     cosines, sines = rng.standard_normal((2, k.size)) * part / np.sqrt(np.sum(part**2))

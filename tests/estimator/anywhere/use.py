@@ -1,4 +1,4 @@
-"""Currents of a cell in use for hours and days, at 1 Hz [A]."""
+"""Currents of a cell in use for hours and days, at 1 Hz."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ DAY_S = 86400
 
 
 def drive(rng: np.random.Generator, one_c: float, mean_c: float, seconds: int) -> Floats:
-    """Levels of some seconds, stops and some regeneration."""
+    """Return a current of levels of some seconds, stops and some regeneration [A]."""
     level = np.clip(rng.normal(mean_c, 0.9 * mean_c + 0.1, seconds), -0.5, 3.0)
     level[rng.random(seconds) < 0.15] = 0.0
     return one_c * np.repeat(level, rng.exponential(LEVEL_S, seconds).astype(int) + 2)[:seconds]
@@ -21,7 +21,7 @@ def charge(one_c: float, rate_c: float, soc: float) -> Floats:
 
 
 def cycles(rng: np.random.Generator, one_c: float, count: int, by_soc: float, rest_s: int) -> Floats:
-    """Drives by ``by_soc`` down and a charge up again at C/2, each followed by a rest."""
+    """Return currents of drives over ``by_soc`` and charges at C/2, each followed by a rest [A]."""
     parts = []
     for _ in range(count):
         down = drive(rng, one_c, 0.5, 20000)
@@ -31,7 +31,7 @@ def cycles(rng: np.random.Generator, one_c: float, count: int, by_soc: float, re
 
 
 def days(rng: np.random.Generator, one_c: float, count: int, soc: float) -> Floats:
-    """Two drives with a rest after each, then a charge where less than half is left, and a rest; over again."""
+    """Return currents of repeated days: two drives with rests, a charge if less than half is left, and a rest [A]."""
     parts = [np.zeros(0)]
     while sum(part.size for part in parts) < count * DAY_S:
         for _ in range(2):

@@ -1,4 +1,4 @@
-"""Chen & Mora's elements and the exact response of their cell."""
+"""Elements and exact response of Chen and Mora's cell model."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_capacitances_are_zero_at_their_delta() -> None:
 
 
 def test_simulated_cell_agrees_with_an_independent_integration() -> None:
-    """(2.1)-(2.4) by solve_ivp at tight tolerance, a load that changes every minute: at most 0.1 mV apart."""
+    """(2.1)-(2.4) by solve_ivp with a tight tolerance under a load that changes every minute differ by at most 0.1 mV."""
     time_s = np.arange(0.0, 3000.0, 1.0)
     levels = np.random.default_rng(3).uniform(0.0, 0.5, 50)
     current_a = levels[(time_s // 60).astype(int)]
@@ -60,12 +60,12 @@ def test_simulated_cell_agrees_with_an_independent_integration() -> None:
 
 
 @given(st.floats(1e-3, 1e3), st.floats(-5, 5), st.floats(-0.5, 0.5), st.floats(1e-3, 1.0), st.floats(0.1, 1e4))
-def test_two_steps_are_one_step_of_twice_the_length(dt: float, i: float, v: float, r: float, tau: float) -> None:
+def test_two_steps_equal_one_step_of_twice_the_length(dt: float, i: float, v: float, r: float, tau: float) -> None:
     twice = kernel.rc_step(kernel.rc_step(v, i, r, tau, dt), i, r, tau, dt)
     assert twice == pytest.approx(kernel.rc_step(v, i, r, tau, 2 * dt), abs=1e-12)
 
 
-def test_grid_stands_for_the_formula_to_a_microvolt() -> None:
+def test_grid_agrees_with_the_formula_to_a_microvolt() -> None:
     value, slope = ocv_grid(CHEN_MORA)
     for soc in np.random.default_rng(1).uniform(0, 1, 500):
         assert kernel.ocv(soc, value, slope) == pytest.approx(kernel.emf(soc, A), abs=1e-6)

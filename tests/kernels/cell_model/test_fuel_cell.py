@@ -1,4 +1,4 @@
-"""The fuel cell's physics: its limits, its exact step, its sensitivities, and that it is a model of the same shape."""
+"""Fuel cell model: physical limits, exact step, sensitivities, and interface of the learning law."""
 
 import inspect
 
@@ -17,9 +17,9 @@ from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")
 THETA = np.array([0.1, -0.05, 0.03, 0.2, 0.1, 0.05, 0.3, 0.0])
-"""Some parameters beside the file's."""
+"""Parameters that differ from the file's."""
 STEPS = ((3.0, 0.01), (3.0, 0.02), (6.0, 0.005), (9.0, 0.1), (12.0, 0.1), (0.5, 0.03), (0.0, 0.5))
-"""Currents [A], one beyond the limiting one, and for how long [s]."""
+"""Currents [A], one beyond the limiting current, and durations [s]."""
 currents = st.floats(0.0, 8.0)
 lengths = st.floats(1e-4, 10.0)
 
@@ -37,7 +37,7 @@ def settled(current_a: float, theta: np.ndarray = THETA) -> tuple[np.ndarray, np
 
 
 def voltages(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Voltage after each of ``STEPS`` and its derivatives."""
+    """Return the voltage after each of ``STEPS`` and its derivatives."""
     (x, dx), out, slopes = settled(0.0, theta), [], []
     for current_a, dt_s in STEPS:
         fuel_cell.advance(x, dx, theta, given_by_file(), current_a, dt_s)
@@ -64,7 +64,7 @@ def test_sensitivities_are_those_of_finite_differences(j: int) -> None:
 
 
 @given(currents, currents, lengths, lengths)
-def test_two_steps_under_one_current_are_one(
+def test_two_steps_under_one_current_equal_one_step(
     before_a: float, current_a: float, first_s: float, second_s: float
 ) -> None:
     (x, dx), (y, dy) = settled(before_a), settled(before_a)
@@ -92,7 +92,7 @@ def test_the_step_agrees_with_an_independent_integration() -> None:
 
 @pytest.mark.parametrize("current_a", [0.5, 2.0, 5.0])
 def test_a_small_step_settles_with_the_resistance_of_tafel_s_slope(current_a: float) -> None:
-    """Time constant C A / I: what impedance calls charge transfer resistance is A / I."""
+    """The time constant is C A / I, because the charge transfer resistance is A / I."""
     values = given_by_file()
     values[fuel_cell.B] = 1e-9  # without concentration loss
     reaction_a = current_a + values[fuel_cell.INTERNAL]
@@ -122,7 +122,7 @@ def test_a_settled_record_lies_on_the_polarisation_curve() -> None:
 
 
 @pytest.mark.parametrize("celsius", [20.0, 60.0])
-def test_losses_follow_the_temperature_as_mann_s_coefficients_do(celsius: float) -> None:
+def test_temperature_dependence_of_the_losses_agrees_with_mann(celsius: float) -> None:
     values, kelvin = np.zeros(8), 273.15 + celsius
     fuel_cell.load_file_constants(values, PEM.a, celsius)
     cells = mann_stack.CELLS
@@ -132,14 +132,14 @@ def test_losses_follow_the_temperature_as_mann_s_coefficients_do(celsius: float)
     assert values[fuel_cell.E] == pytest.approx(cells * mann_stack._nernst_v(kelvin), rel=1e-4)
 
 
-def test_charge_and_overload_leave_the_model_finite() -> None:
+def test_the_model_is_finite_under_charge_and_overload() -> None:
     for current_a in (-5.0, -1e-9, 0.0, 20.0):
         x, dx = settled(current_a)
         assert np.isfinite(x).all()
         assert np.isfinite(dx).all()
 
 
-def test_the_cell_and_the_fuel_cell_are_two_files_of_one_shape() -> None:
+def test_cell_and_fuel_cell_models_define_the_same_functions() -> None:
     for function in ("load_constants", "steady_state", "advance", "output", "write"):
         shapes = [
             tuple(inspect.signature(getattr(m, function).py_func).parameters)

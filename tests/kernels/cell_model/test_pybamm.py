@@ -1,4 +1,4 @@
-"""The simulated cell against PyBaMM's Thevenin model: equal elements, independent equations and solver."""
+"""Comparison of the simulated cell with PyBaMM's Thevenin model: equal elements, independent equations and solver."""
 
 import os
 from collections.abc import Callable
@@ -16,9 +16,9 @@ pybamm = pytest.importorskip("pybamm", reason="PyBaMM is not installed: it has n
 CELL = load_cell("chen_mora")
 START_SOC = 0.95
 LOAD = ((0.4, 60), (0.0, 60), (-0.25, 60), (0.0, 60), (0.4, 600), (0.0, 600), (0.15, 300))
-"""Current [A], discharge positive, and how long [s]: pulses and rests shorter and longer than the time constants."""
+"""Currents [A], positive on discharge, and durations [s]: pulses and rests shorter and longer than the time constants."""
 ROUNDS = 3
-"""Down to an SOC of 0.06, where every element bends."""
+"""Number of repetitions, which lead to an SOC of 0.06, where every element is nonlinear."""
 AT_MOST_V = 1e-4
 
 
@@ -30,7 +30,7 @@ def constant_elements() -> np.ndarray:
 
 
 def thevenin_voltages(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Terminal voltage [V] and SOC at each second by PyBaMM."""
+    """Return the terminal voltage [V] and SOC at each second by PyBaMM."""
 
     def over_soc(amplitude: float, exponent: float, offset: float) -> Callable[..., Any]:
         return lambda _temperature, _current, soc: amplitude * pybamm.exp(-exponent * soc) + offset
@@ -65,7 +65,7 @@ def thevenin_voltages(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         model, parameter_values=values, experiment=pybamm.Experiment(steps * ROUNDS), solver=solver
     )
     solved = simulation.solve(showprogress=False)
-    # A step's last value is the next one's first instant, still under the old current.
+    # the last value of a step is at the start of the next one, but under the previous current
     voltage_v = [cycle["Voltage [V]"].entries[:-1] for cycle in solved.cycles]
     soc = [cycle["SoC"].entries[:-1] for cycle in solved.cycles]
     return np.concatenate(voltage_v), np.concatenate(soc)
@@ -73,7 +73,7 @@ def thevenin_voltages(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("a", [CELL.a, constant_elements()], ids=["elements over SOC", "constant elements"])
 def test_simulated_cell_agrees_with_the_thevenin_model_of_pybamm(a: np.ndarray) -> None:
-    """At most 0.1 mV apart at every second of pulses and rests over most of the SOC range."""
+    """The voltages differ by at most 0.1 mV at every second of pulses and rests over most of the SOC range."""
     expected_v, expected_soc = thevenin_voltages(a)
     current_a = np.tile(np.concatenate([np.full(seconds, level) for level, seconds in LOAD]), ROUNDS)
     assert len(expected_v) == len(current_a)

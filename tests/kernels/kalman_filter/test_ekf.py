@@ -1,4 +1,4 @@
-"""The filter against its definition: Jacobians, a textbook update, mixtures, and hours of operation."""
+"""Kalman filter compared with its definition: Jacobians, update, mixtures, and hours of operation."""
 
 from itertools import pairwise
 
@@ -32,7 +32,7 @@ def settings(**changes):
 
 
 def somewhere(p, seed=1, time_s=1.0):
-    """A state in the middle of a drive: any mean, any covariance, a window of five samples."""
+    """Return a state in the middle of a drive with a random mean and covariance and a window of five samples."""
     rng = np.random.default_rng(seed)
     s = np.zeros(1, EKF_STATE)[0]
     hypotheses.initialize_filter(s, p, 0.55, 1.5, 12.0)
@@ -73,7 +73,7 @@ def test_h_is_the_derivative_of_the_voltage_by_every_state_but_the_soc() -> None
         assert h[j] == pytest.approx(by_difference, rel=1e-6, abs=1e-9), j
 
 
-def test_by_the_soc_it_is_the_secant_of_the_ocv_over_one_std_and_nothing_of_the_resistances() -> None:
+def test_h_by_the_soc_is_the_secant_of_the_ocv_over_one_std() -> None:
     p = settings(sensor_v2=0.0)
     s = somewhere(p)
     s["covariance"][0, SOC, SOC] = 0.1**2
@@ -84,7 +84,7 @@ def test_by_the_soc_it_is_the_secant_of_the_ocv_over_one_std_and_nothing_of_the_
     assert s["h"][SOC] == pytest.approx((above - below) / 0.2, rel=1e-3)
 
 
-def test_p_goes_by_the_derivative_of_the_mean() -> None:
+def test_p_is_propagated_by_the_derivative_of_the_mean() -> None:
     """F P F' of the kernel, P with Q less P = 0 with Q, against F by finite differences.
 
     How fast the error of the OCV changes is itself another at another SOC, which is no part of F: here it is not.
@@ -113,12 +113,12 @@ def test_p_goes_by_the_derivative_of_the_mean() -> None:
     expected, nodes = f @ covariance @ f.T, np.arange(NODE, STATES)
     assert by_kernel[nodes, nodes] == pytest.approx(
         expected[nodes, nodes], abs=1.0 / ekf_noise.AGED_SOC
-    )  # their Q is P's
+    )  # Q of these states depends on P
     by_kernel[nodes, nodes] = expected[nodes, nodes]
     assert by_kernel == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-def test_the_update_is_that_of_the_textbook() -> None:
+def test_the_update_equals_the_kalman_update() -> None:
     p = settings()
     s = somewhere(p)
     _, curved_v = linearised(s, p)
@@ -138,10 +138,10 @@ def test_the_update_is_that_of_the_textbook() -> None:
     ("name", "before", "std", "true_soc"),
     [*(("chen_mora", 0.045, 0.035, true) for true in (0.06, 0.08, 0.1, 0.13)), ("lfp", 0.037, 0.1, 0.21)],
 )
-def test_an_update_over_the_bend_near_empty_is_that_of_bayes(
+def test_an_update_over_the_knee_near_empty_agrees_with_bayes(
     name: str, before: float, std: float, true_soc: float
 ) -> None:
-    """SOC alone, against the posterior on a grid: the OCV is ten times as steep where the filter starts."""
+    """SOC alone, compared with the posterior on a grid. The OCV is ten times as steep at the initial SOC."""
     cell, noise_v = load_cell(name, None if name == "chen_mora" else 3.0), 0.03
     p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(), 1e-3, None)[0]
     s = np.zeros(1, EKF_STATE)[0]
@@ -167,7 +167,7 @@ def test_an_innovation_of_many_std_counts_as_one_of_two() -> None:
     for stds in (2.0, 8.0):
         s = somewhere(p)
         s["covariance"][0][SOC] = s["covariance"][0][:, SOC] = (
-            0.0  # by the SOC's own move it would be linear about another
+            0.0  # otherwise the update would be linearized about another SOC
         )
         _, curved_v = linearised(s, p)
         h, covariance, before = (np.array(x) for x in (s["h"], s["covariance"][0], s["mean"][0]))
@@ -179,7 +179,7 @@ def test_an_innovation_of_many_std_counts_as_one_of_two() -> None:
 
 
 def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
-    """Against the Lyapunov equation of the load and the branches that it drives."""
+    """The covariance is compared with the solution of the Lyapunov equation of load and RC pairs."""
     p = settings()
     s = np.zeros(1, EKF_STATE)[0]
     mean, covariance = s["mean"][0], s["covariance"][0]
@@ -198,7 +198,7 @@ def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
 
 @pytest.mark.parametrize(("first_c", "rms_c"), [(0.0, 0.3), (-0.2, 0.3), (1.0, 1.0), (2.5, 1.285), (-6.0, 1.285)])
 def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float) -> None:
-    """The model errs by the RMS of the load: of the sample's current no more than that of the load before switch-on."""
+    """The model's error follows the RMS of the load. The first sample increases it at most to the RMS before switch-on."""
     p = settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
@@ -208,8 +208,8 @@ def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float)
 
 
 @pytest.mark.parametrize("first_c", [1.5, 3.0, 6.0])
-def test_the_load_in_a_gap_after_a_peak_may_have_gone_on_or_ended(first_c: float) -> None:
-    """Beyond the usual RMS, 1.285 C, the load is unknown."""
+def test_the_load_in_a_gap_after_a_peak_may_have_continued_or_ended(first_c: float) -> None:
+    """The std is that of the long-term RMS load, 1.285 C."""
     p = settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
@@ -227,8 +227,8 @@ def test_outside_the_temperatures_of_the_cell_file_r_grows() -> None:
     assert variances == pytest.approx([1.0, 1.0, 4.0, 9.0])
 
 
-def test_above_the_temperatures_of_the_cell_file_nothing_is_surer() -> None:
-    """Resistances fall there, and relative errors would fall too."""
+def test_errors_do_not_decrease_above_the_temperatures_of_the_cell_file() -> None:
+    """Resistances decrease there, but errors of the model do not."""
     p = settings(low_c=0.0, high_c=30.0)
     s = somewhere(p)
     sizes = []
@@ -239,14 +239,14 @@ def test_above_the_temperatures_of_the_cell_file_nothing_is_surer() -> None:
     assert sizes[2] == pytest.approx(2.0**2 * np.array(sizes[0]), rel=0.01)
 
 
-def test_inflation_is_one_for_white_innovations_and_follows_those_that_stay() -> None:
+def test_inflation_is_one_for_white_innovations_and_grows_for_persistent_ones() -> None:
     s = np.zeros(1, EKF_STATE)[0]
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
     rng, slow = np.random.default_rng(3), []
     for u in rng.standard_normal(20_000):
         ekf.adapt_bias_inflation(s, 0, 1.0, u)
         slow.append(s["slow_inflation"][0])
-    assert np.mean(slow) == pytest.approx(1.3, abs=0.3)  # what is below 1 counts as 1
+    assert np.mean(slow) == pytest.approx(1.3, abs=0.3)  # ratios below 1 count as 1
     for _ in range(7200):
         ekf.adapt_bias_inflation(s, 0, 1.0, 0.2)
     assert s["slow_inflation"][0] > 30.0
@@ -254,7 +254,7 @@ def test_inflation_is_one_for_white_innovations_and_follows_those_that_stay() ->
 
 
 @pytest.mark.parametrize("dt_s", [1.0, 10.0, 60.0, 600.0])
-def test_inflation_of_white_innovations_is_small_however_far_samples_are_apart(dt_s: float) -> None:
+def test_inflation_of_white_innovations_is_small_for_any_sample_period(dt_s: float) -> None:
     s = np.zeros(1, EKF_STATE)[0]
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
     rng, both = np.random.default_rng(4), []
@@ -264,7 +264,7 @@ def test_inflation_of_white_innovations_is_small_however_far_samples_are_apart(d
     assert np.mean(both, axis=0) == pytest.approx([1.3, 1.3], abs=0.3)
 
 
-def test_one_innovation_after_a_gap_inflates_nothing(drive) -> None:
+def test_a_single_innovation_after_a_gap_causes_no_inflation(drive) -> None:
     estimator = start(drive)
     f = estimator.record[0]["filter"]
     estimator.run(drive.samples[:1800])
@@ -273,12 +273,12 @@ def test_one_innovation_after_a_gap_inflates_nothing(drive) -> None:
     before, seeded_s = [float(f[name][0]) for name in names], float(f["seeded_s"])
     estimator.run(drive.samples[1980:1981])
     assert [float(f[name][0]) for name in names] == before
-    assert f["seeded_s"] == seeded_s + 181.0  # the sample was taken in
+    assert f["seeded_s"] == seeded_s + 181.0  # the sample was processed
     assert estimator.state["gaps"][0] == 1
 
 
-def test_branches_in_a_gap_are_as_unsure_as_of_a_load_that_nobody_saw() -> None:
-    """Against a load with a level and a Gauss-Markov process, drawn 4000 times through three minutes."""
+def test_rc_pairs_after_a_gap_have_the_covariance_of_an_unknown_load() -> None:
+    """The covariance is compared with 4000 draws of a load with a level and a Gauss-Markov process over three minutes."""
     p, rng, load_a, t, gap_s = settings(), np.random.default_rng(6), 2.0, settings()["load_s"], 180
     level_a = load_a * rng.standard_normal(4000)
     process_a, x = load_a * rng.standard_normal(4000), np.zeros((BRANCHES, 4000))
@@ -293,7 +293,7 @@ def test_branches_in_a_gap_are_as_unsure_as_of_a_load_that_nobody_saw() -> None:
 
 
 @pytest.mark.parametrize("gap_s", [1.0, 6.0, 10.0, 30.0, 180.0, 3600.0])
-def test_what_a_gap_adds_is_a_covariance(gap_s: float) -> None:
+def test_the_noise_of_a_gap_is_a_covariance(gap_s: float) -> None:
     p, covariance, f = settings(), np.zeros((STATES, STATES)), np.ones(STATES)
     f[BRANCH] = np.exp(-gap_s / TAUS)
     ekf_noise.add_gap_noise(p, covariance, f, 2.0, gap_s / p["capacity_as"])
@@ -302,7 +302,7 @@ def test_what_a_gap_adds_is_a_covariance(gap_s: float) -> None:
 
 
 def mixture(mean, covariance, weight):
-    """Mean and covariance of a mixture of normal distributions, by its definition."""
+    """Return mean and covariance of a mixture of normal distributions by definition."""
     weight = weight / weight.sum()
     total = weight @ mean
     away = mean - total
@@ -334,7 +334,7 @@ def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
     assert hypotheses.weakest_cell_soc_std(s, p) == pytest.approx(np.sqrt(covariance[SOC, SOC] + spread**2))
 
 
-def test_two_that_become_one_keep_mean_and_covariance() -> None:
+def test_merging_preserves_mean_and_covariance() -> None:
     s, weight = several(settings(), 2)
     mean, covariance = mixture(s["mean"][:2], s["covariance"][:2], weight)
     merge_pair(s, 0, 1)
@@ -343,7 +343,7 @@ def test_two_that_become_one_keep_mean_and_covariance() -> None:
     assert np.exp(s["ln_weight"][0]) == pytest.approx(weight.sum())
 
 
-def test_what_is_unlikely_goes_and_what_agrees_becomes_one() -> None:
+def test_unlikely_hypotheses_are_removed_and_similar_ones_merged() -> None:
     s, _ = several(settings(), 4)
     s["covariance"][:4, SOC, SOC] = 0.02**2
     s["mean"][:4, SOC] = 0.3, 0.5, 0.505, 0.7
@@ -354,8 +354,8 @@ def test_what_is_unlikely_goes_and_what_agrees_becomes_one() -> None:
 
 
 @pytest.mark.parametrize("true", [0, 1])
-def test_a_hypothesis_that_holds_its_model_for_wrong_loses_against_one_that_does_not(true: int) -> None:
-    """Its biases have followed its observations, 0.2 V, so no innovation shows it."""
+def test_a_hypothesis_with_a_large_bias_loses_weight(true: int) -> None:
+    """Its biases of 0.2 V have absorbed the errors, so that its innovations are small."""
     p, apart = settings(), (0.4, 0.7)
     s, _ = several(p, 2)
     voltage_v = 0.0
@@ -384,7 +384,7 @@ def start(seen, wrong=0.2):
 
 
 @pytest.mark.parametrize("dt_s", [1.0, 10.0, 60.0])
-def test_calibration_takes_the_current_between_samples_as_the_filter_does(dt_s: float) -> None:
+def test_calibration_interpolates_the_current_as_the_filter_does(dt_s: float) -> None:
     current_a = np.repeat(np.random.default_rng(0).uniform(0.0, 3.0, 50), 4)
     samples = np.zeros(current_a.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"] = dt_s * np.arange(current_a.size), current_a
@@ -407,8 +407,8 @@ def fast():
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 1.0, 100.0, 1000.0])
-def test_the_covariance_stays_one_at_any_rate(drive, fast, rate_hz: float) -> None:
-    """Symmetric to the last bit, no variance below 0 beyond rounding, nothing infinite."""
+def test_the_covariance_stays_valid_at_any_rate(drive, fast, rate_hz: float) -> None:
+    """The covariance is exactly symmetric, has no variance below 0 beyond rounding, and is finite."""
     samples = {0.1: drive.samples[::10], 1.0: drive.samples, 100.0: fast.samples, 1000.0: fast.samples.copy()}[rate_hz]
     if rate_hz == 1000.0:
         samples["time_s"] = samples["time_s"][0] + np.arange(samples.size) / rate_hz
@@ -416,7 +416,7 @@ def test_the_covariance_stays_one_at_any_rate(drive, fast, rate_hz: float) -> No
 
 
 @pytest.mark.parametrize("gap_s", [2, 6, 12, 60])
-def test_the_covariance_stays_one_through_gaps(drive, gap_s: int) -> None:
+def test_the_covariance_stays_valid_through_gaps(drive, gap_s: int) -> None:
     parts = [part[: part.size - gap_s] for part in np.split(drive.samples[:3600], range(gap_s + 30, 3600, gap_s + 30))]
     stays_a_covariance(start(drive), parts)
 
@@ -440,8 +440,8 @@ def is_covariance(f) -> None:
         assert np.linalg.eigvalsh(covariance / scale[:, None] / scale).min() > -1e-9
 
 
-def test_a_hundred_samples_a_second_tell_the_same_as_one(fast) -> None:
-    """The mean of a second's samples is one update, for any number of samples."""
+def test_100_samples_a_second_give_the_result_of_one(fast) -> None:
+    """The mean of a second's samples is one update for any number of samples."""
     slow = fast.samples[::100]
     many, few = (start(fast).run(samples).copy() for samples in (fast.samples, slow))
     many = many[::100]
@@ -451,7 +451,7 @@ def test_a_hundred_samples_a_second_tell_the_same_as_one(fast) -> None:
     assert many["soc_std"][late] == pytest.approx(few["soc_std"][late], rel=0.1)
 
 
-def test_from_several_socs_to_one(drive) -> None:
+def test_hypotheses_converge_to_one(drive) -> None:
     estimator = start(drive)
     f = estimator.record[0]["filter"]
     estimator.run(drive.samples[:1])
@@ -464,8 +464,8 @@ def test_from_several_socs_to_one(drive) -> None:
     assert counts[-1] == 1
 
 
-def test_of_a_hypothesis_that_went_nothing_is_left(drive) -> None:
-    """Neither of those that others made superfluous nor, once the SOC is known, of all but one."""
+def test_rows_of_removed_hypotheses_are_zero(drive) -> None:
+    """Rows of merged and removed hypotheses are zero, and all rows but one after convergence."""
     estimator = start(drive)
     f = estimator.record[0]["filter"]
     rows = "mean", "covariance", "ln_weight", "minute_u", "ten_minutes_u", "fast_inflation", "slow_inflation"
@@ -482,7 +482,7 @@ def test_of_a_hypothesis_that_went_nothing_is_left(drive) -> None:
 
 
 @pytest.mark.parametrize("soc", [0.0, 0.5, 1.0])
-def test_an_soc_that_is_told_is_published(drive, soc: float) -> None:
+def test_an_soc_set_by_the_user_is_published(drive, soc: float) -> None:
     estimator = start(drive)
     estimator.run(drive.samples[:600])
     estimator.set_soc(soc)
@@ -492,8 +492,8 @@ def test_an_soc_that_is_told_is_published(drive, soc: float) -> None:
 
 
 @pytest.mark.parametrize("wrong", [-0.3, -0.1, 0.0, 0.1, 0.3])
-def test_an_soc_that_is_told_is_believed_until_the_voltage_shows_that_it_is_wrong(drive, wrong: float) -> None:
-    """After five minutes the truth is inside the band, and after twenty nearby."""
+def test_an_soc_set_by_the_user_is_corrected_if_the_voltage_contradicts(drive, wrong: float) -> None:
+    """After 5 min the true SOC is inside the interval, and after 20 min the estimate is near it."""
     estimator = start(drive)
     estimator.run(drive.samples[:600])
     estimator.set_soc(float(drive.soc[600]) + wrong)
@@ -503,8 +503,9 @@ def test_an_soc_that_is_told_is_believed_until_the_voltage_shows_that_it_is_wron
     assert error[1200:].max() < 0.01
 
 
-def test_an_soc_that_was_known_and_is_wrong_by_far_is_given_up(drive) -> None:
-    """0.3 too low, known to 0.01: within ten minutes the truth is inside the band, and after twenty nearby."""
+def test_a_certain_but_wrong_soc_is_reinitialized(drive) -> None:
+    """The SOC is 0.3 too low with a std of 0.01. Within 10 min the true SOC is inside the interval, and after 20 min
+    the estimate is near it."""
     estimator = start(drive)
     estimator.run(drive.samples[:600])
     hypotheses.spawn_hypotheses(
@@ -517,7 +518,7 @@ def test_an_soc_that_was_known_and_is_wrong_by_far_is_given_up(drive) -> None:
     assert error[1200:].max() < 0.04
 
 
-def test_a_temperature_that_is_lost_is_that_of_the_next_sample(drive) -> None:
+def test_a_non_finite_temperature_is_replaced_by_the_next_sample(drive) -> None:
     estimator, samples = start(drive), drive.samples[:700].copy()
     samples["temperature_c"] = 8.0
     estimator.run(samples[:600])
@@ -528,7 +529,7 @@ def test_a_temperature_that_is_lost_is_that_of_the_next_sample(drive) -> None:
     assert f["temperature_c"] == 8.0
 
 
-def test_a_sensor_that_says_85_degrees_now_and_then_is_not_followed(drive) -> None:
+def test_single_temperatures_of_85_degrees_are_limited(drive) -> None:
     estimator, samples = start(drive), drive.samples[:1200].copy()
     samples["temperature_c"] = 25.0
     samples["temperature_c"][[0, 1]] = samples["temperature_c"][600:630] = 85.0
@@ -541,8 +542,8 @@ def test_a_sensor_that_says_85_degrees_now_and_then_is_not_followed(drive) -> No
 
 
 @pytest.mark.parametrize("unseen_s", [7200.0, np.inf])
-def test_after_a_restart_the_cell_is_as_cold_as_its_sensor_says_at_once(drive, unseen_s: float) -> None:
-    """The errors of the hypotheses are those of the cold cell, not of the warm cell before."""
+def test_the_measured_temperature_is_used_at_once_after_a_restart(drive, unseen_s: float) -> None:
+    """The errors of the hypotheses are those of the cold cell, not of the warm cell before the restart."""
     bias_v = []
     for before_c in (25.0, -15.0):
         estimator, samples = start(drive), drive.samples[:602].copy()
@@ -557,7 +558,7 @@ def test_after_a_restart_the_cell_is_as_cold_as_its_sensor_says_at_once(drive, u
 
 
 @pytest.mark.parametrize("field", ["mean", "covariance", "ln_weight"])
-def test_what_is_not_finite_is_forgotten_and_counted(drive, field: str) -> None:
+def test_non_finite_values_are_reset_and_counted(drive, field: str) -> None:
     estimator = start(drive)
     estimator.run(drive.samples[:1800])
     before = estimator.state["soc"][0]
@@ -571,7 +572,7 @@ def test_what_is_not_finite_is_forgotten_and_counted(drive, field: str) -> None:
 
 
 @pytest.mark.parametrize(("soc", "held"), [(1.02, True), (-0.02, True), (0.6, False)])
-def test_a_limited_soc_teaches_neither_sensor_nor_capacity_nor_curve(soc: float, held: bool) -> None:
+def test_a_limited_soc_does_not_update_offset_capacity_and_curve(soc: float, held: bool) -> None:
     p = settings()
     s = somewhere(p)
     s["mean"][0, SOC] = soc
@@ -587,7 +588,7 @@ def test_a_limited_soc_teaches_neither_sensor_nor_capacity_nor_curve(soc: float,
 @pytest.mark.parametrize(
     ("trend_c", "r_std", "held"), [(0.9, 0.7, True), (-0.9, 0.7, True), (0.1, 0.7, False), (0.9, 0.1, False)]
 )
-def test_a_constant_current_teaches_no_capacity_where_resistances_are_hardly_known(
+def test_a_constant_current_does_not_update_the_capacity_with_uncertain_resistances(
     trend_c: float, r_std: float, held: bool
 ) -> None:
     p = settings(r_std=r_std)

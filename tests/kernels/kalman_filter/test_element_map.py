@@ -1,4 +1,4 @@
-"""The map returns the functions it was filled from, and nothing for unvisited SOC."""
+"""Fits to the map return the functions that it was filled from, and no information for unvisited SOC."""
 
 import math
 
@@ -39,7 +39,7 @@ def fitted(table: np.ndarray, prior: np.ndarray) -> np.void:
     return fit[0]
 
 
-def test_map_of_the_whole_range_gives_the_elements_back() -> None:
+def test_a_map_of_the_whole_range_gives_the_true_elements() -> None:
     fit = fitted(filled(0.02, 1.0, 0.01), TRUTH * 1.5)
     for e, function in enumerate(FUNCTIONS):
         assert fit["bins"][e] == 25
@@ -53,30 +53,30 @@ def test_true_offsets_lie_within_three_standard_errors() -> None:
         assert abs(fit["a"][i] - TRUTH[i]) < 3 * fit["std"][i] < 0.2 * TRUTH[i]
 
 
-def test_empty_map_leaves_the_configured_values_and_says_nothing_of_their_error() -> None:
+def test_an_empty_map_gives_the_configured_values_without_std() -> None:
     fit = fitted(np.zeros(1, dtype=ELEMENT_MAP), TRUTH)
     assert list(fit["bins"]) == [0] * ELEMENTS
     assert fit["a"][1:] == pytest.approx(TRUTH[1:16])
     assert np.isnan(fit["std"][1:]).all()
 
 
-def test_exponents_are_uncertain_when_only_high_soc_was_seen() -> None:
+def test_exponents_are_uncertain_with_data_at_high_soc_only() -> None:
     narrow, wide = fitted(filled(0.6, 1.0), TRUTH), fitted(filled(0.02, 1.0), TRUTH)
     assert narrow["std"][2] > 3 * wide["std"][2]
 
 
 @pytest.mark.parametrize(("exponent", "end"), [(1e4, EXPONENT_MAX), (1e-3, EXPONENT_MIN)])
-def test_an_exponent_beyond_the_searched_range_is_taken_at_its_end(exponent: float, end: float) -> None:
+def test_an_exponent_beyond_the_searched_range_is_limited(exponent: float, end: float) -> None:
     prior = TRUTH.copy()
     prior[[2, 5, 8, 11, 14]] = exponent
-    fit = fitted(filled(0.6, 0.61), prior)  # nothing seen where the exponent shows: the configured one draws
+    fit = fitted(filled(0.6, 0.61), prior)  # no data determine the exponent: the fit tends to the configured one
     found = fit["a"][[2, 5, 8, 11, 14]]
     assert (found >= EXPONENT_MIN).all()
     assert (found <= EXPONENT_MAX).all()
     assert np.abs(np.log(found / end)).min() < 0.05
 
 
-def test_a_singular_fit_says_nothing_of_its_error() -> None:
+def test_a_singular_fit_has_no_standard_errors() -> None:
     table = np.zeros(1, dtype=ELEMENT_MAP)
     add_observation(table[0], 0, 0.5, -3.0, 0.1**2, 10.0)
     table["moment"][0, 0, 12] = math.nan
@@ -84,17 +84,17 @@ def test_a_singular_fit_says_nothing_of_its_error() -> None:
     assert np.isnan(fit["std"][1:4]).all()
 
 
-def test_a_fit_takes_no_memory() -> None:
+def test_a_fit_allocates_no_memory() -> None:
     table, fit = filled(0.02, 1.0), np.zeros(1, dtype=ELEMENT_FIT)
     fit_element(table[0], 0, TRUTH, fit[0])
     _nrt_python.memsys_enable_stats()
     before = rtsys.get_allocation_stats().alloc
     for _ in range(100):
         fit_element(table[0], 0, TRUTH, fit[0])
-    assert rtsys.get_allocation_stats().alloc - before <= 100  # one a call, to hand the prior over from Python
+    assert rtsys.get_allocation_stats().alloc - before <= 100  # one for each call, for passing the prior from Python
 
 
-def test_a_value_that_is_not_known_adds_nothing() -> None:
+def test_an_uncertain_value_is_not_added() -> None:
     table = np.zeros(1, dtype=ELEMENT_MAP)
     add_observation(table[0], 0, 0.5, -3.0, 0.5**2, 10.0)
     add_observation(table[0], 0, 0.5, -3.0, math.nan, 10.0)

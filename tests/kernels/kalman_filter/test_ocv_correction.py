@@ -1,4 +1,4 @@
-"""The error of the OCV as states along SOC."""
+"""Correction of the OCV by states along SOC."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from tests.estimator.anywhere.truth import simulate
 GENERIC = load_cell("nmc", 3.0)
 
 
-def test_the_first_variance_is_the_curve_s_at_nodes_and_between() -> None:
+def test_the_initial_variance_equals_that_of_the_curve_at_and_between_nodes() -> None:
     p = Estimator(GENERIC).settings_record[0]["filter"]
     x, covariance = np.ones(STATES), np.ones((STATES, STATES))
     reset_ocv_correction(x, covariance)
@@ -33,7 +33,7 @@ def test_the_first_variance_is_the_curve_s_at_nodes_and_between() -> None:
         assert np.isclose(row @ covariance @ row, p["learned"] * error_v**2, rtol=1e-12)
 
 
-def test_it_is_that_of_the_nodes_in_units_of_the_error() -> None:
+def test_the_correction_is_interpolated_in_units_of_the_error() -> None:
     p = Estimator(GENERIC).settings_record[0]["filter"]
     x = np.zeros(STATES)
     x[NODE:] = np.arange(NODES)
@@ -44,8 +44,8 @@ def test_it_is_that_of_the_nodes_in_units_of_the_error() -> None:
     assert ocv_correction(p, x, 1.1) == ocv_correction(p, x, 1.0)
 
 
-def test_a_curve_with_a_plateau_is_left_as_it_is() -> None:
-    """There a voltage determines neither SOC nor curve: nothing is learned, and the error stays that of the file."""
+def test_a_curve_with_a_plateau_is_not_learned() -> None:
+    """On a plateau a voltage determines neither SOC nor curve, so that the error stays that of the file."""
     estimator = Estimator(load_cell("lfp", 2.0), initial_soc=0.5)
     for i in range(1200):
         estimator.step(float(i), 1.0, 3.25)
@@ -58,7 +58,8 @@ def test_a_curve_with_a_plateau_is_left_as_it_is() -> None:
 
 
 def partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, np.ndarray, Estimator]:
-    """Error of the SOC and its std over drives between about 0.85 and 0.3, charged between, rests after both."""
+    """Return the error of the SOC and its std over drives between about 0.85 and 0.3 with charges and rests between
+    them."""
     pieces, soc = [], 0.85
     for n in range(cycles):
         drive = load_a(Case("", seed=n), 3600)
@@ -75,8 +76,8 @@ def partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, np.ndarray
     return trace["soc"] - true, trace["soc_std"].copy(), estimator
 
 
-def test_the_same_curve_met_again_and_again_makes_no_certainty() -> None:
-    """A cell file with its stated error, over six cycles: the interval contains the truth to the end."""
+def test_repeated_cycles_do_not_make_the_soc_overconfident() -> None:
+    """The cell file has its declared error. The interval contains the true SOC over six cycles."""
     errors = []
     for seed in (51, 54, 57):
         error, std, _ = partial_cycles(cell_file(Case("", seed=seed, capacity=1.03)), 6)
@@ -87,7 +88,8 @@ def test_the_same_curve_met_again_and_again_makes_no_certainty() -> None:
 
 
 def test_a_generic_curve_is_learned_as_far_as_the_soc_is_known() -> None:
-    """Between 0.35 and 0.85 no voltage determines the SOC on a wrong curve: neither becomes certain."""
+    """On a wrong curve between 0.35 and 0.85 no voltage determines the SOC, so that neither SOC nor curve becomes
+    certain."""
     error, std, estimator = partial_cycles(GENERIC, 6)
     assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95
     soc = np.linspace(0.4, 0.8, 9)

@@ -1,4 +1,4 @@
-"""The learning law's parts: exact steps and sensitivities of the model, the balance of memory and leakage."""
+"""Parts of the learning law: exact steps and sensitivities of the model, balance of information and leakage."""
 
 import numpy as np
 import pytest
@@ -14,12 +14,12 @@ A = load_cell("chen_mora").a[:16]
 COUNT = len(chen_mora_sensitivity.NAMES)
 GIVEN = np.array([0.075, 0.047, 33.0, 0.05, 223.0, 3.8, 0.0, 0.0])
 LOAD = [(0.3, 1.0), (-0.2, 40.0), (0.0, 300.0), (0.5, 0.01), (0.1, 90.0)]
-"""Current [A] and for how long [s]."""
+"""Currents [A] and durations [s]."""
 thetas = st.lists(st.floats(-1.2, 1.2), min_size=COUNT, max_size=COUNT)
 
 
 def after(theta: np.ndarray, load: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """States, their derivatives, psi and y^ [V] after a load that began at rest."""
+    """Return states, derivatives, psi and y^ [V] after a load that starts at rest."""
     x, dx, psi = np.zeros(2), np.zeros((2, LEARNABLE)), np.zeros(LEARNABLE)
     for current_a, dt_s in load:
         chen_mora_sensitivity.advance(x, dx, theta, GIVEN, current_a, dt_s)
@@ -39,7 +39,7 @@ def test_sensitivities_are_the_derivatives_of_states_and_output(theta: list[floa
 
 
 @given(thetas, st.floats(1e-3, 1e4), st.integers(2, 50))
-def test_a_long_step_is_many_short_ones(theta: list[float], dt_s: float, parts: int) -> None:
+def test_a_long_step_equals_many_short_ones(theta: list[float], dt_s: float, parts: int) -> None:
     at = np.array(theta + [0.0] * (LEARNABLE - COUNT))
     whole = after(at, [(0.2, 30.0), (-0.1, dt_s)])
     split = after(at, [(0.2, 30.0), *[(-0.1, dt_s / parts)] * parts])
@@ -48,7 +48,7 @@ def test_a_long_step_is_many_short_ones(theta: list[float], dt_s: float, parts: 
 
 
 @given(thetas, st.floats(0.05, 1.0))
-def test_what_is_written_has_the_elements_that_theta_stands_for(theta: list[float], soc: float) -> None:
+def test_written_parameters_have_the_elements_of_theta(theta: list[float], soc: float) -> None:
     a = np.zeros(16)
     chen_mora_sensitivity.write(np.array(theta), A, a)
     ratio = np.exp(theta)
@@ -59,11 +59,11 @@ def test_what_is_written_has_the_elements_that_theta_stands_for(theta: list[floa
 
 
 @given(st.integers(0, 1000))
-def test_the_step_leads_where_memory_and_leakage_balance(seed: int) -> None:
+def test_the_step_solves_for_the_balance_of_information_and_leakage(seed: int) -> None:
     rng = np.random.default_rng(seed)
     state, settings = np.zeros(1, LEARNING_STATE), np.zeros(1, LEARNING_SETTINGS)
     m, q = state[0], settings[0]
-    psi = rng.normal(size=(3, COUNT))  # fewer than there are parameters: the leakage decides the rest
+    psi = rng.normal(size=(3, COUNT))  # fewer rows than parameters: the leakage determines the others
     q["count"], q["leak_v2s"][:COUNT], q["middle"][:COUNT] = COUNT, 1e-3, rng.normal(size=COUNT)
     m["information"][:COUNT, :COUNT] = np.tril(psi.T @ psi)
     m["pull"][:COUNT], m["theta"][:COUNT] = psi.T @ rng.normal(size=3), rng.normal(size=COUNT)
@@ -73,7 +73,7 @@ def test_the_step_leads_where_memory_and_leakage_balance(seed: int) -> None:
     assert m["theta"][:COUNT] + m["step"][:COUNT] == pytest.approx(balance, rel=1e-6, abs=1e-6)
 
 
-def test_where_rounding_has_left_no_positive_matrix_theta_stays() -> None:
+def test_theta_is_unchanged_if_the_matrix_is_not_positive_definite() -> None:
     state, settings = np.zeros(1, LEARNING_STATE), np.zeros(1, LEARNING_SETTINGS)
     settings["count"], settings["leak_v2s"] = COUNT, 1e-6
     state["information"][0, 2, 2] = -1.0

@@ -1,4 +1,4 @@
-"""E_a(-r^a) against its series in many digits."""
+"""Comparison of E_a(-r^a) with its series in many digits."""
 
 import math
 
@@ -10,7 +10,7 @@ from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_le
 
 
 def exact(alpha: float, r: float) -> float:
-    """The series (3.11) at z = -r^alpha with enough digits to survive its cancellation."""
+    """Return the series (3.11) at z = -r^alpha with enough digits for its cancellation."""
     with mpmath.workdps(60 + int(r)):
         a, z = mpmath.mpf(alpha), -(mpmath.mpf(r) ** mpmath.mpf(alpha))
         return float(sum(z**k / mpmath.gamma(a * k + 1) for k in range(40 + int(3 * r))))
@@ -29,12 +29,12 @@ def test_value_at_zero_is_one() -> None:
 
 
 @pytest.mark.parametrize("alpha", [2.0, 3.01, 0.5, math.nan])
-def test_alpha_without_nussbaum_property_is_refused(alpha: float) -> None:
+def test_alpha_without_nussbaum_property_is_rejected(alpha: float) -> None:
     with pytest.raises(ValueError, match=r"must be in \(2, 3\]"):
         decay_table(alpha)
 
 
-def test_running_mean_swings_both_ways() -> None:
+def test_the_running_mean_is_unbounded_in_both_directions() -> None:
     """Definition 2.2.2.1: the mean of N over 0..k is unbounded above and below; its swings grow."""
     series, (value, slope) = series_coefficients(2.5), decay_table(2.5)
     k = np.linspace(0.0, 40.0, 40_001)

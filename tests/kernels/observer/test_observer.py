@@ -1,4 +1,4 @@
-"""The observer's promises: exact steps, the Lemma's limit, tracking, lock."""
+"""Observer: exact steps, limit of Lemma 4.1.3, tracking, and lock."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def discharge(cell: CellModel, hours: float, rate_hz: float, current_a: float) -
 
 
 @given(st.floats(0.0, 50.0), st.floats(-1.0, 1.0), st.floats(0.05, 1e3), st.floats(0.05, 1e4), st.floats(1e-4, 3600.0))
-def test_states_step_is_the_matrix_exponential(
+def test_states_step_equals_the_matrix_exponential(
     gain: float, drop_v: float, tau_ts: float, tau_tl: float, dt_s: float
 ) -> None:
     state = np.zeros(1, dtype=OBSERVER_STATE)
@@ -47,7 +47,7 @@ def test_states_step_is_the_matrix_exponential(
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 1.0, 10.0, 100.0])
-def test_parameters_go_to_the_limit_of_lemma_4_1_3_at_every_sample_rate(rate_hz: float) -> None:
+def test_parameters_converge_to_the_limit_of_lemma_4_1_3_at_every_sample_rate(rate_hz: float) -> None:
     """Explicit Euler diverges here at 10 Hz and below: rates are 100 to 130 per second."""
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, initial_soc=1.0, identifier=None)
@@ -63,7 +63,7 @@ def test_limits_are_those_of_table_5() -> None:
 
 
 def test_runtime_error_falls_below_ten_microvolts_within_seconds() -> None:
-    """The valid part of Theorem 4.1.2 (E3): the output is tracked."""
+    """The valid part of Theorem 4.1.2 (erratum 3) states that the output is tracked."""
     cell = load_cell("chen_mora")
     trace = Estimator(cell, PRINTED_LAW, initial_soc=1.0, identifier=None).run(discharge(cell, 0.2, 100.0, 1e-4))
     settled = trace["time_s"] > 20.0
@@ -118,8 +118,8 @@ def test_without_dead_zone_lock_is_lost_reported_and_regained() -> None:
     assert np.isfinite(trace["voltage_estimate_v"]).all()
 
 
-def test_gain_is_rearmed_before_its_sign_turns() -> None:
-    """Load steps raise k as well; a service that runs for months must not lose lock over them."""
+def test_gain_is_rearmed_before_its_sign_changes() -> None:
+    """Load steps also increase k. A service that runs for months must not lose lock because of them."""
     cell = load_cell("chen_mora")
     time_s = np.arange(0.0, 40_000.0, 1.0)
     current_a = np.where(time_s // 20 % 2 == 0, 0.5, -0.5)
@@ -131,8 +131,8 @@ def test_gain_is_rearmed_before_its_sign_turns() -> None:
     assert trace["lock"].all()
 
 
-def test_a_gain_of_the_wrong_sign_turns_and_the_error_comes_back() -> None:
-    """N(k0) < 0 is what a wrong sign of b amounts to: the error grows until k has carried N to the other sign."""
+def test_a_gain_of_the_wrong_sign_changes_and_the_error_decays() -> None:
+    """N(k0) < 0 is equivalent to a wrong sign of b: the error grows until N(k) has changed its sign."""
     cell = load_cell("chen_mora")
     time_s = np.arange(0.0, 4_000.0, 1.0)
     current_a = np.full(time_s.size, 0.1)
@@ -149,7 +149,7 @@ def test_a_gain_of_the_wrong_sign_turns_and_the_error_comes_back() -> None:
 
 
 @pytest.mark.parametrize("nussbaum", ["k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"])
-def test_a_gain_that_begins_at_zero_is_left_to_rise(nussbaum: str) -> None:
+def test_a_gain_that_starts_at_zero_is_not_rearmed(nussbaum: str) -> None:
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, ObserverSettings(nussbaum=nussbaum), initial_soc=0.9, identifier=None)
     estimator.run(discharge(cell, 0.1, 10.0, 0.275))
@@ -158,7 +158,7 @@ def test_a_gain_that_begins_at_zero_is_left_to_rise(nussbaum: str) -> None:
 
 
 def test_a_capacitance_is_never_evaluated_where_it_is_negative() -> None:
-    """A limit that moves delta1 above the SOC within one sample: the margins move first, then the states."""
+    """A limit moves delta1 above the SOC within one sample. The margins are updated before the states."""
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, initial_soc=0.5, identifier=None)
     samples = discharge(cell, 0.02, 1.0, 0.0)
@@ -170,11 +170,11 @@ def test_a_capacitance_is_never_evaluated_where_it_is_negative() -> None:
     assert np.isfinite(trace["voltage_estimate_v"]).all()
 
 
-def test_adaptation_stops_above_the_margin_and_says_so() -> None:
+def test_adaptation_stops_above_the_margin_and_is_reported() -> None:
     cell = load_cell("chen_mora")
     trace = Estimator(cell, initial_soc=1.0, identifier=None)
     samples = discharge(cell, 0.95, 1.0, 0.275)
-    samples["current_a"] *= 1.2  # the count runs empty before the cell does
+    samples["current_a"] *= 1.2  # coulomb counting reaches empty before the cell does
     rows = trace.run(samples)
     assert rows["soc"][-1] < max(rows["delta_1"][-1], rows["delta_2"][-1])
     assert rows["stability_margin"][-1] < 0
