@@ -12,7 +12,7 @@ from bms_estimator.settings.polled_source import PolledSource, with_profile
 MAX_ID, MAX_EXTENDED_ID = 0x7FF, 0x1FFF_FFFF
 """Largest identifiers of eleven and of 29 bits."""
 FRAME_BITS = 512
-"""Bits of the longest CAN FD frame."""
+"""Length of the longest CAN FD frame [bits]."""
 PROFILES: dict[str, dict[str, object]] = {
     # Frame 0x356 of the battery-to-inverter protocol of Pylontech's low voltage packs, as BMS, inverters and diyBMS
     # (pylon_canbus.cpp) speak it: three int16, little endian, in 10 mV, 0.1 A and 0.1 degC; 500 kbit/s.
@@ -23,32 +23,30 @@ PROFILES: dict[str, dict[str, object]] = {
         "temperature": {"id": 0x356, "start_bit": 32, "bits": 16, "signed": True, "scale": 0.1},
     },
 }
-"""Buses with known signals, by name: defaults of ``[source]``. All of them count charge as positive."""
+"""Defaults of ``[source]`` for buses with known signals, by name. All of them report charge as positive."""
 
 
 class Signal(Strict):
-    """One value on the bus: by its name in the DBC file, or by where it lies in a frame."""
+    """Value on the bus, given by its name in the DBC file or by its position in a frame."""
 
     signal: Annotated[str, Field(min_length=1)] | None = Field(
-        default=None, description="name in the DBC file: Signal, or Message.Signal where several have it"
+        default=None, description="name in the DBC file: Signal, or Message.Signal if several messages have it"
     )
     id: Annotated[int, Field(ge=0, le=MAX_EXTENDED_ID)] | None = Field(
         default=None, description="identifier of the frame, such as 0x356"
     )
     extended: bool = Field(default=False, description="the identifier has 29 bits")
     start_bit: Annotated[int, Field(ge=0, lt=FRAME_BITS)] = Field(
-        default=0, description="first bit as a DBC file counts: of a big endian value the highest one"
+        default=0, description="first bit, counted as in a DBC file: the highest bit of a big endian value"
     )
     bits: Annotated[int, Field(ge=1, le=64)] = Field(default=16, description="length")
     byte_order: Literal["little", "big"] = "little"
     signed: bool = False
     scale: float = Field(
-        default=1.0, description="from what is read, or what the DBC file makes of it, to V, A or degC"
+        default=1.0, description="factor from the raw value, or the value by the DBC file, to V, A or degC"
     )
-    offset: float = Field(default=0.0, description="added after the scale")
-    absent: int | None = Field(
-        default=None, description="what stands where nothing is measured, before the scale, such as 0x7FFF"
-    )
+    offset: float = Field(default=0.0, description="offset added after scale")
+    absent: int | None = Field(default=None, description="raw value that means not measured, such as 0x7FFF")
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -65,21 +63,21 @@ class CellSignals(Signal):
     """Cell voltages: consecutive in a frame, or in numbered signals."""
 
     count: Annotated[int, Field(ge=1, le=96)] = Field(
-        default=1, description="so many of the same length follow each other; or numbers from first for {} in signal"
+        default=1, description="number of consecutive values of equal length, or of numbers from first for {} in signal"
     )
-    first: Annotated[int, Field(ge=0)] = Field(default=1, description="number of the first of them in signal")
+    first: Annotated[int, Field(ge=0)] = Field(default=1, description="number of the first cell in signal")
 
     @model_validator(mode="after")
     def _counted(self) -> Self:
         if self.signal is not None and self.count > 1 and "{}" not in self.signal:
-            raise ValueError("signal: of several cells it holds {}, which stands for their number")
+            raise ValueError("signal: must contain {} for the number of the cell if count is above 1")
         whole_bytes = self.start_bit % 8 == 7 and self.bits % 8 == 0
         if self.signal is None and self.count > 1 and self.byte_order == "big" and not whole_bytes:
-            raise ValueError("count: big endian values that follow each other are whole bytes; give each by itself")
+            raise ValueError("count: consecutive big endian values must be whole bytes; give each cell separately")
         return self
 
     def members(self) -> tuple[Signal, ...]:
-        """One signal for each cell."""
+        """Return one signal for each cell."""
         one = Signal(**self.model_dump(exclude={"count", "first"}))
         if self.signal is not None:
             names = [self.signal.replace("{}", str(self.first + number)) for number in range(self.count)]
@@ -92,7 +90,7 @@ class CanSource(PolledSource):
     """CAN bus, receive only."""
 
     kind: Literal["can"]
-    profile: str | None = Field(default=None, description=f"a bus whose signals are known: {', '.join(PROFILES)}")
+    profile: str | None = Field(default=None, description=f"bus with known signals: {', '.join(PROFILES)}")
     interface: Annotated[str, Field(min_length=1)] = Field(
         default="socketcan", description="interface of python-can: socketcan, slcan, pcan, gs_usb, ..."
     )
@@ -114,7 +112,7 @@ class CanSource(PolledSource):
     )
     current: Signal = Field(description="as voltage; sensor.current_sign gives the sign")
     temperature: Signal | None = Field(default=None, description="as voltage")
-    cells: tuple[CellSignals, ...] = Field(default=(), description="list of such signals, each with its count")
+    cells: tuple[CellSignals, ...] = Field(default=(), description="list of signals of cells, each with its count")
 
     @model_validator(mode="before")
     @classmethod
@@ -125,9 +123,9 @@ class CanSource(PolledSource):
     def _named_in_a_file(self) -> Self:
         signals = [self.voltage, self.current, *self.cells, *([self.temperature] if self.temperature else [])]
         if self.dbc is None and any(signal.signal is not None for signal in signals):
-            raise ValueError("dbc: missing, and signals are named that only a DBC file knows")
+            raise ValueError("dbc: missing, but required for signals by name")
         if sum(cells.count for cells in self.cells) > 96:
-            raise ValueError("cells: at most 96 of them")
+            raise ValueError("cells: at most 96")
         return self
 
     @property
@@ -142,7 +140,7 @@ class CanSource(PolledSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The sign of a known bus, and the steps of signals defined by hand."""
+        """Return the ``[sensor]`` defaults: sign of a known bus, and resolution of signals without a DBC file."""
         sign = {"current_sign": "charge_positive"} if self.profile else {}
         volts = {} if self.voltage.signal else {"voltage_resolution_v": abs(self.voltage.scale)}
         amperes = {} if self.current.signal else {"current_resolution_a": abs(self.current.scale)}

@@ -1,4 +1,4 @@
-"""The live view on a real pseudo-terminal: its content by size, and that nothing waits for it."""
+"""Live view on a real pseudo-terminal: content by screen size, without blocking the service."""
 
 import re
 import signal
@@ -20,16 +20,14 @@ def demo() -> Iterator[PseudoTerminal]:
 
 
 @pytest.mark.parametrize(("columns", "rows"), SIZES, ids=str)
-def test_soc_band_voltage_current_and_health_are_on_a_screen_of_any_size(
-    demo: PseudoTerminal, columns: int, rows: int
-) -> None:
+def test_main_values_are_shown_on_any_screen_size(demo: PseudoTerminal, columns: int, rows: int) -> None:
     demo.resize(columns, rows)
     demo.until(lambda: len(demo.screen()) == rows and max(map(len, demo.screen())) == columns)
     demo.until(lambda: all(re.search(what, "\n".join(demo.screen())) for what in NEVER_CUT))
     demo.until(lambda: "true " in "".join(demo.screen()))
 
 
-def test_a_demo_that_is_interrupted_says_what_came_of_it_and_leaves_the_terminal_as_it_was() -> None:
+def test_interrupted_demo_prints_a_summary_and_restores_the_terminal() -> None:
     with PseudoTerminal("demo", "--port", str(free_port())) as terminal:
         terminal.until(lambda: "true " in "".join(terminal.screen()))
         terminal.process.send_signal(signal.SIGINT)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.live.key_presses import meanings
+from bms_estimator.cli.live.key_presses import actions
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.command_line import PROGRAM, run
@@ -97,5 +97,5 @@ def test_what_cannot_be_watched_is_said(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_keys_are_known_in_both_modes_of_a_terminal_and_others_mean_nothing() -> None:
-    assert list(meanings(b"\t\x1b[B\x1bOB\x1b[Z\x1bOAq")) == ["next"] * 3 + ["previous"] * 2 + ["quit"]
-    assert list(meanings(b"xyz\x1b[5~\xff\x1b\x1b[")) == []
+    assert list(actions(b"\t\x1b[B\x1bOB\x1b[Z\x1bOAq")) == ["next"] * 3 + ["previous"] * 2 + ["quit"]
+    assert list(actions(b"xyz\x1b[5~\xff\x1b\x1b[")) == []
