@@ -182,8 +182,8 @@ def _make_room(connection: sqlite3.Connection, kept: StoreState, most_bytes: int
     return kept, dropped
 
 
-def _bytes(connection: sqlite3.Connection, where: str = "") -> int:
-    (size,) = connection.execute(f"SELECT coalesce(sum(length(data)), 0) FROM block {where}").fetchone()  # noqa: S608 - ours
+def _bytes(connection: sqlite3.Connection, condition: str = "") -> int:
+    (size,) = connection.execute(f"SELECT coalesce(sum(length(data)), 0) FROM block {condition}").fetchone()  # noqa: S608 - ours
     return int(size)
 
 

@@ -1,1 +1,1 @@
-"""Reports: the thesis recomputed beside the printed page."""
+"""Report that recomputes the thesis and compares the results with the printed ones."""

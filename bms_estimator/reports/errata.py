@@ -1,4 +1,4 @@
-"""The errata of the thesis, E1 to E36: what follows from numbers is computed, printed numbers are those of ``printed``."""
+"""Errata E1 to E36 of the thesis. Corrected numbers are computed, printed numbers are those of ``printed_values``."""
 
 from dataclasses import dataclass
 
@@ -13,51 +13,52 @@ from bms_estimator.reports.simulation import ALPHA, CURRENT_A, Simulation, mean_
 from bms_estimator.reports.theorem_4_1_2 import C_RATES, PRODUCTS, measure
 
 SMALLEST_CURRENT_A = 1e-4
-"""Near enough to the theorem's infinitesimal current."""
+"""Current that stands for the theorem's infinitesimal current [A]."""
 OCV_ERROR_V = 0.010
 """Error of E_o assumed by erratum 19 [V]."""
 SLOW_C = 1.0 / 20.0
+"""C-rate of erratum 19 [1/h]."""
 BY_OHM = ("50 ohm", "25 ohm", "12.5 ohm")
-"""Resistors, by falling resistance."""
+"""Resistors in order of decreasing resistance."""
 CELLS = ("chen_mora", "ncr18650", "thunder_power_6s")
-"""275 mAh, 3 Ah, 6.6 Ah."""
+"""Cells of 275 mAh, 3 Ah and 6.6 Ah."""
 
 
 @dataclass(frozen=True)
 class Erratum:
-    """One erratum.
+    """Erratum of the thesis.
 
     Attributes:
-        where: Equation, table or section.
-        says: The printed text.
-        holds: What holds instead.
+        location: Equation, table or section.
+        printed: Printed text.
+        corrected: Correction, or comment.
     """
 
-    where: str
-    says: str
-    holds: str
+    location: str
+    printed: str
+    corrected: str
 
 
 def errata(s: Simulation) -> list[Erratum]:
-    """E1 to E36 in order."""
+    """Return E1 to E36 in order."""
     return [*_first(s), *_theory(s), *_experiments(s), *_second_audit(s), *_later_chapters()]
 
 
 def table(s: Simulation) -> Table:
-    """Return a table of the report."""
-    rows = tuple((f"E{n}", e.where, e.says, e.holds) for n, e in enumerate(errata(s), 1))
+    """Return the errata as a table of the report."""
+    rows = tuple((f"E{n}", e.location, e.printed, e.corrected) for n, e in enumerate(errata(s), 1))
     return Table(
         "Errata",
-        "what is printed and what holds",
-        ("mark", "where", "says", "holds"),
+        "printed and corrected",
+        ("number", "location", "printed", "corrected"),
         rows,
         Reproduction.ADDED,
-        "The project carries the corrected form of each; its numbers are computed with this report.",
+        "The project uses the corrected forms. The numbers are computed with this report.",
     )
 
 
 def _first(s: Simulation) -> list[Erratum]:
-    """E1 to E14."""
+    """Return E1 to E14."""
     true, estimated = s.cell.a, s.printed_a
     a8, inferred_a8 = printed_values.BOUNDS[8], _weights(printed_values.A8_WEIGHTS)
     e6 = next(c for c in lemma_conditions(load_cell("chen_mora")) if not c.holds)
@@ -69,12 +70,12 @@ def _first(s: Simulation) -> list[Erratum]:
         f"{float(delta(p[8], p[9], p[7])):.6f}, {float(delta(p[11], p[12], p[10])):.6f}" for p in (true, estimated)
     ]
     return [
-        Erratum("(3.10)", "plus sign", "minus sign: else no Nussbaum function"),
-        Erratum("(3.13)", "k' = e²", "with a real converter k never stops growing: dead zone"),
+        Erratum("(3.10)", "plus sign", "minus sign; otherwise it is not a Nussbaum function"),
+        Erratum("(3.13)", "k' = e²", "with a real converter k grows without bound; a dead zone is needed"),
         Erratum(
             "Theorem 4.1.2",
             "parameters are identified, e goes to zero",
-            "parameters go to a weighted mean of their bounds, whatever the data say; tracking is real: |e| at most "
+            "parameters converge to a weighted mean of their bounds, for any data; the output is tracked: |e| at most "
             f"{1e3 * min(fast):.2f} to {1e3 * max(fast):.2f} mV at {CURRENT_A:g} A, {1e6 * min(slow):.0f} to {1e6 * max(slow):.0f} "
             f"µV at {1e3 * min(C_RATES) * CURRENT_A:.2f} mA",
         ),
@@ -110,33 +111,33 @@ def _first(s: Simulation) -> list[Erratum]:
             "-",
             f"delta1, delta2 are {deltas[0]} of Chen and Mora's values, {deltas[1]} of Table 5's estimates",
         ),
-        Erratum("near empty", "-", "C_ts, C_tl are negative below delta1, delta2: adaptation stops before"),
+        Erratum("near empty", "-", "C_ts, C_tl are negative below delta1, delta2; adaptation must stop before"),
     ]
 
 
 def _theory(s: Simulation) -> list[Erratum]:
-    """E15 to E19."""
+    """Return E15 to E19."""
     held, tiny = (quasi_steady(s.cell, i) for i in (CURRENT_A, SMALLEST_CURRENT_A))
     initial = [c for c in lemma_conditions(load_cell("thunder_power_6s")) if "(0)" in c.name]
     rate = next(c for c in lemma_conditions(pack()) if "rate of a7" in c.name)
-    wrong = {load_cell(name).cell.capacity_ah: ocv_error_ohm(load_cell(name)) for name in CELLS}
+    r_s_errors = {load_cell(name).cell.capacity_ah: ocv_error_ohm(load_cell(name)) for name in CELLS}
     r_s, fitted = float(s.cell.a[15]), float(s.r_s_fit.a[2])
     excess = sum(float(s.improved.average[i] - s.cell.a[i]) for i in (3, 6))
     return [
         Erratum(
             "(3.2), (3.3)",
             "the same u drives both branches",
-            "the cell's are driven by i/C_ts and i/C_tl: x2 : x3 goes as tau_ts : tau_tl, not R_ts : R_tl, the same only if C_ts "
-            f"= C_tl. With every parameter true x3 is {1e3 * held.observer_v[1]:.1f} mV where the cell has "
-            f"{1e3 * held.cell_v[1]:.1f}, x2 {1e3 * held.observer_v[0]:.1f} where it has {1e3 * held.cell_v[0]:.1f} (half an hour "
-            f"of {CURRENT_A:g} A)",
+            "those of the cell are driven by i/C_ts and i/C_tl. Therefore x2 : x3 is tau_ts : tau_tl instead of R_ts : R_tl, "
+            f"which is equal only if C_ts = C_tl. With all parameters true, x3 is {1e3 * held.observer_v[1]:.1f} mV instead of "
+            f"the cell's {1e3 * held.cell_v[1]:.1f}, and x2 is {1e3 * held.observer_v[0]:.1f} mV instead of "
+            f"{1e3 * held.cell_v[0]:.1f} (after half an hour at {CURRENT_A:g} A)",
         ),
         Erratum(
             "(4.64)-(4.66)",
             "e goes to zero, the products follow",
             f"quasi-steadily u = x2/tau_ts, so e = -x2/(N tau_ts) = {1e3 * held.predicted_v:.3f} mV at {CURRENT_A:g} A, measured "
-            f"{1e3 * held.error_v:.3f}; at {1e3 * SMALLEST_CURRENT_A:g} mA {1e6 * tiny.error_v:.3f} µV: every term of (4.66) goes "
-            "with i, in the limit it reads 0 = 0",
+            f"{1e3 * held.error_v:.3f}; at {1e3 * SMALLEST_CURRENT_A:g} mA {1e6 * tiny.error_v:.3f} µV. Every term of (4.66) is "
+            "proportional to i, so that in the limit it reads 0 = 0",
         ),
         Erratum(
             "Theorem 4.1.2",
@@ -146,23 +147,23 @@ def _theory(s: Simulation) -> list[Erratum]:
         Erratum(
             "Lemma 4.1.1",
             "conditions for C_ts, C_tl > 0",
-            "circular: that on a8 (a11) is C_ts > 0 (C_tl > 0) rewritten, the others only ensure that delta1 and delta2 are "
-            f"positive. Table 10's initial values violate both first ones ({_sides(initial[0])}; {_sides(initial[1])}), with the "
-            f"weights of E24 the rate of a7 is too high as well ({number(rate.left)} > {number(rate.right)})",
+            "circular: the condition on a8 (a11) is C_ts > 0 (C_tl > 0) rewritten, and the others only ensure that delta1 and "
+            f"delta2 are positive. Table 10's initial values violate the first two ({_sides(initial[0])}; {_sides(initial[1])}). "
+            f"With the weights of E24 the rate of a7 is too high as well ({number(rate.left)} > {number(rate.right)})",
         ),
         Erratum(
             "(4.2)",
             "sign; divided by i",
-            f"(2.4) has the opposite sign. R_s gets what R_ts + R_tl have wrong: {1e3 * fitted:.1f} mΩ where {1e3 * r_s:.1f} less "
-            f"{1e3 * excess:.1f} is {1e3 * (r_s - excess):.1f}. An E_o wrong by {1e3 * OCV_ERROR_V:g} mV makes "
-            + ", ".join(f"{1e3 * ohm:.0f} mΩ at C/20 of {ah:g} Ah" for ah, ohm in wrong.items())
-            + "; step 2 asks for i to 0, step 3 for a large i: weight by the current",
+            f"(2.4) has the opposite sign. R_s absorbs the error of R_ts + R_tl: it is {1e3 * fitted:.1f} mΩ, and {1e3 * r_s:.1f} minus "
+            f"the error {1e3 * excess:.1f} is {1e3 * (r_s - excess):.1f}. An error of E_o of {1e3 * OCV_ERROR_V:g} mV gives "
+            + ", ".join(f"{1e3 * ohm:.0f} mΩ at C/20 of {ah:g} Ah" for ah, ohm in r_s_errors.items())
+            + ". Step 2 requires i to 0, but step 3 a large i: weight by the current",
         ),
     ]
 
 
 def _experiments(s: Simulation) -> list[Erratum]:
-    """E20 to E26."""
+    """Return E20 to E26."""
     currents = printed_pack.current_errors_percent()
     ohm = " / ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in BY_OHM)
     off = " / ".join(f"{currents[load]:.1f}" for load in BY_OHM)
@@ -182,10 +183,11 @@ def _experiments(s: Simulation) -> list[Erratum]:
         ),
         Erratum(
             "Figure 29, Table 10",
-            "judged against Chen and Mora",
-            f"a pack of {six.series_count} cells in series and {six.capacity_ah:g} Ah against a cell of {1e3 * small.capacity_ah:g} "
-            f"mAh, with its bounds: of such cells it had {six.series_count / parallel:.2f} times the resistances and "
-            f"{parallel / six.series_count:.0f} times the capacitances, only the products alike",
+            "compared with Chen and Mora",
+            f"a pack of {six.series_count} cells in series and {six.capacity_ah:g} Ah is compared with a cell of "
+            f"{1e3 * small.capacity_ah:g} mAh, and has its bounds. If it consisted of such cells, it would have "
+            f"{six.series_count / parallel:.2f} times the resistances and {parallel / six.series_count:.0f} times the "
+            "capacitances; only the products would be equal",
         ),
         Erratum(
             "(4.60), (4.63), (4.71)-(4.72)",
@@ -204,11 +206,11 @@ def _experiments(s: Simulation) -> list[Erratum]:
             "Tables 2, 3",
             "starts at the desired values, errors of 0 %",
             f"a family of starts fits both tables: e(0) = {_starts(s)}; the start is the "
-            "rounded truth ("
+            "rounded true value ("
             + ", ".join(
                 f"a{i} {100.0 * (printed_values.CHEN_MORA_ROUNDED[i - 1] / s.cell.a[i] - 1.0):.0f} %" for i in (13, 6)
             )
-            + "): 0 % is an artefact",
+            + "), so that 0 % is an artefact",
         ),
         Erratum(
             "cross references",
@@ -219,7 +221,7 @@ def _experiments(s: Simulation) -> list[Erratum]:
 
 
 def _second_audit(s: Simulation) -> list[Erratum]:
-    """E27 to E33."""
+    """Return E27 to E33."""
     held = quasi_steady(s.cell, CURRENT_A)
     steps, largest, usual = (
         printed_values.TABLE_11["constant steps"],
@@ -237,9 +239,10 @@ def _second_audit(s: Simulation) -> list[Erratum]:
         Erratum(
             "(3.14)",
             "u R_s in the output",
-            f"i R_s, as in (2.4): u R_s is in V Ω/s, and after half an hour of {CURRENT_A:g} A it is {1e3 * held.driven_v:.3f} mV "
-            f"where the ohmic drop is {1e3 * held.ohmic_v:.1f} mV. That drop goes into x2 + x3, {1e3 * sum(held.observer_v):.1f} mV "
-            f"where the cell has {1e3 * sum(held.cell_v):.1f}, and a13 to a15 have next to no effect in schemes 1 to 3",
+            f"i R_s, as in (2.4): u R_s is in V Ω/s, and after half an hour at {CURRENT_A:g} A it is {1e3 * held.driven_v:.3f} mV "
+            f"instead of the ohmic drop of {1e3 * held.ohmic_v:.1f} mV. The drop is added to x2 + x3, which is "
+            f"{1e3 * sum(held.observer_v):.1f} mV instead of {1e3 * sum(held.cell_v):.1f}, so that a13 to a15 have nearly no "
+            "effect in schemes 1 to 3",
         ),
         Erratum(
             "5.3.2, Table 11",
@@ -264,8 +267,8 @@ def _second_audit(s: Simulation) -> list[Erratum]:
             "currents of the loads (E21)",
             f"their differences from Ohm's law, {off} mA at "
             + ", ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in BY_OHM)
-            + f" Ω, are an offset of {1e3 * offset_a:.0f} mA and {100.0 * gain:.1f} % of the current: plausibly the sensor's, and then "
-            "the counted charge is short as well",
+            + f" Ω, are an offset of {1e3 * offset_a:.0f} mA and {100.0 * gain:.1f} % of the current. These are plausible errors of the "
+            "sensor, which would make the counted charge too small as well",
         ),
         Erratum(
             "Table 5, weights",
@@ -276,7 +279,7 @@ def _second_audit(s: Simulation) -> list[Erratum]:
             + ", ".join(f"{low:.0f} to {high:.0f}" for low, high in rates.values())
             + " /s; "
             + "; ".join(_weights(pair) for pair in printed_values.INFERRED_WEIGHTS["5"].values())
-            + f" give every digit. The {_weights(printed_values.A8_WEIGHTS)} of E4 has the ratio only",
+            + f" give every digit. The weights {_weights(printed_values.A8_WEIGHTS)} of E4 only have the right ratio",
         ),
         Erratum(
             "5.2.2",
@@ -291,7 +294,7 @@ def _second_audit(s: Simulation) -> list[Erratum]:
 
 
 def _later_chapters() -> list[Erratum]:
-    """E34 to E36."""
+    """Return E34 to E36."""
     return [
         Erratum(
             "Theorem 4.1.2, proof",
@@ -302,18 +305,18 @@ def _later_chapters() -> list[Erratum]:
         Erratum(
             "7.1",
             "interpolation in E_o(SOC) gives a more accurate SOC than the count",
-            "E_o(SOC) is itself indexed by the count that it is to correct, and so are x2, x3 and R_s of the model",
+            "E_o(SOC) depends on the counted SOC that it is supposed to correct, and so do x2, x3 and R_s of the model",
         ),
         Erratum(
             "Chapter 3, step 2; Algorithm 1",
             "data from step 3; Continue after Return",
-            "step 1; Continue cannot be reached: the loop has to go on to t_max and return once",
+            "step 1; Continue cannot be reached: the loop must run until t_max and return once",
         ),
     ]
 
 
 def _starts(s: Simulation) -> str:
-    """Start error and lambda of each of the fitted starts."""
+    """Describe the fitted starts by error and lambda."""
     return ", ".join(
         f"{start.start_error_v:.3f} V with λ = {start.lambda_:.2f}"
         + ("" if start.alpha == ALPHA else f" at a = {start.alpha:g}")

@@ -1,4 +1,4 @@
-"""Data of chapter 5: real captures, or the simulated pack through two sensor chains."""
+"""Data of chapter 5: real captures, or the simulated pack measured by two sensor chains."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +12,7 @@ from bms_estimator.reports.simulated_experiment import SensorChain, captures, ex
 from bms_estimator.reports.thesis_claims import claim
 
 FINE, COARSE = SensorChain(16), SensorChain(10)
-"""The dSpace board of the thesis, and an Arduino."""
+"""Sensor chains of the dSpace board of the thesis (16 bits) and of an Arduino (10 bits)."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class Recorded:
     """Real captures.
 
     Attributes:
-        cell: The cell file: capacity, limits, bounds.
-        samples: Name and samples of each.
-        voltage_step_v: One step of the voltage converter [V].
+        cell: Cell file with capacity, limits and bounds.
+        samples: Name and samples of each capture.
+        voltage_step_v: Resolution of the voltage [V].
     """
 
     cell: CellModel
@@ -31,7 +31,7 @@ class Recorded:
 
 
 class Experiment:
-    """The protocol on one pack.
+    """Experimental procedure on one pack.
 
     Args:
         recorded: Real captures; None for the simulated pack.
@@ -46,33 +46,33 @@ class Experiment:
 
     @cached_property
     def protocol(self) -> Procedure:
-        """On the real captures, or on the simulated pack through 16 bits."""
+        """Procedure on the real captures, or on the simulated pack measured with 16 bits."""
         if self.recorded is None:
             return Procedure(pack(), captures(self._true, FINE), FINE.voltage_step_v)
         cell = self.recorded.cell
-        found = [Capture(name, kind_of(name, s, cell.cell.capacity_ah), s) for name, s in self.recorded.samples]
-        return Procedure(cell, found, self.recorded.voltage_step_v)
+        recorded = [Capture(name, kind_of(name, s, cell.cell.capacity_ah), s) for name, s in self.recorded.samples]
+        return Procedure(cell, recorded, self.recorded.voltage_step_v)
 
     @cached_property
     def coarse(self) -> Procedure | None:
-        """On the simulated pack through 10 bits; None for real captures."""
+        """Procedure on the simulated pack measured with 10 bits; None for real captures."""
         if self.recorded is not None:
             return None
         return Procedure(pack(), captures(self._true, COARSE), COARSE.voltage_step_v)
 
     def tested(self, *keys: str) -> tuple[Reproduction, str]:
-        """Verdict on one or more of ``claims.CLAIMS``, all of which must hold on the captures, and why, in words.
+        """Return the common verdict on some of ``thesis_claims.CLAIMS``, and its reason.
 
-        Nothing is tested on the simulated pack: it has the model's own form.
+        No claim is tested on the simulated pack, because the pack has exactly the form of the model.
         """
         if self.recorded is None:
             return Reproduction.NO_DATA, ""
-        found = [claim(key, [self.protocol]) for key in keys]
-        words = "".join(f"{one.words} " for one in found)
-        verdicts = {one.verdict for one in found} - {Reproduction.NO_DATA}
+        claims = [claim(key, [self.protocol]) for key in keys]
+        reason = "".join(f"{each.sentence} " for each in claims)
+        verdicts = {each.verdict for each in claims} - {Reproduction.NO_DATA}
         if not verdicts:
-            return Reproduction.NO_DATA, words
-        return (Reproduction.CLAIM_FAILS if Reproduction.CLAIM_FAILS in verdicts else Reproduction.CLAIM_HOLDS), words
+            return Reproduction.NO_DATA, reason
+        return (Reproduction.CLAIM_FAILS if Reproduction.CLAIM_FAILS in verdicts else Reproduction.CLAIM_HOLDS), reason
 
     @property
     def truth(self) -> Floats | None:
@@ -81,12 +81,12 @@ class Experiment:
 
     @property
     def on(self) -> str:
-        """Return the source of the numbers."""
+        """Description of the data source."""
         if self.recorded is None:
             return "the simulated 6S pack"
         return f"{len(self.recorded.samples)} captures of {self.recorded.cell.cell.name}"
 
     @property
     def unpublished(self) -> str:
-        """Reason why the printed numbers cannot result."""
+        """Reason for which the printed numbers cannot be reproduced."""
         return f"The thesis's recordings are not published. Its procedure was run on {self.on}."

@@ -1,4 +1,4 @@
-"""Figures 26 to 38 and 40 to 42: the procedure of chapter 5 on captures."""
+"""Figures 26 to 38 and 40 to 42: results of the procedure of chapter 5."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +15,7 @@ from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_stat
 from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
 
 PER_FIGURE = 4
-"""Loads in one figure, as in Fig. 32."""
+"""Maximum number of loads in a figure, as in Fig. 32."""
 
 
 def _figure(
@@ -26,7 +26,7 @@ def _figure(
 
 
 def figure_26(experiment: Experiment) -> Figure:
-    """E_o over SOC."""
+    """Draw E_o over SOC."""
     p = experiment.protocol
 
     def draw(axes: Any) -> None:
@@ -44,7 +44,7 @@ def figure_26(experiment: Experiment) -> Figure:
         for colour, test in zip(np.resize(COLOURS, len(p.tests)), p.tests, strict=True):
             axes[1].plot(test.soc, 1e3 * (test.ocv_v - p.joint_fit(test.soc)), "o", ms=3, color=colour)
         axes[1].axhline(0.0, color=FAINT, linewidth=0.8)
-        axes[1].set(xlabel="SOC", ylabel="mV", title="points less (2.10)")
+        axes[1].set(xlabel="SOC", ylabel="mV", title="points minus (2.10)")
 
     return _figure(
         "26",
@@ -57,7 +57,7 @@ def figure_26(experiment: Experiment) -> Figure:
 
 
 def figure_27(experiment: Experiment) -> Figure:
-    """Currents of the relaxation tests."""
+    """Draw the currents of the relaxation tests."""
     tests = experiment.protocol.of(Kind.RELAXATION)
     return _figure("27", "Currents of the voltage relaxation tests", _currents(tests, "27"), experiment, "")
 
@@ -80,11 +80,13 @@ def _currents(captures: list[Any], key: str) -> str:
 
 
 def figure_28(experiment: Experiment) -> Figure:
-    """Crossings."""
+    """Draw the crossings of the stability conditions."""
     run = experiment.protocol.adaptive
     found = ", ".join(f"{c.parameter} at SOC {c.soc:.5f}" for c in run.crossings)
     if min(c.soc for c in run.crossings) <= 0.0:
-        return _figure("28", "a8 and a11 meet their stability conditions", "", experiment, f"They never do: {found}.")
+        return _figure(
+            "28", "a8 and a11 meet their stability conditions", "", experiment, f"There is no crossing: {found}."
+        )
     return _figure(
         "28",
         "a8 and a11 meet their stability conditions",
@@ -95,7 +97,7 @@ def figure_28(experiment: Experiment) -> Figure:
 
 
 def figure_29(experiment: Experiment) -> Figure:
-    """Products."""
+    """Draw the RC products."""
     run = experiment.protocol.adaptive
     return _figure(
         "29",
@@ -108,7 +110,7 @@ def figure_29(experiment: Experiment) -> Figure:
 
 
 def figure_30(experiment: Experiment) -> Figure:
-    """Elements."""
+    """Draw the elements."""
     run = experiment.protocol.adaptive
     stop_at = [c.soc for c in run.crossings]
     return _figure(
@@ -121,12 +123,12 @@ def figure_30(experiment: Experiment) -> Figure:
 
 
 def figure_31(experiment: Experiment) -> Figure:
-    """R_s."""
+    """Draw R_s by (4.2)."""
     p, truth = experiment.protocol, experiment.truth
 
     def draw(axes: Any) -> None:
-        for name, found in p.r_s_curves.items():
-            axes.plot(found.soc, 1e3 * found.r_s_ohm, label=name, linewidth=1.0)
+        for name, curve in p.r_s_curves.items():
+            axes.plot(curve.soc, 1e3 * curve.r_s_ohm, label=name, linewidth=1.0)
         axes.plot(p.r_s_mean.soc, 1e3 * p.r_s_mean.r_s_ohm, "k", label="mean", linewidth=1.6)
         axes.plot(SOC_GRID, 1e3 * p.r_s_fit(SOC_GRID), "k--", label="fit (2.9)")
         if truth is not None:
@@ -143,7 +145,7 @@ def figure_31(experiment: Experiment) -> Figure:
         "R_s by (4.2) for different loads",
         plot(draw, salt="figure-31"),
         experiment,
-        "Sign of (4.2) as (2.4); the mean is weighted by the current squared (E19)."
+        "The sign of (4.2) is that of (2.4); the mean is weighted by the square of the current (E19)."
         + (" Grey: the printed curve, from Table 9." if truth is not None else ""),
     )
 
@@ -202,14 +204,14 @@ def _errors(p: Procedure) -> Callable[[Any, str], None]:
 
 
 def figure_32(experiment: Experiment) -> Figure:
-    """Constant loads, voltages."""
+    """Draw the voltages under constant loads."""
     p = experiment.protocol
     title = "Constant loads: actual and estimated voltage"
     return _figure("32", title, _grid(_constant(p), _voltages(p), "32"), experiment, "")
 
 
 def figure_33(experiment: Experiment) -> Figure:
-    """Constant loads, errors."""
+    """Draw the errors under constant loads."""
     p = experiment.protocol
     svg = _grid(_constant(p), _errors(p), "33")
     reason = f"{_largest(p, _constant(p))} Printed: at most {printed_values.MAX_CONSTANT:g} %."
@@ -217,7 +219,7 @@ def figure_33(experiment: Experiment) -> Figure:
 
 
 def figure_34(experiment: Experiment) -> Figure:
-    """Constant loads, currents."""
+    """Draw the currents of the constant loads."""
     captures = experiment.protocol.of(Kind.CONSTANT)[:PER_FIGURE]
     return _figure("34", "Constant loads: currents", _currents(captures, "34"), experiment, "")
 
@@ -229,24 +231,24 @@ def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> F
 
 
 def figure_35(experiment: Experiment) -> Figure:
-    """Draw the voltage under current steps."""
+    """Draw the voltage under constant steps."""
     return _step_voltage(experiment, "35", "Constant steps: actual and estimated voltage", 0)
 
 
 def figure_36(experiment: Experiment) -> Figure:
-    """Currents of the steps."""
+    """Draw the currents of the steps."""
     p = experiment.protocol
     captures = [c for c in p.captures if c.name in _steps(p)]
     return _figure("36", "Steps: currents", _currents(captures, "36"), experiment, "")
 
 
 def figure_37(experiment: Experiment) -> Figure:
-    """Variable steps."""
+    """Draw the voltage under variable steps."""
     return _step_voltage(experiment, "37", "Variable steps: actual and estimated voltage", 1)
 
 
 def figure_38(experiment: Experiment) -> Figure:
-    """Errors of the steps."""
+    """Draw the errors under steps."""
     p = experiment.protocol
     reason = f"{_largest(p, _steps(p))} Printed: at most {printed_values.MAX_STEPS:g} %."
     svg = _grid(_steps(p), _errors(p), "38")
@@ -254,7 +256,7 @@ def figure_38(experiment: Experiment) -> Figure:
 
 
 def figure_40(experiment: Experiment) -> Figure:
-    """Dynamic and static."""
+    """Draw the errors of the dynamic and the static model."""
     p = experiment.protocol
     name = (_steps(p) or _constant(p))[-1]
     svg = plot(lambda axes: dynamic_static_plot(axes, p.dynamic[name], p.static[name]), columns=2, salt="figure-40")
@@ -262,20 +264,20 @@ def figure_40(experiment: Experiment) -> Figure:
 
 
 def figure_41(experiment: Experiment) -> Figure:
-    """SOC by interpolation."""
+    """Draw the SOC by interpolation."""
     p = experiment.protocol
     run, (soc, _) = p.dynamic[p.largest], p.interpolated(p.largest)
     rms = float(np.sqrt(np.mean((soc - run.soc) ** 2)))
 
     def draw(axes: Any) -> None:
-        hours, counted, looked_up = thin(run.time_s / 3600.0, run.soc, soc)
+        hours, counted, interpolated = thin(run.time_s / 3600.0, run.soc, soc)
         axes[0].plot(hours, counted, color=COLOURS[0], alpha=0.45, linewidth=2.4, label="coulomb counting")
-        axes[0].plot(hours, looked_up, "--", color=COLOURS[1], linewidth=1.0, label="interpolation in E_o")
+        axes[0].plot(hours, interpolated, "--", color=COLOURS[1], linewidth=1.0, label="interpolation in E_o")
         axes[0].set(xlabel="time [h]", ylabel="SOC")
         axes[0].legend()
         hours, difference = thin(run.time_s / 3600.0, 100.0 * (soc - run.soc))
         axes[1].plot(hours, difference, linewidth=0.9)
-        axes[1].set(xlabel="time [h]", ylabel="% of SOC", title="interpolated less counted")
+        axes[1].set(xlabel="time [h]", ylabel="% of SOC", title="interpolated minus counted")
 
     return _figure(
         "41",
@@ -288,7 +290,7 @@ def figure_41(experiment: Experiment) -> Figure:
 
 
 def figure_42(experiment: Experiment) -> Figure:
-    """E_o over both SOCs."""
+    """Draw E_o over the counted and the interpolated SOC."""
     p = experiment.protocol
     run, (soc, e_o) = p.dynamic[p.largest], p.interpolated(p.largest)
 

@@ -1,4 +1,4 @@
-"""Tables 8 to 11 and 13: the procedure of chapter 5 on captures, beside the printed values."""
+"""Tables 8 to 11 and 13: results of the procedure of chapter 5, with the printed values."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ from bms_estimator.reports.report_items import Reproduction, Table, number
 
 
 def table_8(experiment: Experiment) -> Table:
-    """a16 to a21."""
+    """Return the table of a16 to a21."""
     protocol, truth = experiment.protocol, experiment.truth
     points = pooled(protocol.tests)
     mean, joint = average(protocol.single_fits), protocol.joint_fit
@@ -32,7 +32,7 @@ def table_8(experiment: Experiment) -> Table:
     table = protocol.table
     coarse = ""
     if experiment.coarse is not None:
-        coarse = f" Through 10 bits the joint fit's residual is {1e3 * rms_v(experiment.coarse.joint_fit.residual_v):.2f} mV RMS."
+        coarse = f" With 10 bits the residual of the joint fit is {1e3 * rms_v(experiment.coarse.joint_fit.residual_v):.2f} mV RMS."
     return Table(
         "8",
         "Step 1: a16 to a21 from voltage relaxation tests",
@@ -47,7 +47,7 @@ def table_8(experiment: Experiment) -> Table:
 
 
 def table_9(experiment: Experiment) -> Table:
-    """a13 to a15."""
+    """Return the table of a13 to a15."""
     protocol, truth = experiment.protocol, experiment.truth
     fit = protocol.r_s_fit
     columns = ("parameter", "printed", *(() if truth is None else ("true",)), "recomputed", "± std")
@@ -64,13 +64,13 @@ def table_9(experiment: Experiment) -> Table:
         tuple(rows),
         Reproduction.NO_DATA,
         f"{experiment.unpublished} R_s by (4.2), with the sign of (2.4) and each value weighted by its current squared (E19), "
-        f"over {len(protocol.r_s_curves)} constant loads and relaxation tests; residual of the fit {1e3 * fit.rms_ohm:.2f} mΩ RMS. It takes up what R_ts + R_tl, which come from the bounds, have "
-        "wrong; a13 at 0 says that no rise towards empty is left for it.",
+        f"over {len(protocol.r_s_curves)} constant loads and relaxation tests; residual of the fit {1e3 * fit.rms_ohm:.2f} mΩ RMS. "
+        "R_s absorbs the error of R_ts + R_tl, which come from the bounds. If a13 is 0, R_s does not rise towards empty.",
     )
 
 
 def table_10(experiment: Experiment) -> Table:
-    """a1 to a12."""
+    """Return the table of a1 to a12."""
     protocol, truth, run = experiment.protocol, experiment.truth, experiment.protocol.adaptive
     printed_bounds = experiment.recorded is None
     over = {
@@ -97,15 +97,16 @@ def table_10(experiment: Experiment) -> Table:
         rows.append(row if truth is None else (*row, number(float(truth[i]))))
     w = run.window
     corrected = (
-        "Weights of a8 as E4, of a4 and a7 as E24, inferred from the printed estimates; printed a5 = 30 contradicts its bounds "
-        "and weights, which give 150 (E5). The run gives the limits, which are not what is printed; the other eleven printed "
-        f"estimates follow to {printed_values.worst_mean_percent():.1f} % from bounds, weights and initial values alone, without any data, as a mean over the first "
-        f"10 h: {printed_values.FREE_PARAMETERS['10']} free parameters, this time and two weights each of a4, a7 and a8. The fit is a "
-        "loose one: of what the estimates lie above their limits it gives "
-        + ", ".join(f"a{i} {number(by, 3)} where {number(above, 3)} is printed" for i, (above, by) in over.items())
+        "Weights of a8 as in E4, of a4 and a7 as in E24, inferred from the printed estimates. The printed a5 = 30 contradicts its "
+        "bounds and weights, which give 150 (E5). The run gives the limits, which differ from the printed estimates. The other "
+        f"eleven printed estimates are within {printed_values.worst_mean_percent():.1f} % of the mean over the first 10 h that follows "
+        "from bounds, weights and initial values alone, without any data. This fit has "
+        f"{printed_values.FREE_PARAMETERS['10']} free parameters: the time, and two weights each of a4, a7 and a8. It is a loose fit: "
+        "the excess of the estimates over their limits is "
+        + ", ".join(f"a{i} {number(by, 3)} (printed {number(above, 3)})" for i, (above, by) in over.items())
         + ". "
         if printed_bounds
-        else "Bounds are the printed ones scaled to this cell's capacity, where its file has none of its own. "
+        else "Bounds are the printed ones, scaled to the cell's capacity, unless the cell file has its own. "
     )
     return Table(
         "10",
@@ -120,12 +121,12 @@ def table_10(experiment: Experiment) -> Table:
 
 
 def _over_limit(index: int) -> float:
-    """Mean from the first sample on of Table 10's parameter less its limit."""
+    """Return the mean of Table 10's parameter from the first sample on, minus its limit."""
     return printed_values.mean_from_start("10", index) - printed_values.bounds("10", index).limit
 
 
 def table_11(experiment: Experiment) -> Table:
-    """Compute the validation table."""
+    """Return the table of the validation."""
     protocol, coarse = experiment.protocol, experiment.coarse
     columns = ["load", "mean current [A]", "serves", "printed mean %", "mean %", "max %", "RMS [mV]"]
     columns += ["at SOC", f"mean %, SOC > {KNEE_SOC:g}", f"max %, SOC > {KNEE_SOC:g}"]
@@ -159,10 +160,10 @@ def table_11(experiment: Experiment) -> Table:
         tuple(rows),
         verdict,
         f"{experiment.unpublished} {tested}a1 to a12 from {protocol.smallest.name}, a16 to a21 from the relaxation tests, a13 "
-        f"to a15 from all constant loads and relaxation tests but the one of the row. Error of the measured voltage, from the "
-        f"first sample until SOC {protocol.lowest_soc:.2g}, counted from full. "
+        f"to a15 from all constant loads and relaxation tests except that of the row. Errors are in percent of the measured voltage, "
+        f"from the first sample until SOC {protocol.lowest_soc:.2g}, counted from full. "
         + (
-            "The pack has the very form of the model, so the errors are smaller than a real pack's."
+            "The simulated pack has exactly the form of the model, so that the errors are smaller than those of a real pack."
             if experiment.recorded is None
             else "Captures of several cells count as one cell here."
         ),
@@ -170,7 +171,7 @@ def table_11(experiment: Experiment) -> Table:
 
 
 def table_13(experiment: Experiment) -> Table:
-    """Dynamic and static."""
+    """Return the comparison of the dynamic and the static model."""
     protocol = experiment.protocol
     loads = [capture.name for capture in protocol.validating]
     runs = {"dynamic": protocol.dynamic, "static": protocol.static}
@@ -192,7 +193,7 @@ def table_13(experiment: Experiment) -> Table:
         rows,
         verdict,
         f"{experiment.unpublished} {tested}The static model is frozen at SOC {STATIC_SOC:g}; the thesis does not print its own. "
-        "The printed 0.003 % of the dynamic model is a hundredth of the errors of Table 11: its definition must differ.",
+        "The printed 0.003 % of the dynamic model is a hundredth of the errors of Table 11, so that its definition must differ.",
     )
 
 

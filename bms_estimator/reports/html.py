@@ -1,4 +1,4 @@
-"""A report as one self-contained HTML page: no scripts, no fonts, no images from elsewhere."""
+"""Report as one self-contained HTML page, without scripts and external resources."""
 
 from html import escape
 from pathlib import Path
@@ -67,13 +67,13 @@ footer { color: var(--soft); font-size: .85rem; margin-top: 3rem; }
 """
 
 LONG_CELL = 40
-"""A table with a cell of more characters than this is one of words: left-aligned, and it wraps."""
+"""Maximum length of a cell in a table of numbers [characters]. A table with longer cells is left-aligned and wraps."""
 
-DECLARED = """
-<p>Every table and figure of “Adaptive estimation of Li-ion battery model parameters”, recomputed beside what is printed.
-Where the two differ the reason is given with it; <a href="#table-errata">E1 to E36</a> are the errata of the thesis that this project
-carries corrected. Only the text of the thesis was available, with its numbers and tables: what its figures show was not seen.
-What the thesis does not print is declared: N(k) = E<sub>2.5</sub>(-k<sup>2.5</sup>), k<sub>0</sub> = 0,
+INTRODUCTION = """
+<p>Every table and figure of “Adaptive estimation of Li-ion battery model parameters”, recomputed and compared with print.
+The reason for each difference is given; <a href="#table-errata">E1 to E36</a> are the errata of the thesis, whose corrections this
+project uses. Only the text of the thesis with its numbers and tables was available; the content of its figures was not.
+Values that the thesis does not print are chosen as follows: N(k) = E<sub>2.5</sub>(-k<sup>2.5</sup>), k<sub>0</sub> = 0,
 x<sub>2</sub>(0) = x<sub>3</sub>(0) = 0 (schemes 1 and 2: start and λ of E25), simulations at 100 Hz (C/10 runs at 10 Hz) with the semi-exact step, which is stable at
 any step length. Errors are always in percent of the true value.</p>
 """
@@ -88,14 +88,14 @@ def page(report: Report) -> str:
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>The thesis, recomputed</title><style>{STYLE}</style></head><body>{_navigation(report)}<main>"
-        f"<h1>The thesis, recomputed</h1>{DECLARED}<p>Chapter 5 was run on <strong>{escape(report.on)}</strong>.</p>"
+        f"<h1>The thesis, recomputed</h1>{INTRODUCTION}<p>Chapter 5 was run on <strong>{escape(report.on)}</strong>.</p>"
         f"{_counts(report)}{chapters}{_account(report)}"
         f"<footer>bms_estimator {escape(__version__)}</footer></main></body></html>"
     )
 
 
 def write(report: Report, folder: Path) -> Path:
-    """Write ``index.html`` into ``folder``; returns its path."""
+    """Write ``index.html`` into ``folder``. Return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "index.html"
     path.write_text(page(report), encoding="utf-8")
@@ -114,7 +114,7 @@ def _navigation(report: Report) -> str:
             for item in items
         )
         parts.append(f'<b>{escape(chapter)}</b><div class="marks">{links}</div>')
-    return "".join([*parts, '<b><a href="#account">Closing note</a></b></nav>'])
+    return "".join([*parts, '<b><a href="#account">Summary</a></b></nav>'])
 
 
 def _short(item: Item) -> str:
@@ -168,6 +168,6 @@ def _account(report: Report) -> str:
         for item in report.items
     )
     return (
-        '<h2 id="account">Closing note: what holds</h2><div class="scroll"><table class="account"><thead><tr><th></th>'
-        f"<th>title</th><th>verdict</th><th>why</th></tr></thead><tbody>{rows}</tbody></table></div>"
+        '<h2 id="account">Summary of the verdicts</h2><div class="scroll"><table class="account"><thead><tr><th></th>'
+        f"<th>title</th><th>verdict</th><th>reason</th></tr></thead><tbody>{rows}</tbody></table></div>"
     )

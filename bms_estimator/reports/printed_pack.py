@@ -1,4 +1,4 @@
-"""The pack as Tables 8 to 10 print it: Figures 28 to 30 follow from it without any recording, and Ohm's law checks it."""
+"""Pack with the printed parameters of Tables 8 to 10: Figures 28 to 30, and a check of the printed currents."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,43 +17,44 @@ from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
 A = printed_values.tables_8_to_10()
 EMPTY_SOC = 0.02
-"""A discharge through a resistor ends here, above delta2."""
+"""SOC at the end of a discharge through a resistor, above delta2."""
 GRID = np.linspace(EMPTY_SOC, 1.0, 9801)
+"""SOC over which means are computed."""
 
 
 def deltas() -> tuple[float, float]:
-    """delta1 and delta2 of Table 10, (2.11) and (2.12)."""
+    """Return delta1 and delta2 of Table 10, (2.11) and (2.12)."""
     return float(delta(A[8], A[9], A[7])), float(delta(A[11], A[12], A[10]))
 
 
 def product_errors() -> tuple[float, float]:
-    """Mean error of R_ts C_ts and R_tl C_tl over SOC against Chen and Mora's, as Fig. 29 compares them [%]."""
+    """Return the mean errors of R_ts C_ts and R_tl C_tl against those of Chen and Mora, as in Fig. 29 [%]."""
     true = load_cell("chen_mora").a
     return mean_error_percent(PRODUCTS[0], A, true), mean_error_percent(PRODUCTS[1], A, true)
 
 
 def mean_current_a(ohm: float) -> float:
-    """Mean current of a slow discharge through ``ohm`` [A]: Ohm's law with E_o and all resistances of Tables 8 to 10.
+    """Return the mean current of a slow discharge through ``ohm`` by Ohm's law with Tables 8 to 10 [A].
 
-    The mean over time of a charge Q is Q over the integral of dq / i.
+    The mean over time is the charge Q divided by the integral of dq / i.
     """
     current_a = np.array([emf(x, A) for x in GRID]) / (ohm + _inner_ohm())
     return float(1.0 / np.mean(1.0 / current_a))
 
 
 def _inner_ohm() -> Floats:
-    """R_s + R_ts + R_tl of Tables 8 to 10 over ``GRID`` [ohm]."""
+    """Return R_s + R_ts + R_tl of Tables 8 to 10 over ``GRID`` [ohm]."""
     ohm: Floats = element("R_ts", A, GRID) + element("R_tl", A, GRID) + np.array([r_s(x, A) for x in GRID])
     return ohm
 
 
 def mean_voltage_v(current_a: float) -> float:
-    """Mean terminal voltage of a slow discharge at ``current_a`` by Tables 8 to 10 [V]."""
+    """Return the mean terminal voltage of a slow discharge at ``current_a`` by Tables 8 to 10 [V]."""
     return float(np.mean(np.array([emf(x, A) for x in GRID]) - current_a * _inner_ohm()))
 
 
 def current_differences_a() -> dict[str, float]:
-    """Each printed current less that of Ohm's law [A]."""
+    """Return each printed current minus that of Ohm's law [A]."""
     return {
         load: printed_values.CURRENTS_A[load] - mean_current_a(ohm)
         for load, ohm in printed_values.RESISTORS_OHM.items()
@@ -61,7 +62,7 @@ def current_differences_a() -> dict[str, float]:
 
 
 def current_sensor() -> tuple[float, float]:
-    """Offset [A] and gain error of a current sensor that would explain these differences, by least squares."""
+    """Return offset [A] and gain error of a current sensor that explain the differences, by least squares."""
     true_a = np.array([mean_current_a(ohm) for ohm in printed_values.RESISTORS_OHM.values()])
     gain, offset_a = np.polyfit(true_a, list(current_differences_a().values()), 1)
     return float(offset_a), float(gain)
@@ -76,19 +77,19 @@ def current_errors_percent() -> dict[str, float]:
 
 
 def saturated_above_soc() -> float:
-    """SOC at which E_o of Table 8 reaches the end of the voltage sensor's range."""
+    """Return the SOC at which E_o of Table 8 reaches the end of the voltage sensor's range."""
     e_o = np.array([emf(x, A) for x in GRID])
     return float(np.interp(printed_values.SENSOR_RANGE_V, e_o, GRID))
 
 
 def figure_28() -> Figure:
-    """Crossings."""
+    """Draw the crossings of the stability conditions."""
     at = deltas()
 
     def draw(axes: Any) -> None:
-        for ax, i, met_at in zip(axes, (8, 11), at, strict=True):
-            ax.plot((0.4 * met_at, 12.0 * met_at), (A[i], A[i]), label=f"$a_{{{i}}}$ of Table 10")
-            condition_plot(ax, i, float(A[i]), met_at)
+        for ax, i, crossing_soc in zip(axes, (8, 11), at, strict=True):
+            ax.plot((0.4 * crossing_soc, 12.0 * crossing_soc), (A[i], A[i]), label=f"$a_{{{i}}}$ of Table 10")
+            condition_plot(ax, i, float(A[i]), crossing_soc)
 
     return Figure(
         "28",
@@ -100,21 +101,21 @@ def figure_28() -> Figure:
 
 
 def figure_29() -> Figure:
-    """Products."""
+    """Draw the RC products."""
     true, errors = load_cell("chen_mora").a, product_errors()
     return Figure(
         "29",
         "R_ts·C_ts and R_tl·C_tl as estimated",
         plot(lambda axes: products_plot(axes, true, A), columns=2, salt="figure-29"),
         Reproduction.RECOMPUTED,
-        f"{NO_VALUES} From Table 10 alone, beside Chen and Mora's as in print: {errors[0]:.1f} and {errors[1]:.1f} % off on "
-        "average over SOC 0.05 to 1 (a5 = 150, E5). They are the products of the bounds' limits (E3), and the truth they are "
-        "held against is that of another battery (E22).",
+        f"{NO_VALUES} From Table 10 alone, compared with Chen and Mora as in print: the mean errors over SOC 0.05 to 1 are "
+        f"{errors[0]:.1f} and {errors[1]:.1f} % (a5 = 150, E5). They are the products of the bounds' limits (E3), and the reference "
+        "is another battery (E22).",
     )
 
 
 def figure_30() -> Figure:
-    """Elements."""
+    """Draw the elements."""
     return Figure(
         "30",
         "R_tl, R_ts, C_tl, C_ts with the stability conditions",

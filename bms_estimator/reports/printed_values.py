@@ -1,4 +1,4 @@
-"""The numbers as the thesis prints them, misprints included."""
+"""Numbers as printed in the thesis, including misprints."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Bounds
 
 CHEN_MORA_ROUNDED = (0.30, 29.0, 0.04, 6.0, 155.0, 0.04, 752.0, 13.0, 703.0, 6050.0, 27.0, 4475.0, 0.1, 24.0, 0.07)
-"""a1..a15, "Chen and Mora's Values" and initial values of Tables 2 and 3."""
+"""Rounded a1..a15 of Chen and Mora, which are also the initial values of Tables 2 and 3."""
 
 TABLE_1 = (1.031, 35.0, 3.685, 0.2156, 0.1178, 0.3201)
 """a16..a21."""
@@ -53,7 +53,7 @@ TABLE_3 = (
 TABLE_3_ERROR = (0, 2.13, 0, 10.3, 0.34, 0, 0.0822, 4.755, 0.0879, 0.00991, 2.289, 0.0134, 0, 2.575, 0)
 TABLE_3_SHIFT = 0.6182
 SMALL = (1, 3, 6, 13, 15)
-"""The indices that schemes 2 and 3 hold back: the set q."""
+"""Indices of the small parameters (set q), which schemes 2 and 3 pull back."""
 
 TABLE_4 = {
     1: (0.30, 0.25, 0.2946, 0.3208, 8.16),
@@ -79,7 +79,7 @@ BOUNDS = {
     11: (50.0, 5.0, 50.0, 50.0),
     12: (5000.0, 3000.0, 10.0, 20.0),
 }
-"""Tables 5 and 10, index: upper bound, lower bound, lambda_x, lambda_y, as printed (a8: E4)."""
+"""Upper bound, lower bound, lambda_x and lambda_y of Tables 5 and 10 by index, as printed (a8: E4)."""
 A8_WEIGHTS = (10.0, 20.0)
 """Weights that belong to the printed estimates of a8 (erratum 4)."""
 A5 = 150.0
@@ -157,25 +157,25 @@ INFERRED_WEIGHTS = {
     "5": {7: (196.0, 182.0), 8: (15.0, 30.0), 10: (20.0, 20.0), 11: (150.0, 150.0), 12: (50.0, 100.0)},
     "10": {4: (70.0, 50.0), 7: (70.0, 65.0), 8: A8_WEIGHTS},
 }
-"""Table: index: the weights that its printed estimate belongs to, where those printed beside it give another (E4, E24, E32)."""
+"""Weights by table and index that give the printed estimate, if the printed weights do not (E4, E24, E32)."""
 START_MEAN_S = {"5": 328.3, "10": 36_000.0}
 """Durations from the first sample over which the means (3.19) equal the printed estimates of Tables 5 and 10 [s]."""
 FREE_PARAMETERS = {"5": 8, "10": 7}
-"""Fitted to the estimates of Tables 5 and 10: the time of ``START_MEAN_S``; of each pair in ``INFERRED_WEIGHTS`` the sum, and
-the ratio as well unless it is the printed one (a10 to a12 of Table 5)."""
+"""Number of parameters fitted to the estimates of Tables 5 and 10: the time ``START_MEAN_S``, the sum of each pair in
+``INFERRED_WEIGHTS``, and its ratio unless that is printed (a10 to a12 of Table 5)."""
 DECIMALS_5 = {1: 4, 2: 4, 3: 4, 4: 4, 5: 4, 6: 4, 7: 4, 8: 4, 9: 2, 10: 1, 11: 4, 12: 1}
 """Decimals of the estimates of Table 5."""
 
 
 def bounds(table: str, index: int) -> Bounds:
-    """Return the bounds of (3.18) for Table 5 or 10: as printed, with the weights of ``INFERRED_WEIGHTS``."""
+    """Return the printed bounds of (3.18) for Table 5 or 10, with the weights of ``INFERRED_WEIGHTS``."""
     upper, lower, x, y = BOUNDS[index]
     x, y = INFERRED_WEIGHTS[table].get(index, (x, y))
     return Bounds(upper=upper, lower=lower, weight_upper=x, weight_lower=y, initial=initial(table, index))
 
 
 def initial(table: str, index: int) -> float:
-    """a_i(t0) of Table 5 or 10."""
+    """Return a_i(t0) of Table 5 or 10."""
     return TABLE_5[index][0] if table == "5" else TABLE_10[index][0]
 
 
@@ -186,7 +186,7 @@ def mean_from_start(table: str, index: int) -> float:
 
 
 def implied_rates(index: int) -> tuple[float, float]:
-    """Least and greatest lambda_x + lambda_y with which ``mean_from_start`` rounds to the estimate of Table 5 [1/s]."""
+    """Return minimum and maximum lambda_x + lambda_y for which ``mean_from_start`` rounds to the estimate of Table 5 [1/s]."""
     half = 0.5 * 10.0 ** -DECIMALS_5[index]
     b, estimate = bounds("5", index), TABLE_5[index][1]
     rates = [
@@ -202,7 +202,7 @@ def worst_mean_percent() -> float:
 
 
 def tables_5_and_6() -> Floats:
-    """a1..a15 of the printed estimates of Tables 5 and 6 at index 1..15, shape (16,)."""
+    """Return the printed estimates a1..a15 of Tables 5 and 6 at index 1..15, shape (16,)."""
     a = np.zeros(16)
     for index, (_, estimate, _, _) in TABLE_5.items():
         a[index] = estimate
@@ -212,7 +212,7 @@ def tables_5_and_6() -> Floats:
 
 
 def tables_8_to_10() -> Floats:
-    """a1..a21 of the printed estimates of Tables 8 to 10 at index 1..21, shape (22,); a5 = 150 (E5)."""
+    """Return the printed estimates a1..a21 of Tables 8 to 10 at index 1..21, shape (22,), with a5 = 150 (E5)."""
     a = np.zeros(22)
     for index, (_, estimate) in TABLE_10.items():
         a[index] = estimate

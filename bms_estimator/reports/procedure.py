@@ -1,11 +1,10 @@
-"""The experimental protocol of chapter 5 on captures: steps 1 to 3, validation, SOC by interpolation.
+"""Experimental procedure of chapter 5 on captures: steps 1 to 3, validation, SOC by interpolation.
 
 The captures are real ones, or those of the simulated pack. Each result is computed on first use.
 
-No parameter is estimated from the capture that validates it. Step 1 takes the relaxation tests alone; step 2 the
-constant
-load of the smallest current, with bounds that no capture has a part in; step 3 the constant loads up to
-0.6C and the loads of the relaxation tests, but for a constant load's own validation all others.
+No parameter is estimated from the capture that validates it. Step 1 uses only the relaxation tests. Step 2 uses the
+constant load of the smallest current, with bounds that do not depend on captures. Step 3 uses the constant loads up to
+0.6C and the loads of the relaxation tests; for the validation of a constant load, that load is excluded.
 """
 
 from collections.abc import Sequence
@@ -38,22 +37,22 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
 
 LOWEST_SOC = 0.05
-"""Validation ends here: below, the elements and the open-circuit voltage run off (E14)."""
+"""SOC at which validation ends: below it the elements and the open-circuit voltage diverge (E14)."""
 KNEE_SOC = 0.1
-"""Errors are given above it as well: below it real cells leave the form of the elements under any large current."""
+"""SOC above which errors are given separately: below it, real cells under large currents deviate from (2.5) to (2.9)."""
 STATIC_SOC = 0.5
 """SOC at which the static model is frozen."""
-REST_SHARE = 0.05
-"""A capture that rests for a larger share of its time is one of steps."""
-LARGEST_C = 0.6
-"""A constant load of a larger C-rate validates only: the thesis's go to 0.55C (3652 mA of 6.6 Ah), and what a cell shows
-under more is the resistance of a cell that the load has warmed [1/h]."""
-STEADY = 0.15
-"""A current that varies by less than this of its mean is constant."""
+MAX_REST_FRACTION = 0.05
+"""Maximum fraction of time at rest in a capture with a constant load."""
+MAX_STEP_3_C = 0.6
+"""Maximum C-rate of a constant load in step 3 [1/h]. The loads of the thesis reach 0.55C (3652 mA of 6.6 Ah); a larger
+load warms the cell, which changes its resistance."""
+MAX_VARIATION = 0.15
+"""Maximum standard deviation of a constant current, relative to its mean."""
 
 
 class Kind(Enum):
-    """Purpose of a capture."""
+    """Kind of an experiment."""
 
     RELAXATION = "voltage relaxation test"
     CONSTANT = "constant load"
@@ -62,12 +61,12 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Capture:
-    """One experiment.
+    """Capture of one experiment.
 
     Attributes:
-        name: What to call it.
-        kind: Purpose of the capture.
-        samples: Dtype ``SAMPLE``, raw.
+        name: Name in tables and figures.
+        kind: Kind of the experiment.
+        samples: Raw samples, dtype ``SAMPLE``.
     """
 
     name: str
@@ -81,22 +80,23 @@ def kind_of(name: str, samples: SampleBlock, capacity_ah: float) -> Kind:
     current_a = good["current_a"]
     rest_a = rest_current_a(current_a, capacity_ah)
     resting = np.abs(current_a) < rest_a
-    if resting.mean() < REST_SHARE:
+    if resting.mean() < MAX_REST_FRACTION:
         loaded = current_a[~resting]
-        return Kind.CONSTANT if loaded.std() < STEADY * abs(loaded.mean()) else Kind.STEPS
+        return Kind.CONSTANT if loaded.std() < MAX_VARIATION * abs(loaded.mean()) else Kind.STEPS
     loaded = current_a[~resting & (np.r_[0.0, np.abs(np.diff(current_a))] < rest_a)]
-    if loaded.size and loaded.std() < STEADY * abs(loaded.mean()):
+    if loaded.size and loaded.std() < MAX_VARIATION * abs(loaded.mean()):
         return Kind.RELAXATION
     return Kind.STEPS
 
 
 class Procedure:
-    """Chapter 5 on one pack.
+    """Procedure of chapter 5 on one pack.
 
     Args:
-        cell: Supplies capacity, limits, and the bounds of (3.18) if it has any, otherwise those of Table 10; its elements and OCV are not used.
-        captures: At least one relaxation test, and one constant load or steps; discharging.
-        voltage_step_v: One step of the voltage converter [V].
+        cell: Capacity, limits, and bounds of (3.18) of the cell. Without bounds those of Table 10 are used; elements and
+            OCV of the cell are not used.
+        captures: Discharging captures: at least one relaxation test, and one constant load or steps.
+        voltage_step_v: Resolution of the voltage [V].
     """
 
     def __init__(self, cell: CellModel, captures: Sequence[Capture], voltage_step_v: float) -> None:
@@ -115,19 +115,19 @@ class Procedure:
 
     @property
     def loads(self) -> list[Capture]:
-        """Captures that the model is compared on: constant loads and steps. All but ``smallest`` validate."""
+        """Captures with which the model is compared: constant loads and steps. All but ``smallest`` validate."""
         return self.of(Kind.CONSTANT, Kind.STEPS)
 
     @property
     def validating(self) -> list[Capture]:
-        """Loads that gave the model they are compared with no parameter."""
+        """Loads from which no parameter of the compared model was estimated."""
         return [capture for capture in self.loads if capture is not self.smallest]
 
     # Step 1 -----------------------------------------------------------------------------------------------------
 
     @cached_property
     def tests(self) -> list[RelaxationTest]:
-        """The voltage relaxation tests."""
+        """Evaluated voltage relaxation tests."""
         return [
             relaxation_test(
                 c.samples, self.cell.cell.capacity_ah, series_count=self.cell.cell.series_count, name=c.name
@@ -137,34 +137,34 @@ class Procedure:
 
     @cached_property
     def single_fits(self) -> list[ChenMoraFit]:
-        """(2.10) fitted to each test, for (5.1)-(5.2)."""
+        """Fits of (2.10) to each test, for (5.1)-(5.2)."""
         return [fit_chen_mora(pooled([test])) for test in self.tests]
 
     @cached_property
     def joint_fit(self) -> ChenMoraFit:
-        """(2.10) fitted to all tests together."""
+        """Fit of (2.10) to all tests together."""
         return fit_chen_mora(pooled(self.tests))
 
     @cached_property
     def table(self) -> TableFit:
-        """The monotone table through the points of all tests."""
+        """Monotone table through the points of all tests."""
         return fit_table(pooled(self.tests))
 
     @cached_property
     def lowest_soc(self) -> float:
-        """Return the SOC at which validation ends: ``LOWEST_SOC``, or above it the last point of step 1 of all tests.
+        """SOC at which validation ends: ``LOWEST_SOC``, or the lowest point of all relaxation tests if that is higher.
 
-        Below that (2.10) is a guess.
+        Below the lowest point (2.10) is extrapolated.
         """
         return max(LOWEST_SOC, min(float(test.soc.min()) for test in self.tests))
 
     @cached_property
     def with_ocv(self) -> CellModel:
-        """The cell with the fitted (2.10)."""
+        """Cell with the fitted (2.10)."""
         return self.cell.model_copy(update={"ocv": self.joint_fit.ocv})
 
     def initial_soc(self, capture: Capture) -> float:
-        """1 if the capture starts as full as the relaxation tests do, otherwise from its first voltage at rest."""
+        """Return the initial SOC: 1 if the capture starts full, otherwise from its first voltage at rest."""
         first = remove_glitches(capture.samples, capture.name)[0]
         full_v = float(self.table.ocv_v[-1])
         if capture.kind is Kind.RELAXATION or abs(first["current_a"]) > 0.01 * self.cell.cell.capacity_ah:
@@ -180,14 +180,14 @@ class Procedure:
     def smallest(self) -> Capture:
         """Constant load of the smallest current, because Algorithm 1 needs a very small one.
 
-        A relaxation test, if that load is the only one to validate with, or missing.
+        It is a relaxation test if there is no constant load, or if that load is the only one for validation.
         """
         spare = len(self.loads) > 1 and self.of(Kind.CONSTANT)
         return min(spare or self.of(Kind.RELAXATION), key=lambda c: float(np.mean(c.samples["current_a"])))
 
     @cached_property
     def adaptive(self) -> AdaptiveRun:
-        """Algorithm 1 on it."""
+        """Run of Algorithm 1 on ``smallest``."""
         estimator = Estimator(
             self.with_ocv,
             ObserverSettings(),
@@ -201,36 +201,36 @@ class Procedure:
 
     @property
     def step_3(self) -> list[Capture]:
-        """Each relaxation test, and each constant load up to ``LARGEST_C``."""
-        largest_a = LARGEST_C * self.cell.cell.capacity_ah
-        constant = [c for c in self.of(Kind.CONSTANT) if np.median(c.samples["current_a"]) <= largest_a]
+        """Captures of step 3: relaxation tests, and constant loads up to ``MAX_STEP_3_C``."""
+        max_a = MAX_STEP_3_C * self.cell.cell.capacity_ah
+        constant = [c for c in self.of(Kind.CONSTANT) if np.median(c.samples["current_a"]) <= max_a]
         return [*constant, *self.of(Kind.RELAXATION)]
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
-        """R_s by (4.2) for each of these."""
+        """R_s by (4.2) for each capture of ``step_3``."""
         a = self.adaptive.average
         return {c.name: series_resistance(self.with_ocv, self._predict(c, a)) for c in self.step_3}
 
     @cached_property
     def r_s_mean(self) -> SeriesResistance:
-        """Their mean, as in Fig. 31, each weighted by its current squared (E19)."""
+        """Mean of ``r_s_curves`` as in Fig. 31, weighted by the square of the current (E19)."""
         return mean_of(list(self.r_s_curves.values()))
 
     @cached_property
     def r_s_fit(self) -> SeriesResistanceFit:
-        """a13..a15."""
+        """Fit of a13..a15 to ``r_s_mean``."""
         return fit_series_resistance(self.r_s_mean, self.lowest_soc)
 
     def r_s_without(self, name: str) -> SeriesResistanceFit:
-        """Return the R_s of all captures but ``name``."""
+        """Return the fit of a13..a15 to all captures of step 3 but ``name``."""
         if name not in self.r_s_curves:
             return self.r_s_fit
         others = [curve for load, curve in self.r_s_curves.items() if load != name]
         return fit_series_resistance(mean_of(others), self.lowest_soc)
 
     def a_for(self, name: str) -> Floats:
-        """a1..a15 for the load ``name``, with nothing of it in a13..a15. Shape (16,)."""
+        """Return a1..a15 for the load ``name``, with a13..a15 estimated without that load. Shape (16,)."""
         a = self.adaptive.average.copy()
         a[13:16] = self.r_s_without(name).a
         return a
@@ -242,21 +242,21 @@ class Procedure:
 
     @cached_property
     def dynamic(self) -> dict[str, Prediction]:
-        """The estimated model, frozen, on every load (5.3)."""
+        """Predictions of the estimated model, with frozen parameters, for every load (5.3)."""
         return {c.name: self._predict(c, self.a_for(c.name)) for c in self.loads}
 
     @cached_property
     def static(self) -> dict[str, Prediction]:
-        """Run the model with its elements fixed at one SOC (chapter 6)."""
+        """Predictions of the model with its elements fixed at one SOC, for every load (chapter 6)."""
         return {c.name: self._predict(c, static_elements(self.a_for(c.name), STATIC_SOC)) for c in self.loads}
 
     @cached_property
     def largest(self) -> str:
-        """Name of the constant load of the largest current, the bulb of Fig. 41; without one, of the first load."""
+        """Name of the constant load with the largest current (the bulb in Fig. 41); without one, of the first load."""
         constant = self.of(Kind.CONSTANT) or self.loads[:1]
         return max(constant, key=lambda c: float(np.median(c.samples["current_a"]))).name
 
     def interpolated(self, name: str) -> tuple[Floats, Floats]:
-        """SOC and E_o by 7.1 over the run of the load ``name``."""
+        """Return SOC and E_o by the interpolation of section 7.1 over the load ``name``."""
         cell = self.with_ocv.model_copy(update={"r_s": self.r_s_without(name).element})
         return soc_by_interpolation(cell, self.dynamic[name])

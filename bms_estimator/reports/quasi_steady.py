@@ -1,8 +1,8 @@
-"""Response of (3.1)-(3.3) to a constant current with true parameters: errata 15, 16 and 27.
+"""Response of (3.1)-(3.3) to a constant current with true parameters, for errata 15, 16 and 27.
 
-Both branches are driven by one u, where the cell's are by i/C_ts and i/C_tl. When x2^, x3^ change slowly, u =
-x2^/tau_ts = x3^/tau_tl: their ratio is tau_ts to tau_tl, the cell's R_ts to R_tl. And u = -N e is not zero, so e is
-not.
+Both RC pairs of the observer are driven by one input u, but those of the cell by i/C_ts and i/C_tl. If x2^ and x3^ change
+slowly, u = x2^/tau_ts = x3^/tau_tl. Therefore x2^ : x3^ is tau_ts : tau_tl in the observer and R_ts : R_tl in the cell.
+Since u = -N e is not zero, e is not zero either.
 """
 
 from dataclasses import dataclass
@@ -15,22 +15,23 @@ from bms_estimator.model.cell import Bounds, CellModel
 from bms_estimator.reports.simulation import block, observer_settings, with_bounds
 
 STEP_S = 0.1
-HELD_S = 1800.0
-"""Time for which the current is held [s]: eight times tau_tl."""
+"""Simulation step [s]."""
+DURATION_S = 1800.0
+"""Duration of the constant current [s]: eight times tau_tl."""
 
 
 @dataclass(frozen=True)
 class QuasiSteady:
-    """Cell and observer at the end of the held current.
+    """Cell and observer at the end of the constant current.
 
     Attributes:
         cell_v: x2 and x3 of the cell [V].
         observer_v: x2^ and x3^ [V].
-        tau_s: tau_ts and tau_tl of both [s].
-        ohmic_v: i R_s, which (2.4) takes off the terminal voltage [V].
-        driven_v: u R_s, which (3.14) takes off in its place [V ohm/s].
-        error_v: e as the observer has it [V].
-        predicted_v: -x2^ / (N tau_ts), the e that keeps x2^ where it is [V].
+        tau_s: tau_ts and tau_tl of both cell and observer [s].
+        ohmic_v: i R_s, which (2.4) subtracts from the terminal voltage [V].
+        driven_v: u R_s, which (3.14) subtracts instead [V ohm/s].
+        error_v: Error e of the observer [V].
+        predicted_v: -x2^ / (N tau_ts), the error e at which x2^ is constant [V].
     """
 
     cell_v: tuple[float, float]
@@ -43,20 +44,20 @@ class QuasiSteady:
 
 
 def quasi_steady(cell: CellModel, current_a: float) -> QuasiSteady:
-    """Hold ``current_a`` [A] on a full cell while the observer runs with a1..a12 at the cell's own."""
+    """Simulate a full cell and the observer at a constant ``current_a`` [A], with the cell's a1..a12 in the observer."""
     a, capacity_as = cell.a, cell.cell.capacity_ah * 3600.0
     x = (1.0, 0.0, 0.0)
-    time_s = np.arange(0.0, HELD_S, STEP_S)
+    time_s = np.arange(0.0, DURATION_S, STEP_S)
     voltage_v = np.empty(time_s.size)
     for n in range(time_s.size):
         voltage_v[n] = terminal_voltage(x, current_a, a)
         x = cell_step(x, current_a, STEP_S, capacity_as, a)
-    own = {
+    centred = {
         i: Bounds(upper=1.5 * a[i], lower=0.5 * a[i], weight_upper=50.0, weight_lower=50.0, initial=a[i])
         for i in range(1, 13)
     }
     estimator = Estimator(
-        with_bounds(cell, own),
+        with_bounds(cell, centred),
         observer_settings("improved"),
         identifier=None,
         voltage_resolution_v=1e-6,

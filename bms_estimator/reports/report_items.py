@@ -5,37 +5,38 @@ from enum import Enum
 
 
 class Reproduction(Enum):
-    """Reproduction of a table or figure."""
+    """Verdict on the reproduction of a table or figure."""
 
     FITTED = "fitted"
     """Agrees with print after corrections and after fitting free parameters that the thesis does not print."""
     RECOMPUTED = "recomputed"
-    """Computed from printed values, compared with nothing: the thesis prints no value of it."""
+    """Computed from printed values, without comparison, because the thesis prints no value of it."""
     NO_DATA = "no data printed"
     """The recording, load or model behind it is not published."""
     CONTRADICTED = "contradicted by the thesis's own numbers"
     """Other printed numbers of the thesis give another result."""
     CLAIM_HOLDS = "claim tested on other data: holds"
-    """Verdict on a claim of the thesis about its recordings, tested on others."""
+    """A claim of the thesis about its recordings also holds on other captures."""
     CLAIM_FAILS = "claim tested on other data: fails"
+    """A claim of the thesis about its recordings does not hold on other captures."""
     GIVEN = "given"
     """Input data, a diagram or a photograph: there is nothing to compute."""
     ADDED = "added"
-    """Label of an item that is not in the thesis."""
+    """Item that is not in the thesis."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table: printed beside recomputed.
+    """Table of printed and recomputed values.
 
     Attributes:
-        key: "5" for Table 5 of the thesis; the name of one that is not in it.
+        key: "5" for Table 5 of the thesis; the name of an added table.
         title: Caption.
         columns: Headings.
-        rows: One list of cells for each row.
-        verdict: What became of it.
-        reason: Why it differs from print, or what the agreement rests on.
-        free: Free parameters of a fit; 0 without one.
+        rows: Cells of each row.
+        verdict: Verdict on the reproduction.
+        reason: Reason for differences from print, or basis of the agreement.
+        free: Number of free parameters of a fit; 0 without one.
     """
 
     key: str
@@ -51,14 +52,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure.
+    """Figure with recomputed curves.
 
     Attributes:
         key: "19" for Figure 19 of the thesis.
         title: Caption.
         svg: The plot, one ``<svg>`` element; empty for a diagram or photograph.
-        verdict: What became of it.
-        reason: Content, and difference from print with its reason.
+        verdict: Verdict on the reproduction.
+        reason: Content, and reason for differences from print.
     """
 
     key: str
@@ -74,19 +75,19 @@ Item = Table | Figure
 
 
 def name(item: Item) -> str:
-    """Table 5, Figure 19; an item that is not in the thesis by its key alone."""
+    """Return the name of an item, such as Table 5 or Figure 19; for an added item, its key."""
     return item.key if item.verdict is Reproduction.ADDED else f"{item.kind} {item.key}"
 
 
 def label(item: Item) -> str:
-    """Verdict in words; of a fit with the number of its free parameters."""
+    """Return the verdict as text, for a fit with its number of free parameters."""
     if item.verdict is Reproduction.FITTED and isinstance(item, Table):
         return f"{item.verdict.value}, {item.free} free parameters"
     return item.verdict.value
 
 
 def number(value: float, digits: int = 4) -> str:
-    """Format a number for tables: significant digits, no needless exponent."""
+    """Format a number for tables with significant digits and, if possible, without exponent."""
     if value != value:  # NaN  # noqa: PLR0124
         return "-"
     text = f"{value:.{digits}g}"
@@ -96,6 +97,6 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def percent(value: float, true: float) -> str:
-    """Error of ``value`` in percent of the true value (E7)."""
+    """Format the error of ``value`` in percent of the true value (E7)."""
     error = 100.0 * abs(value - true) / abs(true)
     return "0" if error < 1e-4 else number(error, 3)

@@ -1,9 +1,9 @@
-"""A simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5, seen through the simulated sensor chain.
+"""Simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5, measured by a simulated sensor chain.
 
-The pack has the open-circuit voltage of Table 8, the R_s of Table 9 and, as Fig. 29 compares with, the R_ts, R_tl, C_ts,
-C_tl of Chen and Mora: they lie within the bounds of Table 10 but not at their Lemma 4.1.3 limits. Loads are the
-resistors of 5.1, whose currents differ from the printed ones (E21); the bulb is the resistor that draws its printed
-current. The voltage passes a divider, the current a +-10 A sensor; noise is half a step either way, in addition to
+The pack has the open-circuit voltage of Table 8, the R_s of Table 9, and the R_ts, R_tl, C_ts, C_tl of Chen and Mora, with
+which Fig. 29 compares. These lie within the bounds of Table 10, but not at their Lemma 4.1.3 limits. The loads are the
+resistors of 5.1, whose currents differ from the printed ones (E21). The bulb is a resistor with the bulb's printed
+current. The voltage is measured by a divider, the current by a +-10 A sensor. Noise is uniform within half a step, before
 rounding.
 """
 
@@ -24,15 +24,16 @@ CURRENT_RANGE_A = 20.0
 MEAN_VOLTAGE_V = 23.0
 """Mean voltage of the pack over a discharge [V], which converts the bulb's mean current to a resistance."""
 QUARTER_HOUR_S = 900.0
+"""Duration of a pulse and of a rest [s]."""
 LOWEST_SOC = 0.012
-"""Discharges end here, just above delta2 of the true pack."""
+"""SOC at the end of a discharge, just above delta2 of the true pack."""
 VARIABLE_STEPS = ((600.0, "12.5 ohm"), (300.0, "50 W bulb"), (900.0, "12.5 ohm"), (420.0, ""), (240.0, "50 W bulb"))
-"""Test protocol 4: seconds, load; the thesis does not print its own."""
+"""Durations [s] and loads of test protocol 4, which the thesis does not print."""
 
 
 @dataclass(frozen=True)
 class SensorChain:
-    """Divider, current sensor, converter.
+    """Sensor chain of divider, current sensor and converter.
 
     Attributes:
         bits: Number of bits of the converter: 10 for an Arduino, 16 for the dSpace board of the thesis.
@@ -42,22 +43,22 @@ class SensorChain:
 
     @property
     def voltage_step_v(self) -> float:
-        """One step of the voltage [V]."""
+        """Resolution of the voltage [V]."""
         return float(VOLTAGE_RANGE_V / 2**self.bits)
 
     @property
     def current_step_a(self) -> float:
-        """One step of the current [A]."""
+        """Resolution of the current [A]."""
         return float(CURRENT_RANGE_A / 2**self.bits)
 
     def read(self, samples: SampleBlock, seed: int) -> SampleBlock:
-        """Return the board's reading of true samples."""
+        """Return the measured values of true samples."""
         noise = np.random.default_rng(seed)
-        seen = samples.copy()
+        measured = samples.copy()
         for name, step in (("voltage_v", self.voltage_step_v), ("current_a", self.current_step_a)):
             jitter = noise.uniform(-0.5, 0.5, samples.size)
-            seen[name] = np.rint(samples[name] / step + jitter) * step
-        return seen
+            measured[name] = np.rint(samples[name] / step + jitter) * step
+        return measured
 
 
 def pack() -> CellModel:
@@ -70,7 +71,7 @@ def pack() -> CellModel:
 
 
 def resistance_ohm(load: str) -> float:
-    """Resistance of a load; infinite without one."""
+    """Return the resistance of a load; infinite without a load."""
     if not load:
         return float("inf")
     return printed_values.RESISTORS_OHM.get(load, MEAN_VOLTAGE_V / printed_values.CURRENTS_A[load])
@@ -104,18 +105,18 @@ def experiments() -> list[Capture]:
     """Simulate the experiments of chapter 5: relaxation tests, constant loads, steps."""
     cell = pack()
     rest, pulse = (QUARTER_HOUR_S, ""), (QUARTER_HOUR_S, "12.5 ohm")
-    found = [
+    simulated = [
         Capture(f"relaxation {load}", Kind.RELAXATION, run_down(cell, [(QUARTER_HOUR_S, load), rest]))
         for load in printed_values.CURRENTS_A
     ]
-    # the observer runs on the smallest current: at 5 Hz; the others only validate
-    found += [
+    # the observer runs only on the smallest current, which is therefore sampled at 5 Hz
+    simulated += [
         Capture(load, Kind.CONSTANT, run_down(cell, [(QUARTER_HOUR_S, load)], 0.2 if load == "50 ohm" else 1.0))
         for load in printed_values.CURRENTS_A
     ]
-    found.append(Capture("constant steps", Kind.STEPS, run_down(cell, [rest, pulse])))
-    found.append(Capture("variable steps", Kind.STEPS, run_down(cell, list(VARIABLE_STEPS))))
-    return found
+    simulated.append(Capture("constant steps", Kind.STEPS, run_down(cell, [rest, pulse])))
+    simulated.append(Capture("variable steps", Kind.STEPS, run_down(cell, list(VARIABLE_STEPS))))
+    return simulated
 
 
 def captures(true: list[Capture], chain: SensorChain) -> list[Capture]:

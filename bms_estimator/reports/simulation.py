@@ -1,7 +1,7 @@
-"""The thesis's simulations: schemes 1 to 3 (3.2.5) and the improved method (4.1.1) on the cell of Chen and Mora.
+"""Simulations of the thesis: schemes 1 to 3 (3.2.5) and the improved method (4.1.1) on the cell of Chen and Mora.
 
-What the thesis does not print is declared here: N(k) = E_2.5(-k^2.5), k0 = 0, x2(0) = x3(0) = 0, no sensor noise. Where
-the printed weights give other estimates than the printed ones, those inferred hold (E4, E24, E32).
+Values that the thesis does not print are chosen as N(k) = E_2.5(-k^2.5), k0 = 0, x2(0) = x3(0) = 0, without sensor noise.
+If the printed weights contradict the printed estimates, the inferred weights are used (E4, E24, E32).
 """
 
 from dataclasses import dataclass
@@ -28,48 +28,50 @@ from bms_estimator.reports import printed_values
 from bms_estimator.settings.observer import ObserverSettings
 
 STEP_S = 0.01
-"""The thesis's 100 Hz."""
+"""Sample interval of the thesis, 100 Hz [s]."""
 CURRENT_A = 0.275
-"""1C of the 275 mAh cell (E12)."""
+"""Current of 1C of the 275 mAh cell (E12) [A]."""
 SMALL_CURRENT_A = 0.0275
-"""C/10, for step 2: Algorithm 1 needs a very small current; the thesis does not print the one it used."""
+"""Current of C/10 for step 2 [A]. Algorithm 1 needs a very small current, which the thesis does not print."""
 R_S_CURRENTS_A = (0.1, 0.275, 0.55)
 """Currents for (4.2) [A]; the thesis does not print its own."""
 LOWEST_SOC = 0.05
-"""Errors over SOC are taken from here to 1: below, the elements run off (E14)."""
+"""Lower end of the SOC range of errors: below it the elements diverge (E14)."""
 SOC_GRID = np.linspace(LOWEST_SOC, 1.0, 951)
+"""SOC range of errors."""
 PULSE_S = 600.0
 """Half period of the pulsed load of Fig. 39."""
 STATIC_SOC = 0.5
 """SOC at which the static model's elements are frozen; the thesis does not print its own."""
 FINAL_SOC = 0.02
-"""The estimated model is compared with the cell down to here; Table 5's estimates give delta2 = 0.0179."""
-ROUNDED_EPSILON_V = 1e-3
+"""SOC at which the comparison of model and cell ends, above delta2 = 0.0179 of Table 5's estimates."""
+EPSILON_V = 1e-3
 """eps2 of Algorithm 1 in simulation [V]."""
 START_OVER_S = 60.0
-"""t_int of (3.19) for a start far off: |e| then settles late, near eps2 [s]."""
+"""t_int of (3.19) for a start with a large error, after which |e| settles late [s]."""
 START_TIMES_S = np.r_[np.arange(0.0, 10.0, 0.0002), np.arange(10.0, START_OVER_S, STEP_S)]
-"""Samples of such a start [s]. The kernel's step holds N, which falls as k grows until e has settled: at 0.2 ms its result is
-that of the differential equations to four digits, at 10 ms the fitted lambda is 2 % larger."""
+"""Sample times of a start with a large error [s]. The kernel keeps N constant during a step, although N decreases while k
+grows. With steps of 0.2 ms the result agrees with the differential equations to four digits; with 10 ms the fitted lambda
+is 2 % larger."""
 AFTER_START_S = 1.0
-"""Sample interval after it [s]."""
+"""Sample interval after ``START_TIMES_S`` [s]."""
 ALPHA, OTHER_ALPHA = 2.5, 2.9
 """Alpha of (3.10): the default, and another one that fits Tables 2 and 3."""
 HIGH_CURRENT_A = 4.0 * CURRENT_A
-"""4C: more than the thesis's simulations draw by far."""
+"""Current of 4C, far above the currents of the thesis's simulations [A]."""
 
 
 @dataclass(frozen=True)
 class OneStart:
-    """Schemes 1 and 2 from one start: two unprinted numbers, so chosen that both move as printed.
+    """Runs of schemes 1 and 2 from a start fitted to both printed tables.
 
     Attributes:
-        start_v: x2(t0) + x3(t0), each half of it [V].
+        start_v: x2(t0) + x3(t0), with x2(t0) = x3(t0) [V].
         start_error_v: e(t0) [V].
         lambda_: lambda of (3.10).
         alpha: Exponent alpha of (3.10), chosen and not fitted.
-        scheme_1: The run of (3.16).
-        scheme_2: The run of (3.17).
+        scheme_1: Run of (3.16).
+        scheme_2: Run of (3.17).
     """
 
     start_v: float
@@ -81,7 +83,7 @@ class OneStart:
 
 
 def block(time_s: Floats, current_a: Floats, voltage_v: Floats) -> SampleBlock:
-    """Arrays as samples."""
+    """Return arrays as samples."""
     samples = np.zeros(time_s.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"], samples["voltage_v"] = time_s, current_a, voltage_v
     samples["temperature_c"] = np.nan
@@ -92,10 +94,10 @@ def discharge(cell: CellModel, current_a: float, step_s: float, first_s: Floats 
     """Simulate a full cell under constant current down to SOC 0.005.
 
     Args:
-        cell: The cell.
-        current_a: Positive on discharge [A].
+        cell: Cell to simulate.
+        current_a: Current, positive on discharge [A].
         step_s: Sample interval [s].
-        first_s: Times of the first samples, up to where ``step_s`` begins [s].
+        first_s: Times of the first samples, after which ``step_s`` applies [s].
     """
     seconds = 0.995 * cell.cell.capacity_ah * 3600.0 / current_a
     time_s = np.arange(0.0, seconds, step_s)
@@ -107,8 +109,8 @@ def discharge(cell: CellModel, current_a: float, step_s: float, first_s: Floats 
 
 
 def observer_settings(law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> ObserverSettings:
-    """Return the settings as printed: no dead zone, no restart of k; the sign of N by erratum 1."""
-    printed_law = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "epsilon_v": ROUNDED_EPSILON_V}
+    """Return the printed settings, without dead zone and without reset of k; the sign of N is that of erratum 1."""
+    printed_law = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "epsilon_v": EPSILON_V}
     return ObserverSettings.model_validate(printed_law | {"lambda": lambda_, "alpha": alpha})
 
 
@@ -123,14 +125,14 @@ def table_5_cell() -> CellModel:
 
 
 class Simulation:
-    """All runs of the simulation part, each computed on first use."""
+    """Runs of the simulations of chapters 3 and 4, each computed on first use."""
 
     def __init__(self) -> None:
         self.cell = table_5_cell()
 
     @cached_property
     def truth(self) -> SampleBlock:
-        """The cell of Chen and Mora under 0.275 A at 100 Hz."""
+        """Samples of the cell of Chen and Mora at 0.275 A and 100 Hz."""
         return discharge(self.cell, CURRENT_A, STEP_S)
 
     def _scheme(self, law: str) -> AdaptiveRun:
@@ -138,7 +140,7 @@ class Simulation:
         return adaptive_run(self._observer(law), self.truth)
 
     def _observer(self, law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> Estimator:
-        """Make a scheme with the rates and targets of Tables 2 to 4."""
+        """Return an observer with the rates and targets of Tables 2 to 4."""
         settings = observer_settings(law, lambda_, alpha)
         estimator = Estimator(self.cell, settings, identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0)
         record = estimator.settings[0]
@@ -156,7 +158,7 @@ class Simulation:
 
     @cached_property
     def started_truth(self) -> SampleBlock:
-        """The cell under 0.275 A, sampled faster in its first minute."""
+        """Samples of the cell at 0.275 A, with a shorter interval in the first minute."""
         return discharge(self.cell, CURRENT_A, AFTER_START_S, START_TIMES_S)
 
     def _started(self, law: str, start_v: float, lambda_: float, alpha: float) -> AdaptiveRun:
@@ -168,52 +170,52 @@ class Simulation:
 
     @cached_property
     def scheme_1(self) -> AdaptiveRun:
-        """(3.16), from the rounded values of Table 2."""
+        """Run of (3.16) from the rounded values of Table 2."""
         return self._scheme("scheme-1")
 
     @cached_property
     def scheme_2(self) -> AdaptiveRun:
-        """(3.17), from the rounded values of Table 3."""
+        """Run of (3.17) from the rounded values of Table 3."""
         return self._scheme("scheme-2")
 
     @cached_property
     def scheme_3(self) -> AdaptiveRun:
-        """(3.18) for a1, a3, a6, a13, a15 with the bounds of Table 4; the others as (3.16)."""
+        """Run of (3.18) for a1, a3, a6, a13, a15 with the bounds of Table 4, and of (3.16) for the others."""
         return self._scheme("scheme-3")
 
     @cached_property
     def one_start(self) -> OneStart:
-        """Schemes 1 and 2 from the start and with the lambda that move a2 by as much as Tables 2 and 3 print."""
+        """Schemes 1 and 2 with the start and lambda for which a2 changes as printed in Tables 2 and 3."""
         return self._fit_start(ALPHA, 1.4, 9.0)
 
     @cached_property
     def other_starts(self) -> tuple[OneStart, OneStart]:
-        """Two others that do: one of the opposite sign, one with another alpha."""
+        """Two other solutions for the start: one of the opposite sign, one with another alpha."""
         return self._fit_start(ALPHA, -1.4, 9.0), self._fit_start(OTHER_ALPHA, 1.4, 17.0)
 
     def _fit_start(self, alpha: float, near_v: float, near_lambda: float) -> OneStart:
         shifts = {"scheme-1": printed_values.TABLE_2_SHIFT, "scheme-2": printed_values.TABLE_3_SHIFT}
 
-        def off(unknown: Floats) -> list[float]:
+        def residuals(unknown: Floats) -> list[float]:
             runs = (self._started(law, unknown[0], unknown[1], alpha) for law in shifts)
             return [
                 float(run.average[2] - printed_values.CHEN_MORA_ROUNDED[1]) / shift - 1.0
                 for run, shift in zip(runs, shifts.values(), strict=True)
             ]
 
-        start_v, lambda_ = least_squares(off, (near_v, near_lambda), xtol=1e-3).x
+        start_v, lambda_ = least_squares(residuals, (near_v, near_lambda), xtol=1e-3).x
         runs = [self._started(law, start_v, lambda_, alpha) for law in shifts]
         ohmic_v, loop = CURRENT_A * r_s(1.0, self.cell.a), 1.0 + r_s(1.0, np.r_[0.0, printed_values.CHEN_MORA_ROUNDED])
         error_v = (start_v - ohmic_v) / loop  # (3.15) with (3.14), N(0) = 1
         return OneStart(float(start_v), float(error_v), float(lambda_), alpha, runs[0], runs[1])
 
     def frozen(self, a: Floats, lowest_soc: float = 0.01) -> Prediction:
-        """Run a model with constant parameters ``a`` under the current of ``truth``; every tenth sample."""
+        """Run a model with constant parameters ``a`` over every tenth sample of ``truth``."""
         return predict(self.cell, self.truth[::10], 1.0, a=a, lowest_soc=lowest_soc)
 
     @cached_property
     def improved(self) -> AdaptiveRun:
-        """The improved method with the settings of Table 5 (a7, a8: E4, E24) at C/10."""
+        """Run of the improved method with the settings of Table 5 (a7, a8: E4, E24) at C/10."""
         samples = discharge(self.cell, SMALL_CURRENT_A, 10.0 * STEP_S)
         estimator = Estimator(
             self.cell, observer_settings("improved"), identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0
@@ -229,12 +231,12 @@ class Simulation:
 
     @cached_property
     def printed_a(self) -> Floats:
-        """a1..a15 as Tables 5 and 6 print them, shape (16,)."""
+        """Printed a1..a15 of Tables 5 and 6, shape (16,)."""
         return printed_values.tables_5_and_6()
 
     @cached_property
     def r_s_curves(self) -> dict[float, SeriesResistance]:
-        """R_s by (4.2) for each current, with a1..a12 as estimated."""
+        """R_s by (4.2) for each current, with the estimated a1..a12."""
         return {i: self._r_s(i, self.improved.average) for i in R_S_CURRENTS_A}
 
     def _r_s(self, current_a: float, a: Floats) -> SeriesResistance:
@@ -243,17 +245,17 @@ class Simulation:
 
     @cached_property
     def r_s_mean(self) -> SeriesResistance:
-        """Their mean, as in Fig. 22."""
+        """Mean of ``r_s_curves``, as in Fig. 22."""
         return mean_of(list(self.r_s_curves.values()))
 
     @cached_property
     def r_s_fit(self) -> SeriesResistanceFit:
-        """a13..a15."""
+        """Fit of a13..a15 to ``r_s_mean``."""
         return fit_series_resistance(self.r_s_mean, LOWEST_SOC)
 
     @cached_property
     def pulsed(self) -> SampleBlock:
-        """The true cell under a pulsed 1C load, from full to empty."""
+        """Samples of the true cell under a pulsed 1C load, from full to empty."""
         time_s = np.arange(0.0, 2.0 * 0.97 * 3600.0, 1.0)
         current_a = np.where(time_s % (2.0 * PULSE_S) < PULSE_S, CURRENT_A, 0.0)
         capacity_as = self.cell.cell.capacity_ah * 3600.0
@@ -265,12 +267,12 @@ class Simulation:
         return predict(self.cell, self.pulsed, 1.0, a=a, lowest_soc=lowest_soc)
 
     def constant_error_percent(self, current_a: float) -> float:
-        """Mean error of the printed Tables 5 and 6 under a constant current, down to ``FINAL_SOC`` [%]."""
+        """Return the mean error of the printed Tables 5 and 6 at a constant current, down to ``FINAL_SOC`` [%]."""
         samples = discharge(self.cell, current_a, 1.0)
         return predict(self.cell, samples, 1.0, a=self.printed_a, lowest_soc=FINAL_SOC).mean_percent
 
     def printed_r_s_plateau(self, current_a: float) -> float:
-        """a15 of (4.2) with the printed Table 5 [ohm]: R_s at half charge, where a13 has no part in it."""
+        """Return a15 of (4.2) with the printed Table 5 [ohm]: R_s at SOC 0.5, where the term of a13 vanishes."""
         curve = self._r_s(current_a, self.printed_a)
         return float(np.interp(0.5, curve.soc, curve.r_s_ohm))
 
@@ -291,6 +293,6 @@ def element(name: str, a: Floats, soc: Floats = SOC_GRID) -> Floats:
 
 
 def mean_error_percent(name: str, a: Floats, true: Floats) -> float:
-    """Mean error of an element over ``SOC_GRID``, of the true value [%] (E7)."""
-    right = element(name, true)
-    return float(np.mean(np.abs(element(name, a) - right) / np.abs(right)) * 100.0)
+    """Return the mean error of an element over ``SOC_GRID`` relative to the true value [%] (E7)."""
+    true_values = element(name, true)
+    return float(np.mean(np.abs(element(name, a) - true_values) / np.abs(true_values)) * 100.0)

@@ -22,10 +22,11 @@ from bms_estimator.reports.simulation import (
 from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
 from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
-NO_VALUES = "The thesis prints no value of the figure: compared with nothing."
+NO_VALUES = "The thesis prints no value of the figure that could be compared."
 WHOLE = np.linspace(0.0, 1.0, 1001)
+"""Whole range of SOC."""
 WEAK_SOC = (0.85, 0.7)
-"""SOC at which the weak batteries of Fig. 43 begin."""
+"""Initial SOC of the weak batteries in Fig. 43."""
 
 
 def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, float] | None = None) -> Figure:
@@ -42,37 +43,37 @@ def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, 
 
 
 def figure_3(s: Simulation) -> Figure:
-    """E_o."""
+    """Draw E_o."""
     return curve("3", "Open-circuit voltage E_o over SOC, (2.10)", "V", np.array([emf(x, s.cell.a) for x in WHOLE]))
 
 
 def figure_4(s: Simulation) -> Figure:
-    """R_s."""
+    """Draw R_s."""
     return curve("4", "R_s over SOC, (2.9)", "Ω", np.array([r_s(x, s.cell.a) for x in WHOLE]))
 
 
 def figure_5(s: Simulation) -> Figure:
-    """R_ts."""
+    """Draw R_ts."""
     return curve("5", "R_ts over SOC, (2.5)", "Ω", element("R_ts", s.cell.a, WHOLE))
 
 
 def figure_6(s: Simulation) -> Figure:
-    """C_ts."""
+    """Draw C_ts."""
     return curve("6", "C_ts over SOC, (2.7)", "F", element("C_ts", s.cell.a, WHOLE))
 
 
 def figure_7(s: Simulation) -> Figure:
-    """R_tl."""
+    """Draw R_tl."""
     return curve("7", "R_tl over SOC, (2.6)", "Ω", element("R_tl", s.cell.a, WHOLE), (0.0, 0.5))
 
 
 def figure_8(s: Simulation) -> Figure:
-    """C_tl."""
+    """Draw C_tl."""
     return curve("8", "C_tl over SOC, (2.8)", "F", element("C_tl", s.cell.a, WHOLE))
 
 
 def figure_9(_: Simulation) -> Figure:
-    """Draw the block diagram."""
+    """Return the entry of the block diagram."""
     return Figure(
         "9",
         "Mittag-Leffler function as a Nussbaum function: block diagram",
@@ -83,7 +84,7 @@ def figure_9(_: Simulation) -> Figure:
 
 
 def figure_10(_: Simulation) -> Figure:
-    """N(k)."""
+    """Draw N(k)."""
     k = np.linspace(0.0, 14.0, 1500)
 
     def draw(axes: Any) -> None:
@@ -101,14 +102,13 @@ def figure_10(_: Simulation) -> Figure:
         "Mittag-Leffler function as a Nussbaum function: output",
         plot(draw, salt="figure-10"),
         Reproduction.RECOMPUTED,
-        f"{NO_VALUES} E1: printed with a plus sign, E_a(+λk^a) has positive terms only and is no Nussbaum function. With a minus sign "
-        "it swings with growing amplitude, as a Nussbaum function must. "
-        "λ = 1; logarithmic beyond ±1.",
+        f"{NO_VALUES} It is printed with a plus sign (E1), but E_a(+λk^a) has only positive terms and is not a Nussbaum function. "
+        "With a minus sign it oscillates with growing amplitude, as a Nussbaum function must. λ = 1; logarithmic beyond ±1.",
     )
 
 
 def tracking(run: AdaptiveRun, label: str) -> Callable[[Any], None]:
-    """Measured and estimated voltage at run time."""
+    """Return a function that draws measured and estimated voltage at run time."""
 
     def draw(axes: Any) -> None:
         t, y, yhat = thin(run.time_s / 60.0, run.voltage_v, run.voltage_estimate_v)
@@ -121,7 +121,7 @@ def tracking(run: AdaptiveRun, label: str) -> Callable[[Any], None]:
 
 
 def error_plot(axes: Any, run: AdaptiveRun) -> None:
-    """Error e(t) at run time, logarithmic in its middle."""
+    """Draw the error e(t) at run time on logarithmic axes."""
     t, e = thin(run.time_s, 1e3 * run.error_v)
     axes.plot(np.maximum(t, 1e-2), e)
     axes.set_xscale("log")
@@ -131,7 +131,7 @@ def error_plot(axes: Any, run: AdaptiveRun) -> None:
 
 
 def frozen_plot(axes: Any, frozen: Prediction, label: str) -> None:
-    """Voltage of the frozen model beside the true one."""
+    """Draw the voltages of the frozen model and of the true cell."""
     t, y, yhat = thin(frozen.time_s / 60.0, frozen.voltage_v, frozen.predicted_v)
     axes.plot(t, y, label="y, true cell", linewidth=2.6, color=COLOURS[0], alpha=0.45)
     axes.plot(t, yhat, "--", label=label, color=COLOURS[1])
@@ -140,7 +140,7 @@ def frozen_plot(axes: Any, frozen: Prediction, label: str) -> None:
 
 
 def figure_13(s: Simulation) -> Figure:
-    """Scheme 1, run time."""
+    """Draw the voltage of scheme 1 at run time."""
     run = s.one_start.scheme_1
     return Figure(
         "13",
@@ -152,7 +152,7 @@ def figure_13(s: Simulation) -> Figure:
 
 
 def figure_14(s: Simulation) -> Figure:
-    """Scheme 1, error."""
+    """Draw the error of scheme 1."""
     run = s.one_start.scheme_1
     largest = 1e3 * float(np.abs(run.error_v[run.time_s > 60.0][:-60]).max())
     return Figure(
@@ -166,15 +166,15 @@ def figure_14(s: Simulation) -> Figure:
 
 
 def figure_15(s: Simulation) -> Figure:
-    """Scheme 1, frozen."""
+    """Draw the voltage of scheme 1 with frozen parameters."""
     frozen = s.frozen(s.one_start.scheme_1.average)
     return Figure(
         "15",
         "Scheme 1: the model with its averaged parameters",
         plot(lambda axes: frozen_plot(axes, frozen, "ŷ, parameters of Table 2"), salt="figure-15"),
         Reproduction.RECOMPUTED,
-        f"{NO_VALUES} The same shape and wrong values, as the thesis says: {frozen.mean_percent:.1f} % mean error. Start and "
-        "λ of E25.",
+        f"{NO_VALUES} The shape is right and the values are wrong, as the thesis says: the mean error is {frozen.mean_percent:.1f} %. "
+        "Start and λ of E25.",
     )
 
 
@@ -189,25 +189,26 @@ def _frozen_and_error(key: str, title: str, frozen: Prediction, run: AdaptiveRun
 
 
 def figure_16(s: Simulation) -> Figure:
-    """Scheme 2."""
+    """Draw voltage and error of scheme 2."""
     run = s.one_start.scheme_2
     frozen = s.frozen(run.average)
     reason = (
-        f"{NO_VALUES} With the small parameters held where they start, at rounded true values, the frozen model follows to "
-        f"{frozen.mean_percent:.2f} % mean error: what it was given, not what it learned. Sign of N as E1; start and λ of E25."
+        f"{NO_VALUES} The small parameters stay at their initial values, which are rounded true values. The mean error of the frozen "
+        f"model of {frozen.mean_percent:.2f} % therefore comes from its initial values and not from learning. Sign of N as in E1; start "
+        "and λ of E25."
     )
     return _frozen_and_error("16", "Scheme 2: frozen model and run-time error", frozen, run, reason)
 
 
 def figure_17(s: Simulation) -> Figure:
-    """Scheme 3."""
+    """Draw voltage and error of scheme 3."""
     frozen = s.frozen(s.scheme_3.average)
-    reason = f"{NO_VALUES} The frozen model follows to {frozen.mean_percent:.2f} % mean error. Sign of N as E1."
+    reason = f"{NO_VALUES} The mean error of the frozen model is {frozen.mean_percent:.2f} %. Sign of N as in E1."
     return _frozen_and_error("17", "Scheme 3: frozen model and run-time error", frozen, s.scheme_3, reason)
 
 
 def crossing_plot(axes: Any, run: AdaptiveRun) -> None:
-    """Fig. 19 and 28: a8 and a11 with the bounds they must stay above, over SOC."""
+    """Draw a8 and a11 over SOC with their lower bounds, for Fig. 19 and 28."""
     settled = run.time_s >= run.window.t_int_s
     for ax, crossing in zip(axes, run.crossings, strict=True):
         i = int(crossing.parameter[1:])
@@ -215,14 +216,14 @@ def crossing_plot(axes: Any, run: AdaptiveRun) -> None:
         condition_plot(ax, i, float(run.a[-1, i]), crossing.soc)
 
 
-def condition_plot(ax: Any, i: int, value: float, met_at: float) -> None:
+def condition_plot(ax: Any, i: int, value: float, crossing_soc: float) -> None:
     """Draw the bound of a8 or a11, and the SOC where ``value`` meets it."""
-    low, high = 0.4 * max(met_at, 1e-3), 12.0 * max(met_at, 1e-3)
+    low, high = 0.4 * max(crossing_soc, 1e-3), 12.0 * max(crossing_soc, 1e-3)
     soc = np.linspace(low, high, 400)
-    ax.plot(soc, value * met_at / soc, label=f"$-\\ln(a_{{{i + 1}}}/a_{{{i - 1}}})/x_1$")
-    ax.axvline(met_at, color=FAINT, linestyle="-.", linewidth=1.0)
-    ax.annotate(f"  SOC {met_at:.5f}", (met_at, 1.7 * value), color=FAINT, fontsize=8)
-    ax.set(xlabel="SOC (discharge goes left)", xlim=(low, high), ylim=(0.0, 2.5 * value))
+    ax.plot(soc, value * crossing_soc / soc, label=f"$-\\ln(a_{{{i + 1}}}/a_{{{i - 1}}})/x_1$")
+    ax.axvline(crossing_soc, color=FAINT, linestyle="-.", linewidth=1.0)
+    ax.annotate(f"  SOC {crossing_soc:.5f}", (crossing_soc, 1.7 * value), color=FAINT, fontsize=8)
+    ax.set(xlabel="SOC (discharge from right to left)", xlim=(low, high), ylim=(0.0, 2.5 * value))
     ax.legend(loc="upper right")
 
 
@@ -240,21 +241,21 @@ def figure_19(s: Simulation) -> Figure:
 
 
 def figure_20(s: Simulation) -> Figure:
-    """RC products."""
+    """Draw the RC products."""
     printed_errors = [mean_error_percent(name, s.printed_a, s.cell.a) for name in PRODUCTS]
     return Figure(
         "20",
         "R_ts·C_ts and R_tl·C_tl: estimated and true",
         plot(lambda axes: products_plot(axes, s.cell.a, s.improved.average), columns=2, salt="figure-20"),
         Reproduction.CONTRADICTED,
-        "The printed products lie on each other. Recomputed they do not: from the printed estimates they are "
-        f"{printed_errors[0]:.1f} and {printed_errors[1]:.1f} % off, and the recomputed ones go with the bounds (E3, E9, "
-        "Theorem 4.1.2 measured).",
+        "The printed products coincide; the recomputed ones do not. The errors of the products from the printed estimates are "
+        f"{printed_errors[0]:.1f} and {printed_errors[1]:.1f} %, and the recomputed products depend on the bounds (E3, E9, test of "
+        "Theorem 4.1.2).",
     )
 
 
 def elements_plot(axes: Any, true: Floats | None, estimated: Floats, stop_at: Sequence[float]) -> None:
-    """Fig. 21 and 30: four elements over SOC, with lines where delta1 and delta2 are."""
+    """Draw four elements over SOC, with lines at delta1 and delta2, for Fig. 21 and 30."""
     soc = np.linspace(0.03, 1.0, 800)
     for ax, (name, unit) in zip(axes.flat, (("R_tl", "Ω"), ("R_ts", "Ω"), ("C_tl", "F"), ("C_ts", "F")), strict=True):
         if true is not None:
@@ -267,7 +268,7 @@ def elements_plot(axes: Any, true: Floats | None, estimated: Floats, stop_at: Se
 
 
 def products_plot(axes: Any, true: Floats | None, estimated: Floats) -> None:
-    """Fig. 20 and 29: the RC products over SOC."""
+    """Draw the RC products over SOC, for Fig. 20 and 29."""
     for ax, name in zip(axes, ("R_ts C_ts", "R_tl C_tl"), strict=True):
         if true is not None:
             ax.plot(SOC_GRID, element(name, true), label="Chen and Mora")
@@ -293,11 +294,11 @@ def figure_21(s: Simulation) -> Figure:
 
 
 def figure_22(s: Simulation) -> Figure:
-    """R_s at several currents."""
+    """Draw R_s at several currents."""
 
     def draw(axes: Any) -> None:
-        for current, found in s.r_s_curves.items():
-            axes.plot(found.soc, found.r_s_ohm, label=f"{current:g} A", linewidth=1.0)
+        for current, r_s_curve in s.r_s_curves.items():
+            axes.plot(r_s_curve.soc, r_s_curve.r_s_ohm, label=f"{current:g} A", linewidth=1.0)
         axes.plot(SOC_GRID, s.r_s_fit(SOC_GRID), "k--", label="fit of the mean")
         axes.plot(SOC_GRID, [r_s(x, s.cell.a) for x in SOC_GRID], color=FAINT, linewidth=2.4, label="Chen and Mora")
         axes.set(xlabel="SOC", ylabel="R_s [Ω]", ylim=(0.0, 0.15))
@@ -308,8 +309,8 @@ def figure_22(s: Simulation) -> Figure:
         "R_s by (4.2) for different currents",
         plot(draw, salt="figure-22"),
         Reproduction.RECOMPUTED,
-        f"{NO_VALUES} (4.2) with the sign of (2.4) (E19); currents are ours, the thesis prints none. R_s is low by what R_ts + "
-        "R_tl are high.",
+        f"{NO_VALUES} (4.2) with the sign of (2.4) (E19). The thesis does not print the currents. The error of R_s is the negative "
+        "of that of R_ts + R_tl.",
     )
 
 
@@ -326,10 +327,10 @@ def figure_23(s: Simulation) -> Figure:
         t, run = thin(s.improved.time_s / 600.0, s.improved.voltage_estimate_v)
         axes[0].plot(t, run, ":", color=COLOURS[2], label="run time (C/10, time / 10)")
         axes[0].legend()
-        for label, found in runs.items():
-            t, e = thin(found.time_s / 60.0, 1e3 * found.error_v)
+        for label, prediction in runs.items():
+            t, e = thin(prediction.time_s / 60.0, 1e3 * prediction.error_v)
             axes[1].plot(t, e, label=label)
-        axes[1].set(xlabel="time [min]", ylabel="mV", title="true less estimated")
+        axes[1].set(xlabel="time [min]", ylabel="mV", title="true minus estimated")
         axes[1].legend()
 
     return Figure(
@@ -337,28 +338,28 @@ def figure_23(s: Simulation) -> Figure:
         "The estimated model against the cell, constant discharge",
         plot(draw, columns=2, salt="figure-23"),
         Reproduction.RECOMPUTED,
-        f"{NO_VALUES} With the printed Tables 5 and 6 the model is {as_printed.mean_percent:.3f} % off on average, "
-        f"{as_printed.max_percent:.1f} % at most, down to SOC {FINAL_SOC:g}; with a13 to a15 fitted anew to the recomputed a1 to "
-        f"a12 {refitted.mean_percent:.4f} and {refitted.max_percent:.2f} %, although the elements are those of the bounds: on a "
-        "slow load only the sum of the resistances counts, and (4.2) makes that right.",
+        f"{NO_VALUES} With the printed Tables 5 and 6 the mean error of the model is {as_printed.mean_percent:.3f} %, at most "
+        f"{as_printed.max_percent:.1f} %, down to SOC {FINAL_SOC:g}. With the recomputed a1 to a12 and refitted a13 to a15 it is "
+        f"{refitted.mean_percent:.4f} %, at most {refitted.max_percent:.2f} %, although the elements are those of the bounds: under a "
+        "slow load only the sum of the resistances matters, which (4.2) corrects.",
     )
 
 
 def figure_39(s: Simulation) -> Figure:
-    """Dynamic and static."""
+    """Draw the errors of the dynamic and the static model in simulation."""
     dynamic, static = s.dynamic(s.printed_a), s.static(s.printed_a)
     return Figure(
         "39",
         "Dynamic and static model, simulation",
         plot(lambda axes: dynamic_static_plot(axes, dynamic, static), columns=2, salt="figure-39"),
         Reproduction.NO_DATA,
-        f"Load and freezing point are not printed: here pulses of 0.275 A, frozen at SOC {STATIC_SOC:g}, parameters of Tables 5 "
-        "and 6. As printed, the two differ where SOC is low.",
+        f"Load and SOC of the static model are not printed; here pulses of 0.275 A, SOC {STATIC_SOC:g}, and parameters of Tables 5 "
+        "and 6. As in print, the two models differ at low SOC.",
     )
 
 
 def dynamic_static_plot(axes: Any, dynamic: Prediction, static: Prediction) -> None:
-    """Fig. 39 and 40: the end of a run, and the errors over SOC."""
+    """Draw the end of a run, and the errors over SOC, for Fig. 39 and 40."""
     late = dynamic.soc < 0.25
     t, y, moving, frozen = thin(
         dynamic.time_s[late] / 60.0, dynamic.voltage_v[late], dynamic.predicted_v[late], static.predicted_v[late]
@@ -371,13 +372,13 @@ def dynamic_static_plot(axes: Any, dynamic: Prediction, static: Prediction) -> N
     for run, label, colour in ((static, "static", COLOURS[2]), (dynamic, "dynamic", COLOURS[1])):
         soc, e = thin(run.soc, 1e3 * run.error_v)
         axes[1].plot(soc, e, color=colour, label=label, linewidth=1.0)
-    axes[1].set(xlabel="SOC", ylabel="error [mV]", title="actual less model")
+    axes[1].set(xlabel="SOC", ylabel="error [mV]", title="actual minus model")
     axes[1].invert_xaxis()
     axes[1].legend()
 
 
 def figure_43(s: Simulation) -> Figure:
-    """Fault in a bank."""
+    """Draw E_o of a battery bank with a fault."""
     drawn = np.linspace(0.0, 1.0, 800)
     starts = {"healthy bank": (1.0, 1.0, 1.0), "two weak batteries": (1.0, *WEAK_SOC)}
 
@@ -393,8 +394,8 @@ def figure_43(s: Simulation) -> Figure:
         "E_o of a healthy bank and of one with two weak batteries",
         plot(draw, salt="figure-43"),
         Reproduction.NO_DATA,
-        "The bank's batteries and their SOC are not printed; here three of Chen and Mora in series, two of them begin at SOC "
-        f"{WEAK_SOC[0]:g} and {WEAK_SOC[1]:g}. As printed, each shows as a dip when it runs empty.",
+        "The bank's batteries and their SOC are not printed; here three cells of Chen and Mora in series, two of which start at SOC "
+        f"{WEAK_SOC[0]:g} and {WEAK_SOC[1]:g}. As in print, each weak battery causes a dip when it is empty.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Tables 1 to 7 and 12 of the thesis, and Theorem 4.1.2 measured: printed beside recomputed."""
+"""Tables 1 to 7 and 12 of the thesis with printed and recomputed values, and a test of Theorem 4.1.2."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ from bms_estimator.reports.theorem_4_1_2 import measure
 
 
 def table_1(_: Simulation) -> Table:
-    """Compute the open-circuit voltage of Chen and Mora."""
+    """Return the parameters of the open-circuit voltage of Chen and Mora."""
     return Table(
         "1",
         "a16 to a21 for the simulations",
@@ -35,7 +35,7 @@ def table_1(_: Simulation) -> Table:
 
 
 def table_2(simulation: Simulation) -> Table:
-    """Scheme 1."""
+    """Return the table of scheme 1."""
     return _scheme_table(
         simulation,
         "2",
@@ -43,12 +43,12 @@ def table_2(simulation: Simulation) -> Table:
         (printed_values.TABLE_2, printed_values.TABLE_2_ERROR),
         simulation.scheme_1.average,
         simulation.one_start.scheme_1.average,
-        "By (3.16) all fifteen parameters move by the same integral of e², here as in print.",
+        "By (3.16) all fifteen parameters change by the same integral of e², here and in print.",
     )
 
 
 def table_3(simulation: Simulation) -> Table:
-    """Scheme 2."""
+    """Return the table of scheme 2."""
     true = {i: f"{100.0 * (printed_values.CHEN_MORA_ROUNDED[i - 1] / simulation.cell.a[i] - 1.0):.0f}" for i in (13, 6)}
     return _scheme_table(
         simulation,
@@ -57,9 +57,9 @@ def table_3(simulation: Simulation) -> Table:
         (printed_values.TABLE_3, printed_values.TABLE_3_ERROR),
         simulation.scheme_2.average,
         simulation.one_start.scheme_2.average,
-        "a1, a3, a6, a13, a15 are drawn back to where they started, the others move by the same integral of e², here as "
-        "in print. The printed 0 % of the small ones are artefacts: they compare the start with itself, and it is a rounded "
-        f"value, not the true one of Tables 5 and 6 (a13 {true[13]} %, a6 {true[6]} %). The printed error of a5 should be 0.399.",
+        "a1, a3, a6, a13, a15 are pulled back to their initial values, and the others change by the same integral of e², here "
+        "and in print. The printed 0 % of the small parameters are artefacts: they compare the initial value with itself, and it "
+        f"is rounded (a13 {true[13]} %, a6 {true[6]} % from Tables 5 and 6). The printed error of a5 should be 0.399.",
     )
 
 
@@ -74,21 +74,21 @@ def _scheme_table(
 ) -> Table:
     rows = []
     for i, (start, estimate, error) in enumerate(zip(printed_values.CHEN_MORA_ROUNDED, *print_, strict=True), 1):
-        again, true = float(started[i]), float(simulation.cell.a[i])
+        recomputed, true = float(started[i]), float(simulation.cell.a[i])
         rows.append(
             (
                 f"a{i}",
                 number(start),
                 number(true),
                 number(estimate, 6),
-                number(again, 6),
+                number(recomputed, 6),
                 number(float(plain[i]), 6),
                 number(error),
-                percent(again, start),
-                percent(again, true),
+                percent(recomputed, start),
+                percent(recomputed, true),
             )
         )
-    moved = float(plain[2]) - printed_values.CHEN_MORA_ROUNDED[1]
+    change = float(plain[2]) - printed_values.CHEN_MORA_ROUNDED[1]
     fitted = simulation.one_start
     return Table(
         key,
@@ -106,16 +106,16 @@ def _scheme_table(
         ),
         tuple(rows),
         Reproduction.FITTED,
-        f"{reason} How far they move hangs on the error at the start and on λ, neither of which the thesis prints (nor k0, a, "
-        f"x2(0), x3(0)). From x2(0) = x3(0) = 0 with λ = 1 it is {number(moved, 3)}. e(0) = {fitted.start_error_v:.3f} V with "
-        f"λ = {fitted.lambda_:.2f} fits Tables 2 and 3 exactly, and so do other starts (E25): two free parameters fitted to the two "
-        "numbers that the tables hold, so that only the pattern of the rows is evidence. N is E_2.5(-λ k^2.5) with the sign of E1.",
+        f"{reason} The size of the change depends on the initial error and on λ, which the thesis does not print (nor k0, a, "
+        f"x2(0), x3(0)). With x2(0) = x3(0) = 0 and λ = 1 the change is {number(change, 3)}. With e(0) = {fitted.start_error_v:.3f} V "
+        f"and λ = {fitted.lambda_:.2f} Tables 2 and 3 are reproduced exactly, but other starts do so too (E25): two free parameters are "
+        "fitted to two numbers, so that only the pattern of the rows is evidence. N is E_2.5(-λ k^2.5) with the sign of E1.",
         free=2,
     )
 
 
 def table_4(simulation: Simulation) -> Table:
-    """Scheme 3."""
+    """Return the table of scheme 3."""
     x, y = printed_values.TABLE_4_WEIGHTS
     rows = []
     for i, (upper, lower, estimate, desired, error) in printed_values.TABLE_4.items():
@@ -152,19 +152,19 @@ def table_4(simulation: Simulation) -> Table:
         ),
         tuple(rows),
         Reproduction.CONTRADICTED,
-        "The recomputed estimates are the Lemma 4.1.3 limits of the printed bounds and weights, to four digits. The printed "
-        "ones are not: four lie 1 to 2 % below, a15 30 %, and no one pair of weights gives all five. The printed desired "
-        "value of a15 is that of a3; Table 6 has 0.07446. The desired a1, a3, a13 and a15 lie above their own upper bounds, "
-        "which no estimate can reach.",
+        "The recomputed estimates equal the Lemma 4.1.3 limits of the printed bounds and weights to four digits. The printed "
+        "estimates do not: four are 1 to 2 % lower, a15 is 30 % lower, and no pair of weights gives all five. The printed desired "
+        "value of a15 is that of a3; Table 6 has 0.07446. The desired a1, a3, a13 and a15 exceed their upper bounds, so that no "
+        "estimate can reach them.",
     )
 
 
 def table_5(simulation: Simulation) -> Table:
-    """Compute the table of the improved method."""
+    """Return the table of the improved method."""
     rows = []
     for i, (initial, estimate, desired, error) in printed_values.TABLE_5.items():
         upper, lower, x, y = printed_values.BOUNDS[i]
-        again = float(simulation.improved.average[i])
+        recomputed = float(simulation.improved.average[i])
         b = printed_values.bounds("5", i)
         inferred = f" ({b.weight_upper:g}, {b.weight_lower:g})" if i in printed_values.INFERRED_WEIGHTS["5"] else ""
         decimals = printed_values.DECIMALS_5[i]
@@ -175,12 +175,12 @@ def table_5(simulation: Simulation) -> Table:
                 f"{x:g}, {y:g}{inferred}",
                 number(initial),
                 f"{estimate:.{decimals}f}",
-                number(again, 6),
+                number(recomputed, 6),
                 number(b.limit, 6),
                 f"{printed_values.mean_from_start('5', i):.{decimals}f}",
                 number(desired),
                 number(error),
-                percent(again, desired),
+                percent(recomputed, desired),
             )
         )
     conditions = {"printed": load_cell("chen_mora"), "inferred": simulation.cell}
@@ -216,12 +216,12 @@ def table_5(simulation: Simulation) -> Table:
         ),
         tuple(rows),
         Reproduction.FITTED,
-        f"The run gives the Lemma 4.1.3 limits, weighted means of the bounds whatever the data say (E3): a6 = {a6[0]}, printed "
-        f"{a6[1]}. A closed form gives every printed digit: the way from the initial value to the limit, averaged from the very "
-        f"first sample on, over {printed_values.START_MEAN_S['5']:g} s ({a6[2]}), with other weights of a7, a8, a10, a11, a12 than are "
-        f"printed (E32). Its {printed_values.FREE_PARAMETERS['5']} free parameters are the time, the rates of these five, and the ratio "
-        "of the weights of a7 and a8 (E24, E4); twelve numbers fitted with so many are no proof. Errors "
-        f"are of the desired value (E7). The conditions of Lemma 4.1.1 do not all hold (E6): with the {failing}. delta1 and "
+        f"The run gives the Lemma 4.1.3 limits, which are weighted means of the bounds for any data (E3): a6 = {a6[0]}, printed "
+        f"{a6[1]}. A closed form reproduces every printed digit: the mean of the transition from the initial value to the limit, "
+        f"from the first sample on, over {printed_values.START_MEAN_S['5']:g} s ({a6[2]}), with other weights of a7, a8, a10, a11, a12 "
+        f"than printed (E32). Its {printed_values.FREE_PARAMETERS['5']} free parameters are the time, the rates of these five, and the "
+        "ratio of the weights of a7 and a8 (E24, E4), too many for twelve numbers to be a proof. Errors are relative to the desired "
+        f"value (E7). The conditions of Lemma 4.1.1 do not all hold (E6): with the {failing}. delta1 and "
         f"delta2 (E13): {deltas[0]} from the desired values, {deltas[1]} from the printed estimates, {deltas[2]} from the "
         f"recomputed ones. The run is at {SMALL_CURRENT_A} A.",
         free=printed_values.FREE_PARAMETERS["5"],
@@ -229,7 +229,7 @@ def table_5(simulation: Simulation) -> Table:
 
 
 def table_6(simulation: Simulation) -> Table:
-    """R_s."""
+    """Return the table of a13 to a15."""
     fit = simulation.r_s_fit
     rows = []
     for j, (i, (desired, estimate, error)) in enumerate(printed_values.TABLE_6.items()):
@@ -255,21 +255,21 @@ def table_6(simulation: Simulation) -> Table:
             "printed",
             "recomputed",
             "printed error",
-            "its error % (E8)",
+            "error of the printed estimate % (E8)",
             "recomputed error %",
         ),
         tuple(rows),
         Reproduction.CONTRADICTED,
-        f"The currents are not printed; here {currents} A. (4.2) is printed with the opposite sign (E19): (2.4) solved for R_s is "
-        "(E_o - x2 - x3 - y)/i. And x2, x3 must be those of the frozen model: with the observer's own, which settle so "
-        "that (4.1) meets y, R_s is zero. So computed, R_s takes up what R_ts + R_tl have wrong, and its fit is no "
-        f"estimate of the cell's own R_s. From Table 5's own estimates a15 is {plateaus} mΩ at {currents} A, and "
-        f"{1e3 * printed_values.TABLE_6[15][1]:.1f} is printed. The printed error column mixes fractions and a value (E8).",
+        f"The currents are not printed; here they are {currents} A. (4.2) is printed with the opposite sign (E19): (2.4) solved for "
+        "R_s is (E_o - x2 - x3 - y)/i. Its x2, x3 must be those of the frozen model, because those of the observer make (4.1) "
+        "equal y and R_s zero. R_s therefore absorbs the error of R_ts + R_tl, and its fit is not an estimate of the cell's R_s. "
+        f"With Table 5's printed estimates, a15 is {plateaus} mΩ at {currents} A; printed is "
+        f"{1e3 * printed_values.TABLE_6[15][1]:.1f}. The printed error column mixes fractions and a value (E8).",
     )
 
 
 def table_7(simulation: Simulation) -> Table:
-    """Errors of the elements."""
+    """Return the errors of the elements."""
     from_print, true = simulation.printed_a, simulation.cell.a
     rows = tuple(
         (
@@ -286,13 +286,13 @@ def table_7(simulation: Simulation) -> Table:
         ("element", "printed", "from Table 5's printed estimates", "recomputed"),
         rows,
         Reproduction.CONTRADICTED,
-        "E9: Table 5's own printed estimates give other errors than Table 7 prints. The products R·C are not right to 2 % "
-        "and 0.04 % but to 14 % and 3.4 %, and change with the bounds: see Theorem 4.1.2 measured, below.",
+        "The printed estimates of Table 5 give other errors than printed in Table 7 (E9). The errors of the products R·C are 14 % "
+        "and 3.4 % instead of 2 % and 0.04 %, and depend on the bounds: see the test of Theorem 4.1.2 below.",
     )
 
 
 def table_12(simulation: Simulation) -> Table:
-    """Dynamic and static model, simulation."""
+    """Return the comparison of the dynamic and the static model in simulation."""
     runs = {
         "dynamic": [simulation.dynamic(a) for a in (simulation.printed_a, simulation.improved_a)],
         "static": [simulation.static(a) for a in (simulation.printed_a, simulation.improved_a)],
@@ -328,10 +328,10 @@ def table_12(simulation: Simulation) -> Table:
         Reproduction.CONTRADICTED,
         f"Neither the load nor the SOC at which the static model is frozen is printed; here {CURRENT_A:g} A for 10 minutes in 20 "
         f"down to SOC {FINAL_SOC:g}, frozen at SOC {STATIC_SOC:g}. From the printed Tables 5 and 6 the order reverses: dynamic "
-        f"{dynamic}, static {static} % (down to SOC {LOWEST_SOC:g} {higher[0]} and {higher[1]} %: as good as the same). Plainly "
-        "the printed order comes only with a13 to a15 fitted anew. No load up to 4C gives the sizes: at a constant "
-        f"{HIGH_CURRENT_A:g} A the dynamic model of Tables 5 and 6 is {simulation.constant_error_percent(HIGH_CURRENT_A):.2f} "
-        f"% off, and {printed_values.TABLE_12['dynamic']:g} % is printed.",
+        f"{dynamic}, static {static} % (down to SOC {LOWEST_SOC:g} nearly equal: {higher[0]} and {higher[1]} %). The printed order "
+        "results only with refitted a13 to a15. No load up to 4C gives the printed sizes: at a constant "
+        f"{HIGH_CURRENT_A:g} A the error of the dynamic model of Tables 5 and 6 is "
+        f"{simulation.constant_error_percent(HIGH_CURRENT_A):.2f} %; printed is {printed_values.TABLE_12['dynamic']:g} %.",
     )
 
 
@@ -349,7 +349,7 @@ def theorem_4_1_2(_: Simulation) -> Table:
     )
     return Table(
         "Theorem 4.1.2",
-        "measured: do the products converge to the truth?",
+        "tested: do the products converge to the true values?",
         (
             "bounds",
             "current",
@@ -361,11 +361,10 @@ def theorem_4_1_2(_: Simulation) -> Table:
         ),
         rows,
         Reproduction.ADDED,
-        "The tracking claim holds as far as it goes: e is small, and the smaller the smaller the current, but it does not go to "
-        "zero while current flows (E16). The identification claim does "
-        "not: at every current the products land on the values of the Lemma 4.1.3 limits, so their error is set by the "
-        "bounds alone; bounds whose limit is twice the resistances give products twice too large, at 0.01C as at 1C "
-        "(E3). Only bounds that come from data make the products right.",
+        "The tracking claim holds in part: e is small and decreases with the current, but does not converge to zero while current "
+        "flows (E16). The identification claim does not hold: at every current the products converge to the values of the Lemma "
+        "4.1.3 limits, so that their error depends only on the bounds. Bounds whose limit is twice the resistances give twice the "
+        "products, at 0.01C and at 1C (E3). The products are right only if the bounds come from data.",
     )
 
 

@@ -14,8 +14,9 @@ FAINT = "#8a97a6"
 COLOURS = ("#1f5fa8", "#d1602b", "#2f8f5b", "#8a4fa3", "#b08a1e", "#4aa3b5")
 """Colors that differ in print and for color-blind readers: blue, orange, green, violet, ochre, teal."""
 POINTS = 1200
-"""More points than this on a line are not seen in a plot of this width."""
+"""Maximum number of points on a line; more are not visible at this width."""
 WIDTH_IN, ROW_IN = 8.0, 3.0
+"""Width of a figure and height of a row [inches]."""
 
 STYLE: dict[str, Any] = {
     "svg.fonttype": "path",
@@ -43,13 +44,13 @@ STYLE: dict[str, Any] = {
 
 
 def plot(draw: Callable[[Any], None], *, rows: int = 1, columns: int = 1, salt: str = "bms") -> str:
-    """One figure as an ``<svg>`` element.
+    """Return a figure as an ``<svg>`` element.
 
     Args:
-        draw: Is given the axes: one, or an array of rows x columns.
+        draw: Function that draws on the axes: one, or an array of rows x columns.
         rows: Number of rows of axes.
         columns: Number of columns of axes.
-        salt: Makes the ids of the SVG's parts its own, and the same at every run.
+        salt: Salt that makes the ids in the SVG unique on the page and reproducible.
     """
     import matplotlib as mpl  # noqa: PLC0415  (an optional dependency)
     from matplotlib.backends.backend_svg import FigureCanvasSVG  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""Test of Theorem 4.1.2: do the products R_ts C_ts, R_tl C_tl converge to the truth?
+"""Test of Theorem 4.1.2, that the products R_ts C_ts and R_tl C_tl converge to the true values.
 
 The theorem claims this for a small current, for any limits of a1..a12. Here the observer runs at several currents and
 with several bounds on a simulated cell.
@@ -22,21 +22,21 @@ from bms_estimator.reports.simulation import (
 )
 
 C_RATES = (1.0, 0.1, 0.01)
-"""The smallest is a hundred hours from full to empty."""
+"""C-rates of the runs [1/h]; the smallest takes a hundred hours from full to empty."""
 SAMPLES = 100_000
-"""Samples of each run, from full to empty."""
+"""Number of samples of each run, from full to empty."""
 SETTLED_FROM_S = 60.0
-"""Tracking is judged from here on [s]."""
+"""Time after which tracking is evaluated [s]."""
 
 
 @dataclass(frozen=True)
-class Measured:
-    """One run.
+class RunResult:
+    """Result of one run.
 
     Attributes:
         bounds: Description of the bounds.
-        c_rate: Current over capacity [1/h].
-        tracking_v: Largest |e| from ``SETTLED_FROM_S`` to t_unst [V].
+        c_rate: Current divided by capacity [1/h].
+        tracking_v: Maximum |e| from ``SETTLED_FROM_S`` to t_unst [V].
         error_percent: Mean error over SOC of R_ts C_ts and R_tl C_tl [%].
         limit_percent: Error of the products at the Lemma 4.1.3 limits [%].
     """
@@ -52,16 +52,16 @@ PRODUCTS = ("R_ts C_ts", "R_tl C_tl")
 
 
 def bounds_sets(cell: CellModel) -> dict[str, dict[int, Bounds]]:
-    """Table 5's bounds, some with the truth as their limit, some with twice the resistances."""
+    """Return the bounds of Table 5, bounds whose limit is the true value, and bounds whose limit is twice the resistances."""
 
     def around(low: float, high: float) -> dict[int, Bounds]:
-        found = {}
+        bounds = {}
         for i in range(1, 13):
-            # offsets and amplitudes of the resistances only: the exponents and capacitances stay at the truth
+            # scaled are only offsets and amplitudes of the resistances, not exponents and capacitances
             scale = (low, high) if i in (1, 3, 4, 6) else (0.5, 1.5)
             value = float(cell.a[i])
-            found[i] = Bounds(lower=scale[0] * value, upper=scale[1] * value, weight_upper=50.0, weight_lower=50.0)
-        return found
+            bounds[i] = Bounds(lower=scale[0] * value, upper=scale[1] * value, weight_upper=50.0, weight_lower=50.0)
+        return bounds
 
     return {
         "Table 5": {i: cell.bounds(i) for i in range(1, 13)},
@@ -71,34 +71,34 @@ def bounds_sets(cell: CellModel) -> dict[str, dict[int, Bounds]]:
 
 
 @cache
-def measure() -> tuple[Measured, ...]:
-    """Every set of bounds at every current, on the cell of Table 5."""
-    cell, found = table_5_cell(), []
+def measure() -> tuple[RunResult, ...]:
+    """Run each set of bounds at each current on the cell of Table 5."""
+    cell, results = table_5_cell(), []
     for name, bounds in bounds_sets(cell).items():
         bounded = with_bounds(cell, bounds)
         limit = np.zeros(16)
         for i, b in bounds.items():
             limit[i] = b.limit
-        found += [_measure(bounded, name, c_rate, limit) for c_rate in C_RATES]
-    return tuple(found)
+        results += [_measure(bounded, name, c_rate, limit) for c_rate in C_RATES]
+    return tuple(results)
 
 
-def _measure(cell: CellModel, name: str, c_rate: float, limit: Floats) -> Measured:
+def _measure(cell: CellModel, name: str, c_rate: float, limit: Floats) -> RunResult:
     current_a = c_rate * cell.cell.capacity_ah
     samples = discharge(cell, current_a, 3600.0 / c_rate / SAMPLES)
     estimator = Estimator(
         cell, observer_settings("improved"), identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0
     )
     run = adaptive_run(estimator, samples)
-    judged = (run.time_s >= SETTLED_FROM_S) & (run.time_s <= run.window.t_unst_s)
-    return Measured(
+    evaluated = (run.time_s >= SETTLED_FROM_S) & (run.time_s <= run.window.t_unst_s)
+    return RunResult(
         bounds=name,
         c_rate=c_rate,
-        tracking_v=float(np.abs(run.error_v[judged]).max()),
-        error_percent=_both(run.average, cell.a),
-        limit_percent=_both(limit, cell.a),
+        tracking_v=float(np.abs(run.error_v[evaluated]).max()),
+        error_percent=_product_errors(run.average, cell.a),
+        limit_percent=_product_errors(limit, cell.a),
     )
 
 
-def _both(a: Floats, true: Floats) -> tuple[float, float]:
+def _product_errors(a: Floats, true: Floats) -> tuple[float, float]:
     return mean_error_percent(PRODUCTS[0], a, true), mean_error_percent(PRODUCTS[1], a, true)

@@ -1,8 +1,8 @@
 """Claims of chapters 4 to 7 about the thesis's recordings, tested on other captures.
 
-A claim holds if its printed value is reached on more than half of the captures. Of SOC and of RC products nothing is
-printed
-that could be a limit; those are chosen here, and so is the limit 1 for the order of the dynamic and the static model.
+A claim holds if its printed value is reached on more than half of the captures. For SOC and RC products the thesis prints
+no value that could be a limit, so that their limits are chosen here, as is the limit 1 for the order of the dynamic and the
+static model.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -18,31 +18,32 @@ from bms_estimator.reports.report_items import Reproduction
 from bms_estimator.reports.simulation import element
 
 PRODUCTS_PERCENT = 20.0
-"""Theorem 4.1.2 has the RC products exact, Table 7 prints errors of 1.9 and 0.04 %: ten times that is let pass."""
+"""Maximum error of the RC products [%]: ten times the 1.9 % of Table 7. Theorem 4.1.2 claims that they are exact."""
 SOC_PERCENT = 5.0
-"""A count that starts with an SOC wrong by this stays as wrong; what 7.1 calls more accurate must be better."""
+"""Maximum error of the interpolated SOC [%]. Coulomb counting keeps an initial error of this size; section 7.1 claims that
+interpolation is more accurate."""
 MIDDLE_SOC = 0.5
 """SOC at which the RC products are compared."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """One claim on one capture.
+    """Result of a claim on one capture.
 
     Attributes:
         capture: Name of the capture.
-        found: Measured value, in the claim's unit.
+        value: Measured value, in the claim's unit.
         limit: Limit of the value.
     """
 
     capture: str
-    found: float
+    value: float
     limit: float
 
     @property
     def met(self) -> bool:
         """True if the claim holds for the capture."""
-        return self.found <= self.limit
+        return self.value <= self.limit
 
 
 @dataclass(frozen=True)
@@ -51,43 +52,43 @@ class Claim:
 
     Attributes:
         key: Mark in the tables: "mean, constant loads".
-        where: Table or figure.
+        location: Table or figure.
         criterion: Condition for more than half of the captures.
         results: Results of each capture that the claim can be tested on.
     """
 
     key: str
-    where: str
+    location: str
     criterion: str
     results: tuple[Result, ...]
 
     @property
     def met(self) -> int:
-        """On how many captures the criterion was met."""
+        """Number of captures on which the criterion is met."""
         return sum(result.met for result in self.results)
 
     @property
     def verdict(self) -> Reproduction:
-        """Holds, fails, or is not tested by any capture: then there is only what the thesis prints of it, no data."""
+        """Verdict on the claim; NO_DATA if no capture can test it."""
         if not self.results:
             return Reproduction.NO_DATA
         return Reproduction.CLAIM_HOLDS if 2 * self.met > len(self.results) else Reproduction.CLAIM_FAILS
 
     @property
     def span(self) -> str:
-        """Return the range of the results."""
+        """Range of the measured values."""
         if not self.results:
             return "-"
-        ends = [f"{end([result.found for result in self.results]):.3g}" for end in (min, max)]
+        ends = [f"{end([result.value for result in self.results]):.3g}" for end in (min, max)]
         return ends[0] if ends[0] == ends[1] else " to ".join(ends)
 
     @property
-    def words(self) -> str:
-        """Criterion and outcome in a sentence."""
+    def sentence(self) -> str:
+        """Criterion and result in a sentence."""
         criterion = f"{self.key[0].upper()}{self.key[1:]}: {self.criterion}"
         if not self.results:
             return f"{criterion}: none of the captures can test it."
-        return f"{criterion}: met on {self.met} of {len(self.results)} captures (found {self.span}); it had to be more than half."
+        return f"{criterion}: met on {self.met} of {len(self.results)} captures (values {self.span}); required: more than half."
 
 
 def _constant(which: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
@@ -122,20 +123,21 @@ def _soc(p: Procedure) -> list[Result]:
 
 
 def products(p: Procedure) -> Iterator[tuple[str, float, float]]:
-    """Each relaxation test's name and product, as estimated and as its rests show it [s]."""
+    """Yield the name of each relaxation test with its product, and the product as estimated and as measured in its rests [s]."""
     for test, capture in zip(p.tests, p.of(Kind.RELAXATION), strict=True):
         try:
-            seen = initial_elements(capture.samples, test, p.cell.cell.capacity_ah)
-        except UserError:  # no rest that follows a discharge: nothing to compare with
+            measured = initial_elements(capture.samples, test, p.cell.cell.capacity_ah)
+        except UserError:  # without a rest after a discharge, there is nothing to compare with
             continue
-        for name, seen_s in (("R_ts C_ts", seen.tau_ts_s), ("R_tl C_tl", seen.tau_tl_s)):
+        for name, measured_s in (("R_ts C_ts", measured.tau_ts_s), ("R_tl C_tl", measured.tau_tl_s)):
             estimated_s = float(element(name, p.adaptive.average, np.array([MIDDLE_SOC]))[0])
-            yield f"{capture.name}, {name}", estimated_s, seen_s
+            yield f"{capture.name}, {name}", estimated_s, measured_s
 
 
 def _products(p: Procedure) -> list[Result]:
     return [
-        Result(name, 100.0 * abs(found_s / seen_s - 1.0), PRODUCTS_PERCENT) for name, found_s, seen_s in products(p)
+        Result(name, 100.0 * abs(estimated_s / measured_s - 1.0), PRODUCTS_PERCENT)
+        for name, estimated_s, measured_s in products(p)
     ]
 
 
@@ -166,12 +168,12 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Procedure], list[Result]]]] = {
     ),
     "dynamic against static, ratio": (
         "Table 13",
-        f"mean error of the dynamic model over the static one's at most {PRINTED_RATIO:.4f}, as printed",
+        f"mean error of the dynamic model divided by that of the static one at most {PRINTED_RATIO:.4f}, as printed",
         lambda p: _dynamic(p, PRINTED_RATIO),
     ),
     "dynamic against static, order": (
         "Table 13",
-        "mean error of the dynamic model over the static one's at most 1",
+        "mean error of the dynamic model divided by that of the static one at most 1",
         lambda p: _dynamic(p, 1.0),
     ),
     "SOC by interpolation": (
@@ -185,10 +187,10 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Procedure], list[Result]]]] = {
         _products,
     ),
 }
-"""Key -> where it is claimed, criterion, and how it is tested on one cell."""
+"""Location, criterion and test on one cell, by key of the claim."""
 
 
 def claim(key: str, protocols: Sequence[Procedure]) -> Claim:
-    """One claim on the captures of one or more cells. A relaxation test that serves two cells counts for each."""
-    where, criterion, test = CLAIMS[key]
-    return Claim(key, where, criterion, tuple(result for p in protocols for result in test(p)))
+    """Test a claim on the captures of one or more cells. A relaxation test shared by two cells counts twice."""
+    location, criterion, test = CLAIMS[key]
+    return Claim(key, location, criterion, tuple(result for p in protocols for result in test(p)))

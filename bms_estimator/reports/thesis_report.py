@@ -1,4 +1,4 @@
-"""The whole thesis: its tables and figures in order, and how each is made."""
+"""Report of the whole thesis: tables and figures in the thesis's order."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ DIAGRAMS = {
     "49": "Simulink diagram of C_ts",
     "50": "Simulink diagram of the Mittag-Leffler function",
 }
-"""Figures with nothing to compute."""
+"""Figures without anything to compute, by number."""
 FUEL_CELL = dict.fromkeys(
     ("45", "46"),
     "The recording is not published, nor are the equations of its model. The project's own model of a fuel cell, after section "
@@ -68,7 +68,7 @@ CHAPTERS: dict[str, tuple[str, ...]] = {
     "A  Simulink models": ("F47", "F48", "F49", "F50"),
     "Errata": ("TErrata",),
 }
-"""Chapter -> its tables (T) and figures (F) in the order of the thesis."""
+"""Tables (T) and figures (F) by chapter, in the order of the thesis."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class Report:
     """Result of a report.
 
     Attributes:
-        on: What chapter 5 was run on.
-        chapters: Chapter and its items.
+        on: Description of the data of chapter 5.
+        chapters: Chapters with their items.
     """
 
     on: str
@@ -85,12 +85,12 @@ class Report:
 
     @property
     def items(self) -> list[Item]:
-        """All of them."""
+        """Items of all chapters."""
         return [item for _, items in self.chapters for item in items]
 
 
 def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Callable[[], Item]]:
-    """Every item's maker by its mark: T5, F19."""
+    """Return the functions that build the items, by mark such as T5 or F19."""
 
     def of_simulation(make: Callable[[Simulation], Item]) -> Callable[[], Item]:
         return lambda: make(simulation)
@@ -98,16 +98,16 @@ def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Calla
     def of_experiment(make: Callable[[Experiment], Item]) -> Callable[[], Item]:
         return lambda: make(experiment)
 
-    found: dict[str, Callable[[], Item]] = {}
-    found |= {f"T{key}": of_simulation(make) for key, make in simulation_tables.TABLES.items()}
-    found |= {f"F{key}": of_simulation(make) for key, make in simulation_figures.FIGURES.items()}
-    found |= {f"T{key}": of_experiment(make) for key, make in experiment_tables.TABLES.items()}
-    found |= {f"F{key}": of_experiment(make) for key, make in experiment_figures.FIGURES.items()}
-    if experiment.recorded is None:  # the printed values are enough for these
-        found |= {f"F{key}": make for key, make in printed_pack.FIGURES.items()}
-    found["TErrata"] = of_simulation(errata.table)
-    found |= {f"F{key}": _diagram(key) for key in DIAGRAMS}
-    return found
+    builders: dict[str, Callable[[], Item]] = {}
+    builders |= {f"T{key}": of_simulation(make) for key, make in simulation_tables.TABLES.items()}
+    builders |= {f"F{key}": of_simulation(make) for key, make in simulation_figures.FIGURES.items()}
+    builders |= {f"T{key}": of_experiment(make) for key, make in experiment_tables.TABLES.items()}
+    builders |= {f"F{key}": of_experiment(make) for key, make in experiment_figures.FIGURES.items()}
+    if experiment.recorded is None:  # without captures these are computed from the printed values
+        builders |= {f"F{key}": make for key, make in printed_pack.FIGURES.items()}
+    builders["TErrata"] = of_simulation(errata.table)
+    builders |= {f"F{key}": _diagram(key) for key in DIAGRAMS}
+    return builders
 
 
 def _diagram(key: str) -> Callable[[], Item]:
@@ -127,22 +127,22 @@ def build(
 
     Args:
         recorded: Real captures for chapter 5; None: the simulated pack.
-        table: Only this one.
-        figure: Only this one.
-        progress: Called with the name of the next item, the number done, and the total.
+        table: Number of the only table to compute.
+        figure: Number of the only figure to compute.
+        progress: Called with the name of the next item, the number of finished items, and the total.
 
     Raises:
-        UserError: No such table or figure, or captures that chapter 5 cannot be run on.
+        UserError: There is no such table or figure, or chapter 5 cannot be run on the captures.
     """
     experiment = Experiment(recorded)
     if recorded is not None:
-        # captures that cannot serve are refused here, not after half a minute of simulations
+        # reject unusable captures before half a minute of simulations
         _ = experiment.protocol.r_s_fit
     builders = _builders(Simulation(), experiment)
-    wanted = _wanted(builders, table, figure)
-    total, done = sum(len(marks) for _, marks in wanted), 0
+    selected = _select(builders, table, figure)
+    total, done = sum(len(marks) for _, marks in selected), 0
     chapters = []
-    for chapter, marks in wanted:
+    for chapter, marks in selected:
         items = []
         for mark in marks:
             progress(f"{'Table' if mark[0] == 'T' else 'Figure'} {mark[1:]}", done, total)
@@ -153,20 +153,20 @@ def build(
     return Report(experiment.on, tuple(chapters))
 
 
-def _wanted(
+def _select(
     builders: dict[str, Callable[[], Item]], table: str | None, figure: str | None
 ) -> Sequence[tuple[str, tuple[str, ...]]]:
-    """Chapters and marks of the requested items."""
-    asked = [f"T{table}"] * (table is not None) + [f"F{figure}"] * (figure is not None)
-    for mark in asked:
+    """Return chapters and marks of the requested items."""
+    requested = [f"T{table}"] * (table is not None) + [f"F{figure}"] * (figure is not None)
+    for mark in requested:
         if mark not in builders:
             raise UserError(
                 f"the thesis has no {'table' if mark[0] == 'T' else 'figure'} {mark[1:]}: tables are 1 to 13, figures 1 to 50"
             )
-    if not asked:
+    if not requested:
         return list(CHAPTERS.items())
     return [
-        (chapter, tuple(mark for mark in marks if mark in asked))
+        (chapter, tuple(mark for mark in marks if mark in requested))
         for chapter, marks in CHAPTERS.items()
-        if set(marks) & set(asked)
+        if set(marks) & set(requested)
     ]

@@ -1,4 +1,4 @@
-"""Sources with optional libraries: a missing one is named, with its extra."""
+"""Sources with optional libraries: errors for missing ones name the extra."""
 
 import sys
 from pathlib import Path
@@ -19,7 +19,7 @@ V, I = "voltage = { id = 1 }", "current = { id = 2 }"  # noqa: E741
         ('kind = "can"\nprofile = "pylontech-can"', "cantools", "can"),
     ],
 )
-def test_a_missing_package_is_named(
+def test_missing_package_is_reported_with_its_extra(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

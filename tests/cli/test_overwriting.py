@@ -26,7 +26,7 @@ def capture(tmp_path_factory):
         ("identify", ("--cell", "ncr18650", "--keep-ocv"), "out.toml"),
     ],
 )
-def test_a_file_that_is_there_is_replaced_with_force_alone(command, options, name, capture, tmp_path, capsys):
+def test_existing_file_is_replaced_only_with_force(command, options, name, capture, tmp_path, capsys):
     out = tmp_path / name
     out.write_text("# measured in May\n")
     arguments = [command, str(capture), *options, "--out", str(out)]
@@ -55,9 +55,7 @@ def test_a_file_that_is_there_is_replaced_with_force_alone(command, options, nam
     [(Path.symlink_to, "given twice"), (lambda again, path: shutil.copy(path, again), "the same as")],
     ids=["link", "copy"],
 )
-def test_a_capture_that_is_given_twice_does_not_count_twice(
-    command, again_by, why, capture, tmp_path, capsys, monkeypatch
-):
+def test_duplicate_capture_is_rejected(command, again_by, why, capture, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     again = tmp_path / "again.csv"
     again_by(again, capture)

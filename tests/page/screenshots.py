@@ -23,7 +23,7 @@ from tests.mosquitto import Broker
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import SERIES, Service, simulated
 from tests.sinks.snapshots import ONE
-from tests.store.test_history import keep
+from tests.store.test_history import record
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
 LEARN_S = 60.0
@@ -111,7 +111,7 @@ async def shoot_all(service: Service, browser: Browser) -> None:
 async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        await keep(folder / "attic.sqlite", yesterday())
+        await record(folder / "attic.sqlite", yesterday())
         broker = Broker(folder).start()
         try:
             async with Service(folder, broker, free_port(), simulated(soc=SOC)) as service, chromium() as browser:

@@ -27,7 +27,7 @@ from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, starting
 from tests.sinks.snapshots import ONE, STACK
-from tests.store.test_history import at, keep
+from tests.store.test_history import at, record
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
@@ -121,7 +121,7 @@ def board(_time_s: float) -> dict[str, Any]:
 
 @module_fixture
 async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
-    await keep(folder / "cellar.sqlite", [])
+    await record(folder / "cellar.sqlite", [])
     port = free_port()
     async with Service(folder, broker, free_port(), board, pack=PACK) as service, Listener(broker) as live:
         arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
@@ -357,7 +357,7 @@ async def test_a_pack_with_an_alarm_appears_among_foreign_names_and_stands_first
 async def test_history_is_drawn_for_each_span(browser: Browser, house: House, folder: Path) -> None:
     now_s = datetime.now(UTC).timestamp()
     begin_s = datetime.fromisoformat(at(0.0).estimate.time).timestamp()
-    await keep(folder / "cellar.sqlite", [at(now_s - begin_s - 30.0 * s, 3.0, 3.9) for s in range(100, 0, -1)])
+    await record(folder / "cellar.sqlite", [at(now_s - begin_s - 30.0 * s, 3.0, 3.9) for s in range(100, 0, -1)])
     async with dashboard_of(browser, house, "cellar") as opened:
         for span in ("Hour", "Day", "Month"):
             await opened.page.get_by_text(span, exact=True).click()

@@ -21,7 +21,7 @@ from bms_estimator.settings.page import PageSettings
 from bms_estimator.store.minute import epoch_s
 from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE
-from tests.store.test_history import at, keep
+from tests.store.test_history import at, record
 
 MAX_BYTES = 100_000
 """Total content for a browser."""
@@ -197,7 +197,7 @@ async def test_a_token_is_shown_once_and_a_cookie_goes_on(hub, past, tmp_path):
 
 
 async def test_history_comes_in_a_bounded_number_of_points(tmp_path, hub):
-    await keep(tmp_path / "attic.sqlite", [at(30.0 * s) for s in range(4000)])  # 33 h
+    await record(tmp_path / "attic.sqlite", [at(30.0 * s) for s in range(4000)])  # 33 h
     now_s = epoch_s(at(30.0 * 3999).estimate.time)
     past = HistoryQuery(lambda: now_s)
     past.add("attic", tmp_path / "attic.sqlite")

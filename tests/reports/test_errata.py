@@ -1,4 +1,4 @@
-"""The errata's own computations against others: by hand, by simulation, by the identity that is claimed."""
+"""Computed errata against results by hand, by simulation, or by the claimed identity."""
 
 import math
 
@@ -36,8 +36,8 @@ def held():
     return quasi_steady(CHEN_MORA, 0.275)
 
 
-def test_branches_stand_as_their_time_constants_where_the_cells_stand_as_its_resistances(held):
-    """E15: 32.8 s and 223 s, 46.7 and 49.8 mOhm."""
+def test_ratio_of_x2_and_x3_is_that_of_the_time_constants(held):
+    """E15, with tau 32.8 s and 223 s, and resistances of 46.7 and 49.8 mOhm."""
     assert held.tau_s == pytest.approx((32.81, 223.03), abs=0.01)
     assert held.observer_v[1] / held.observer_v[0] == pytest.approx(223.03 / 32.81, rel=0.002)
     assert held.cell_v[1] / held.cell_v[0] == pytest.approx(0.04984 / 0.04669, rel=0.001)
@@ -58,7 +58,7 @@ def test_voltage_of_an_empty_cell_is_not_zero():
 
 
 def test_condition_on_a8_is_the_capacitance_itself():
-    """E18: a8 above its bound exactly where C_ts > 0, whatever the values, so the Lemma assumes what it proves."""
+    """E18: a8 exceeds its bound exactly if C_ts > 0, so that the Lemma assumes what it proves."""
     random = np.random.default_rng(0)
     both = set()
     for a7, a8, a9, soc in random.uniform((100.0, 1.0, 100.0, 0.001), (1000.0, 50.0, 1000.0, 1.0), (2000, 4)):
@@ -82,20 +82,20 @@ def test_initial_values_of_table_10_violate_the_lemma():
 
 
 def test_either_pair_of_weights_of_a7_breaks_one_condition_of_table_5():
-    """E6 with the printed ones; with those of E32 the rate, and of a12 the second one."""
+    """The printed weights violate the condition of E6; those of E32 violate that on the rate, and the second on a12."""
     failing = [[c.name for c in lemma_conditions(cell) if not c.holds] for cell in (CHEN_MORA, table_5_cell())]
     assert failing == [["1: P9.l9 < P7.l7"], ["1: rate of a7 < rate of a9", "2: P12.l12 < P10.l10"]]
 
 
 def test_series_resistance_by_the_printed_sign_is_negative():
-    """E19, on a cell at rest before, half full, 0.275 A."""
+    """E19, for a half full cell after a rest, at 0.275 A."""
     x, a = (0.5, 0.004, 0.007), CHEN_MORA.a
     y = terminal_voltage(x, 0.275, a)
     assert (y + x[1] + x[2] - emf(0.5, a)) / 0.275 == pytest.approx(-r_s(0.5, a))
 
 
 @pytest.mark.parametrize(("cell", "ohm"), [("chen_mora", 0.727), ("ncr18650", 0.0667), ("thunder_power_6s", 0.0303)])
-def test_ten_millivolts_of_the_ocv_at_c_20(cell, ohm):
+def test_error_of_r_s_by_an_ocv_error_at_c_20(cell, ohm):
     assert ocv_error_ohm(load_cell(cell)) == pytest.approx(ohm, rel=1e-3)
 
 
@@ -113,7 +113,7 @@ def test_printed_currents_contradict_ohms_law():
 
 
 def test_mean_current_is_that_of_a_simulated_discharge():
-    """The same pack through the same resistor, step by step with its transients."""
+    """The simulation discharges the pack through the resistor with all transients."""
     a, capacity_as = printed_pack.A, 6.6 * 3600.0
     x, drawn_as, seconds, current_a = (1.0, 0.0, 0.0), 0.0, 0, 0.0
     while x[0] > printed_pack.EMPTY_SOC:
@@ -123,7 +123,7 @@ def test_mean_current_is_that_of_a_simulated_discharge():
     assert printed_pack.mean_current_a(12.5) == pytest.approx(drawn_as / seconds, rel=0.003)
 
 
-def test_simulated_loads_are_what_they_are_called():
+def test_simulated_loads_have_their_nominal_resistance():
     for load in ("50 ohm", "25 ohm", "12.5 ohm"):
         assert f"{resistance_ohm(load):g} ohm" == load
     assert math.isinf(resistance_ohm(""))
@@ -169,7 +169,7 @@ def simulation():
 
 
 def shift_of_a2(start, law):
-    """By how much (3.16) or (3.17) moves a2 in a minute.
+    """Return the change of a2 by (3.16) or (3.17) in a minute.
 
     (2.2), (2.3), (3.2), (3.3), (3.12) to (3.14) solved by scipy, with tolerances in place of a fixed step.
     """
@@ -199,8 +199,8 @@ def shift_of_a2(start, law):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("n", [0, 1, 2])
-def test_fitted_starts_move_the_parameters_as_the_differential_equations_do(simulation, n):
-    """E25: each fits Tables 2 and 3, whatever the kernel's step; k integrates the e^2 that moves the parameters."""
+def test_fitted_starts_agree_with_the_differential_equations(simulation, n):
+    """E25: each start fits Tables 2 and 3 for any kernel step; k integrates the e^2 that changes the parameters."""
     start = (simulation.one_start, *simulation.other_starts)[n]
     for law, run, shift in (
         ("scheme-1", start.scheme_1, printed_values.TABLE_2_SHIFT),
@@ -211,15 +211,15 @@ def test_fitted_starts_move_the_parameters_as_the_differential_equations_do(simu
         assert shift_of_a2(start, law) == pytest.approx(after_a_minute, abs=2e-4)
 
 
-def test_ohmic_drop_goes_into_the_branches(held):
-    """E27: u R_s is 1/1500 of i R_s, and x2^ + x3^ are the cell's with the ohmic drop."""
+def test_ohmic_drop_is_added_to_the_rc_voltages(held):
+    """E27: u R_s is 1/1500 of i R_s, and x2^ + x3^ is that of the cell plus the ohmic drop."""
     assert 1e3 * held.ohmic_v == pytest.approx(0.275 * 74.46, abs=0.01)
     assert 1e3 * held.driven_v == pytest.approx(0.0136, abs=0.0001)
     assert sum(held.observer_v) == pytest.approx(sum(held.cell_v) + held.ohmic_v, abs=3e-4)
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2", "scheme-3"])
-def test_a13_to_a15_have_next_to_no_effect_in_the_schemes(law):
+def test_a13_to_a15_have_nearly_no_effect_in_the_schemes(law):
     """E27: with R_s doubled the output moves by less than 0.05 mV after the first minute."""
     samples = discharge(CHEN_MORA, 0.275, 0.1)[:6000]
     found = []
@@ -254,7 +254,7 @@ def test_bulb_draws_80_watts(rows):
 
 
 def test_current_differences_are_mostly_an_offset():
-    """E31: a sensor of this offset and gain leaves less than 3 mA of them."""
+    """E31: a sensor with this offset and gain explains the differences within 3 mA."""
     offset_a, gain = printed_pack.current_sensor()
     assert (1e3 * offset_a, 100.0 * gain) == pytest.approx((-39.9, -1.66), abs=0.05)
     for load, ohm in printed_values.RESISTORS_OHM.items():
@@ -262,7 +262,7 @@ def test_current_differences_are_mostly_an_offset():
         assert true_a * (1.0 + gain) + offset_a == pytest.approx(printed_values.CURRENTS_A[load], abs=0.003)
 
 
-def test_estimates_of_table_10_keep_a_part_of_their_starts(rows):
+def test_estimates_of_table_10_contain_a_part_of_their_start(rows):
     """E33: 36.4 of 3.63e7 and 29.3 of 4.2e7, above 6000 and 3666.67."""
     assert "a10 lies 36.4 above its limit after a start at 3.6e+07" in rows["E33"]
     assert "a12 lies 29.3 above its limit after a start at 4.2e+07" in rows["E33"]
@@ -270,7 +270,7 @@ def test_estimates_of_table_10_keep_a_part_of_their_starts(rows):
 
 @pytest.fixture(scope="module")
 def rows(simulation):
-    return {f"E{n}": erratum.holds for n, erratum in enumerate(errata(simulation), 1)}
+    return {f"E{n}": erratum.corrected for n, erratum in enumerate(errata(simulation), 1)}
 
 
 def test_there_are_36_errata(rows):

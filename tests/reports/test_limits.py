@@ -1,4 +1,4 @@
-"""Lemma 4.1.3 and (2.11), (2.12) against digits worked out by hand from the printed bounds and weights."""
+"""Lemma 4.1.3, (2.11) and (2.12) against results by hand from the printed bounds and weights."""
 
 import numpy as np
 import pytest
@@ -60,8 +60,8 @@ def test_printed_weights_of_a8_have_another_limit():
 
 
 @pytest.mark.parametrize(("index", "digits"), list(enumerate(TABLE_5.split(), 1)))
-def test_means_from_the_first_sample_on_have_every_digit_of_table_5(index, digits):
-    """Bounds, weights and initial values alone, no data (E3), with the weights of E32."""
+def test_means_from_the_first_sample_reproduce_table_5(index, digits):
+    """Only bounds, initial values and the weights of E32 are used, and no data (E3)."""
     assert printed_values.TABLE_5[index][1] == float(digits)
     decimals = len(digits.partition(".")[2])
     assert f"{printed_values.mean_from_start('5', index):.{decimals}f}" == digits
@@ -81,7 +81,7 @@ def test_printed_weights_do_not_give_the_digits_of_table_5(index):
 
 
 def test_no_other_weights_up_to_800_give_the_digits_of_a7():
-    """E32: 196, 182 is the only pair of whole numbers with the time that a4 allows."""
+    """E32: 196, 182 is the only pair of integers for the time that a4 allows."""
     seconds, start, digits = (328.12, 328.4), 510.0, 759.2573
     x, y = (grid.ravel() for grid in np.mgrid[1:801, 1:801])
     limit = (1000.0 * x + 500.0 * y) / (x + y)
@@ -95,12 +95,12 @@ def test_means_from_the_first_sample_on_are_near_table_10(index, estimate):
     assert printed_values.mean_from_start("10", index) == pytest.approx(estimate, rel=1e-2 * WORST_PERCENT)
 
 
-def test_worst_of_the_means_of_table_10():
+def test_worst_mean_of_table_10():
     assert printed_values.worst_mean_percent() == pytest.approx(WORST_PERCENT, abs=0.005)
 
 
 def test_free_parameters_are_counted_from_the_inferred_weights():
-    """The time, the rate of each inferred pair, and its ratio unless it is the printed one."""
+    """Free are the time, the rate of each inferred pair, and its ratio unless that is printed."""
     for table, pairs in printed_values.INFERRED_WEIGHTS.items():
         ratios = [x / y != printed_values.BOUNDS[i][2] / printed_values.BOUNDS[i][3] for i, (x, y) in pairs.items()]
         assert printed_values.FREE_PARAMETERS[table] == 1 + len(pairs) + sum(ratios)

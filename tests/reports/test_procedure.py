@@ -1,4 +1,4 @@
-"""Chapter 5 on captures: what each serves for, what it needs, what comes out."""
+"""Procedure of chapter 5 on captures: use of each capture, requirements, results."""
 
 import re
 from pathlib import Path
@@ -45,7 +45,7 @@ def protocol(samples):
 
 @pytest.fixture(scope="module")
 def leaf(data):
-    """A capture with rests, and a 1C discharge cut out of one that charges as well."""
+    """Return the procedure on a capture with rests and on the 1C discharge of a longer capture."""
     hppc, cc = (load_capture(data / "leaf" / f"{name}.csv.gz").rows for name in ("hppc_25c_from_full", "cc_1c"))
     captures = [Capture("hppc", Kind.RELAXATION, hppc), Capture("cc", Kind.CONSTANT, chapter5.discharge(cc, 0.3))]
     return Procedure(load_cell("leaf"), captures, 1e-3)
@@ -66,7 +66,7 @@ def test_start_of_each_capture(protocol):
 
 
 def test_frozen_model_is_validated_on_other_loads(protocol):
-    """(5.3) as Table 11. The OCV of ``TRUTH`` is no (2.10): most of the error is what that form leaves of it."""
+    """(5.3) as in Table 11. The OCV of ``TRUTH`` is not of the form (2.10), which causes most of the error."""
     assert protocol.smallest.name == "slow"
     assert [c.name for c in protocol.validating] == ["constant", "steps"]
     found = {name: (run.mean_percent, run.max_percent) for name, run in protocol.dynamic.items()}
@@ -80,7 +80,7 @@ def test_static_model_is_worse_on_every_load(protocol):
     assert all(found[name] > run.mean_percent for name, run in protocol.dynamic.items())
 
 
-def test_soc_by_interpolation_lies_by_the_counted_one(protocol):
+def test_soc_by_interpolation_is_near_the_counted_one(protocol):
     soc, e_o = protocol.interpolated("constant")
     counted = protocol.dynamic["constant"].soc
     assert 100.0 * np.sqrt(np.mean((soc - counted) ** 2)) == pytest.approx(1.15, abs=0.05)
@@ -88,31 +88,31 @@ def test_soc_by_interpolation_lies_by_the_counted_one(protocol):
 
 
 @pytest.mark.parametrize("name", ["constant", "steps"])
-def test_what_validates_has_no_part_in_any_parameter(samples, name):
-    """Its voltage is off by 50 mV, and not one of a1..a21 moves."""
+def test_validating_capture_changes_no_parameter(samples, name):
+    """A voltage error of 50 mV does not change any of a1..a21."""
     moved = samples[name].copy()
-    moved["voltage_v"][100:] += 0.05  # its first rest still tells the SOC it starts with
+    moved["voltage_v"][100:] += 0.05  # the first rest still gives the initial SOC
     before, after = on(samples), on(samples | {name: moved})
     assert after.a_for(name).tolist() == before.a_for(name).tolist()
     assert after.joint_fit.a.tolist() == before.joint_fit.a.tolist()
     assert after.dynamic[name].mean_percent > before.dynamic[name].mean_percent + 0.5
 
 
-def test_what_moves_the_others_is_what_served_step_3(samples):
+def test_captures_of_step_3_change_the_parameters(samples):
     moved = samples["constant"].copy()
     moved["voltage_v"] += 0.05
     before, after = on(samples), on(samples | {"constant": moved})
     assert after.a_for("steps")[15] < before.a_for("steps")[15] - 0.005
 
 
-def test_a_load_beyond_the_thesis_s_c_rates_only_validates(samples):
+def test_load_above_the_c_rates_of_the_thesis_only_validates(samples):
     fast = on(samples | {"constant": capture(constant(2.0, 6_000), soc=1.0)})
     assert list(fast.r_s_curves) == ["slow", "relaxation"]
     assert [c.name for c in fast.validating] == ["constant", "steps"]
 
 
-def test_validation_ends_where_the_lowest_point_of_all_relaxation_tests_lies(samples, protocol):
-    """A second test that ends half full takes nothing from what the first one gives."""
+def test_validation_ends_at_the_lowest_point_of_all_relaxation_tests(samples, protocol):
+    """A second test that ends half full does not raise the end of validation."""
     half = samples["relaxation"][: samples["relaxation"].size // 2]
     both, alone = on(samples | {"half": half}), on(samples | {"relaxation": half})
     assert [test.name for test in both.tests] == ["relaxation", "half"]
@@ -122,7 +122,7 @@ def test_validation_ends_where_the_lowest_point_of_all_relaxation_tests_lies(sam
     assert both.r_s_mean.soc.min() == pytest.approx(protocol.lowest_soc, abs=0.02)
 
 
-def test_bounds_are_the_printed_ones_scaled_by_cells_and_capacity():
+def test_printed_bounds_are_scaled_by_cells_and_capacity():
     pack = load_cell("thunder_power_6s")
     assert printed_bounds(pack) == {name: pack.adaptation[name] for name in pack.adaptation}
     scaled, ohm = printed_bounds(TRUTH), 6.6 / 3.0 / 6.0
@@ -131,26 +131,28 @@ def test_bounds_are_the_printed_ones_scaled_by_cells_and_capacity():
     assert scaled["a5"] == pack.adaptation["a5"]
     own = TRUTH.model_copy(update={"adaptation": {"a3": pack.adaptation["a3"]}})
     captures = [Capture(name, kind, np.empty(0)) for name, kind in SERVES.items()]
-    assert Procedure(own, captures, 1e-3).cell.bounds(3) == pack.adaptation["a3"]  # a cell file's own come first
+    assert (
+        Procedure(own, captures, 1e-3).cell.bounds(3) == pack.adaptation["a3"]
+    )  # bounds of the cell file take precedence
 
 
 @pytest.mark.parametrize(
     ("missing", "words"),
     [(("relaxation",), "voltage relaxation test"), (("slow", "constant", "steps"), "constant load or steps")],
 )
-def test_what_is_missing_is_named(samples, missing, words):
+def test_missing_captures_are_reported(samples, missing, words):
     captures = [Capture(name, SERVES[name], block) for name, block in samples.items() if name not in missing]
     with pytest.raises(UserError, match=rf"needs a {words}; given: .*\)"):
         Procedure(TRUTH, captures, 1e-3)
 
 
-def test_a_lone_constant_load_validates_and_step_2_runs_on_the_relaxation_test(leaf):
+def test_single_constant_load_validates_and_step_2_uses_the_relaxation_test(leaf):
     assert leaf.smallest.name == "hppc"
     assert [c.name for c in leaf.validating] == ["cc"]
 
 
 @pytest.mark.parametrize(("kept", "missing"), [("steps", ("33", "34")), ("constant", ("36", "37", "38"))])
-def test_a_figure_of_a_load_that_is_missing_is_empty_and_says_so(samples, kept, missing):
+def test_figure_of_a_missing_load_is_empty_with_a_reason(samples, kept, missing):
     recorded = Recorded(TRUTH, tuple((name, samples[name]) for name in ("relaxation", kept)), 1e-3)
     experiment = Experiment(recorded)
     drawn = {key: FIGURES[key](experiment) for key in ("33", "34", "36", "37", "38")}
@@ -162,7 +164,7 @@ def test_a_figure_of_a_load_that_is_missing_is_empty_and_says_so(samples, kept, 
 
 
 def test_leaf_figures(leaf):
-    """As in docs/theory/chapter5.md."""
+    """The values are those of docs/theory/chapter5.md."""
     run, (soc, _) = leaf.dynamic["cc"], leaf.interpolated("cc")
     assert (run.mean_percent, run.max_percent) == pytest.approx((0.543, 2.37), abs=0.005)
     assert leaf.static["cc"].mean_percent == pytest.approx(0.517, abs=0.005)
@@ -176,8 +178,8 @@ def test_leaf_verdicts(leaf):
     assert list(found.values()) == [fails, fails, none, none, fails, fails, Reproduction.CLAIM_HOLDS, fails]
 
 
-def test_a_relaxation_test_that_serves_two_cells_counts_for_each(leaf):
-    """By the name of a capture the second result would stand in the first one's place."""
+def test_relaxation_test_shared_by_two_cells_counts_twice(leaf):
+    """Results by name of the capture would overwrite each other."""
     one, two = claim("RC products", [leaf]), claim("RC products", [leaf, leaf])
     assert two.results == 2 * one.results
     assert len(one.results) == 2
@@ -186,19 +188,19 @@ def test_a_relaxation_test_that_serves_two_cells_counts_for_each(leaf):
 def test_dynamic_against_static_is_their_ratio(leaf):
     for key, limit in (("order", 1.0), ("ratio", 0.003 / 0.358)):
         (result,) = claim(f"dynamic against static, {key}", [leaf]).results
-        assert (result.found, result.limit) == (pytest.approx(0.543 / 0.517, abs=0.01), limit)
+        assert (result.value, result.limit) == (pytest.approx(0.543 / 0.517, abs=0.01), limit)
         assert not result.met
 
 
 @pytest.mark.parametrize(
     ("met", "verdict"), [(0, Reproduction.CLAIM_FAILS), (2, Reproduction.CLAIM_FAILS), (3, Reproduction.CLAIM_HOLDS)]
 )
-def test_a_claim_holds_when_it_is_met_on_more_than_half(met, verdict):
+def test_claim_holds_if_met_on_more_than_half(met, verdict):
     results = tuple(Result(f"load {i}", 1.0 if i < met else 2.0, 1.5) for i in range(4))
-    found = Claim("mean", "Table 11", "mean error at most 1.5 %", results)
-    assert (found.met, found.verdict) == (met, verdict)
-    assert found.span == {0: "2", 2: "1 to 2", 3: "1 to 2"}[met]
-    assert f"met on {met} of 4 captures (found {found.span})" in found.words
+    claimed = Claim("mean", "Table 11", "mean error at most 1.5 %", results)
+    assert (claimed.met, claimed.verdict) == (met, verdict)
+    assert claimed.span == {0: "2", 2: "1 to 2", 3: "1 to 2"}[met]
+    assert f"met on {met} of 4 captures (values {claimed.span})" in claimed.sentence
 
 
 @pytest.fixture(scope="module")
@@ -207,15 +209,15 @@ def real_cells(shared_data):
 
 
 @pytest.mark.thorough
-def test_the_document_gives_every_error_that_is_measured(real_cells):
-    """To the digits that it prints."""
+def test_document_lists_every_measured_error(real_cells):
+    """Values agree in all printed digits."""
     measured = [" | ".join(row) for name, p in real_cells.items() for row in chapter5.lines(name, p)]
     table = DOCUMENT.read_text(encoding="utf-8").split("## Errors")[1].split("\n## ")[0]
     assert re.findall(r"^\| (.*) \|$", table, re.MULTILINE)[1:] == measured
 
 
 @pytest.mark.thorough
-def test_the_document_gives_every_verdict(real_cells):
+def test_document_lists_every_verdict(real_cells):
     room = [real_cells[experiment.name] for experiment in chapter5.EXPERIMENTS if experiment.room]
     measured = [
         " | ".join((key, *everywhere, *at_room_temperature))

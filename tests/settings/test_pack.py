@@ -1,4 +1,4 @@
-"""A wrong file gets one line that names file, key, value and what is allowed."""
+"""Errors in settings and cell files: one line with file, key, value and allowed values."""
 
 from pathlib import Path
 
@@ -41,21 +41,21 @@ def edited(tmp_path: Path, old: str, new: str) -> Path:
         ("[cell]", "[cell", r"cell\.toml: not valid TOML: .*line 5"),
     ],
 )
-def test_wrong_cell_file_is_named_with_key_value_and_what_is_allowed(
+def test_error_in_a_cell_file_names_key_value_and_allowed_values(
     tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     with pytest.raises(UserError, match=message):
         load_cell(edited(tmp_path, old, new))
 
 
-def test_all_wrong_keys_are_named_at_once(tmp_path: Path) -> None:
+def test_all_invalid_keys_are_reported_together(tmp_path: Path) -> None:
     path = edited(tmp_path, "capacity_ah = 0.275\nnominal_voltage_v = 3.7", "capacity_ah = 0\nnominal_voltage_v = -1")
     with pytest.raises(UserError) as error:
         load_cell(path)
     assert len(str(error.value).splitlines()) >= 2
 
 
-def test_missing_cell_names_the_shipped_ones() -> None:
+def test_error_on_an_unknown_cell_lists_the_shipped_cells() -> None:
     with pytest.raises(UserError, match=r"no such cell file, nor a shipped cell \(chen_mora, .*thunder_power_6s\)"):
         load_cell("lifepo5")
 
@@ -97,7 +97,7 @@ def test_table_ocv_must_increase_from_empty_to_full(tmp_path: Path, table: str, 
         ("[sensor]\nsample_rate_hz = 5000", r"sensor\.sample_rate_hz = 5000: .*1000"),
     ],
 )
-def test_wrong_settings_are_named(tmp_path: Path, text: str, message: str) -> None:
+def test_error_names_the_invalid_setting(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "pack.toml"
     path.write_text(text)
     with pytest.raises(UserError, match=message):
@@ -110,7 +110,7 @@ def test_empty_settings_are_the_defaults(tmp_path: Path) -> None:
     assert load_settings(path) == Settings()
 
 
-def test_printed_gain_law_can_be_asked_for(tmp_path: Path) -> None:
+def test_printed_gain_law_is_configurable(tmp_path: Path) -> None:
     path = tmp_path / "pack.toml"
     path.write_text('[observer]\nrearm_gain = "never"\ndead_zone_v = 0.0\nlambda = 2.0\n')
     observer = load_settings(path).observer
@@ -126,7 +126,7 @@ def test_printed_gain_law_can_be_asked_for(tmp_path: Path) -> None:
         ('[identifier]\nenabled = false\n[observer]\nlaw = "improved"', "improved"),
     ],
 )
-def test_without_the_identifier_the_law_learns_unless_another_is_named(tmp_path: Path, text: str, law: str) -> None:
+def test_default_law_without_the_identifier_is_learning(tmp_path: Path, text: str, law: str) -> None:
     path = tmp_path / "pack.toml"
     path.write_text(text)
     assert load_settings(path).observer.law == law
@@ -149,7 +149,7 @@ def test_pack_scales_the_cell() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("[pack]\ncapacity_ah = true", "pack.capacity_ah = True: must be a number"),
         ("[pack]\nseries = true", "pack.series = True: must be a number"),
@@ -160,15 +160,15 @@ def test_pack_scales_the_cell() -> None:
         ("a = " + 3000 * "[", "not valid TOML: nested too deeply"),
     ],
 )
-def test_a_number_is_a_number_and_a_truth_value_is_one(tmp_path: Path, text: str, said: str) -> None:
+def test_numbers_and_booleans_are_not_converted(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "pack.toml"
     path.write_text(text)
     with pytest.raises(UserError) as error:
         load_settings(path)
-    assert str(error.value).startswith(f"{path}: {said}")
+    assert str(error.value).startswith(f"{path}: {expected}")
 
 
-def test_a_whole_number_may_be_written_with_a_point(tmp_path: Path) -> None:
+def test_integer_may_be_written_with_a_decimal_point(tmp_path: Path) -> None:
     path = tmp_path / "pack.toml"
     path.write_text("[pack]\nseries = 4.0\ncapacity_ah = 3\n")
     assert load_settings(path).pack.series == 4

@@ -1,4 +1,4 @@
-"""The settings in the documents of sources are settings."""
+"""Settings in the documentation of sources are valid."""
 
 import re
 import tomllib
@@ -19,7 +19,7 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize(("document", "text"), EXAMPLES, ids=lambda value: value[:30])
-def test_an_example_is_accepted(document: str, text: str) -> None:
+def test_documented_example_is_accepted(document: str, text: str) -> None:
     tables = tomllib.loads(text)
     settings = Settings.model_validate(tables)
     assert settings.model_dump(include={"source"}) or settings.sensor.model_fields_set
@@ -27,6 +27,6 @@ def test_an_example_is_accepted(document: str, text: str) -> None:
         assert make_line_producer(Settings.model_validate({"mqtt": {}} | tables))
 
 
-def test_every_profile_stands_in_the_document() -> None:
+def test_every_profile_is_documented() -> None:
     text = (DOCS / "mqtt-source.md").read_text(encoding="utf-8")
     assert [name for name in PROFILES if f"| `{name}` |" not in text] == []

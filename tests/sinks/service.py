@@ -1,4 +1,4 @@
-"""A sink as the service has it, and states that can be told apart."""
+"""MQTT sink as in the service, and states with numbers."""
 
 import asyncio
 import itertools
@@ -21,7 +21,7 @@ STATE = "bms/pack/state"
 
 
 class Sink:
-    """A sink for the pack, and what it counts; every request is answered with its name."""
+    """MQTT sink of a pack with its counters; each request is answered with its name."""
 
     def __init__(self, url: str | tuple[str, ...], most_kept: int = 4, **options: Any) -> None:
         self.delivery = DeliveryStats()
@@ -49,18 +49,18 @@ class Sink:
 
 
 def state(number: int) -> Snapshot:
-    """A snapshot whose estimate has a number."""
+    """Return a snapshot with a number in its estimate."""
     assert ONE.estimate
     return ONE._replace(estimate=ONE.estimate.model_copy(update={"frames_received": number}))
 
 
 def numbers(live: Listener) -> list[int]:
-    """Of the states that have come."""
+    """Return the numbers of the received states."""
     return [json.loads(payload)["frames_received"] for payload in live.all(STATE)]
 
 
 def assert_all_in_order(come: list[int], count: int) -> None:
-    """All states from 0 on came, none out of order; what came twice was among those on their way when a line broke."""
+    """Check that all states from 0 on arrived in order. Only states in flight at a disconnect may arrive twice."""
     assert list(dict.fromkeys(come)) == list(range(count))
     for before, after in itertools.pairwise(come):
         assert before - WINDOW < after <= before + 1, f"{before}, then {after}"

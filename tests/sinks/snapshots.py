@@ -1,4 +1,4 @@
-"""Snapshots as the service makes them."""
+"""Snapshots like those of the service."""
 
 import numpy as np
 
@@ -89,7 +89,7 @@ STACK = of_fuel_cell()
 NOTHING_YET = ONE._replace(
     estimate=None, parameters=make_parameters_payload(Estimator(load_cell("chen_mora"), identifier=None), NOW)
 )
-"""Before the first sample."""
+"""Snapshot before the first sample."""
 
 SOC_LOW = Alarm(
     name="soc_low",
@@ -102,4 +102,4 @@ SOC_LOW = Alarm(
     unit="%",
     text="charge",
 )
-"""Raised."""
+"""Raised alarm."""

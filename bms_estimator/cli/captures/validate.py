@@ -36,30 +36,30 @@ def validate_command(
     The parameters are frozen, and the measured voltage gives only the SOC of the first rest.
     """
     model = load_cell(cell, capacity_ah)
-    found = validate(load_capture(capture, current_sign=current_sign), model, initial_soc=soc)
-    for line in found.warnings:
+    validation = validate(load_capture(capture, current_sign=current_sign), model, initial_soc=soc)
+    for line in validation.warnings:
         typer.echo(f"warning: {line}", err=True)
     if as_json:
-        sys.stdout.write(json.dumps(_json(found)) + "\n")
+        sys.stdout.write(json.dumps(_json(validation)) + "\n")
     else:
-        Console().print(_tables(capture, found))
+        Console().print(_tables(capture, validation))
 
 
-def _json(found: Validation) -> dict[str, Any]:
-    above = {f"{key}_soc_above_0_1": value for key, value in _errors(found.above).items()}
+def _json(validation: Validation) -> dict[str, Any]:
+    above = {f"{key}_soc_above_0_1": value for key, value in _errors(validation.above).items()}
     return (
-        _errors(found.all)
+        _errors(validation.all)
         | above
         | {
-            "initial_soc": found.initial_soc,
-            "initial_soc_from": found.initial_soc_from,
-            "final_soc": found.final_soc,
-            "glitches": found.glitches,
-            "resting": _errors(found.resting),
-            "loaded": _errors(found.loaded),
-            "extra_series_resistance_ohm": _number(found.extra_ohm),
-            "with_extra_series_resistance": _errors(found.without_extra_ohm),
-            "warnings": list(found.warnings),
+            "initial_soc": validation.initial_soc,
+            "initial_soc_from": validation.initial_soc_from,
+            "final_soc": validation.final_soc,
+            "glitches": validation.glitches,
+            "resting": _errors(validation.resting),
+            "loaded": _errors(validation.loaded),
+            "extra_series_resistance_ohm": _number(validation.extra_ohm),
+            "with_extra_series_resistance": _errors(validation.without_extra_ohm),
+            "warnings": list(validation.warnings),
         }
     )
 
@@ -77,21 +77,21 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _tables(capture: Path, found: Validation) -> Group:
+def _tables(capture: Path, validation: Validation) -> Group:
     """Return the result as tables."""
     table = Table(title=capture.name, title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("", "samples", "RMS", "mean", "max"):
         table.add_column(column, justify="left" if not column else "right")
     rows = {
-        "all": found.all,
-        "SOC > 0.1": found.above,
-        "  at rest": found.resting,
-        "  under load": found.loaded,
-        f"  with {1e3 * found.extra_ohm:+.2f} mohm in series": found.without_extra_ohm,
+        "all": validation.all,
+        "SOC > 0.1": validation.above,
+        "  at rest": validation.resting,
+        "  under load": validation.loaded,
+        f"  with {1e3 * validation.extra_ohm:+.2f} mohm in series": validation.without_extra_ohm,
     }
     for name, e in rows.items():
         if e.samples:
             percents = (f"{e.mean_abs_percent:.3f} %", f"{e.max_abs_percent:.2f} %")
             table.add_row(name, f"{e.samples:,}", f"{1e3 * e.voltage_rms_v:.2f} mV", *percents)
-    soc = f"SOC {found.initial_soc:.4f} ({found.initial_soc_from}) to {found.final_soc:.4f}"
-    return Group(table, f"{soc}; {found.glitches} glitches skipped")
+    soc = f"SOC {validation.initial_soc:.4f} ({validation.initial_soc_from}) to {validation.final_soc:.4f}"
+    return Group(table, f"{soc}; {validation.glitches} glitches skipped")

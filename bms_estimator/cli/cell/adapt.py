@@ -47,26 +47,28 @@ def adapt_command(
     check_out(out, captures, force=force)
     check_once(captures)
     model = load_cell(cell, capacity_ah)
-    found = adapt([load_capture(path, current_sign=current_sign) for path in captures], model, soc=soc)
-    write_as_named(out, found.cell, _remarks(cell, found))
+    adaptation = adapt([load_capture(path, current_sign=current_sign) for path in captures], model, soc=soc)
+    write_as_named(out, adaptation.cell, _remarks(cell, adaptation))
     if as_json:
-        sys.stdout.write(json.dumps(_json(out, found)) + "\n")
+        sys.stdout.write(json.dumps(_json(out, adaptation)) + "\n")
         return
     console = Console()
-    console.print(f"{out}: written", _a_table(found), _capture_table(found), *_remarks(cell, found)[1:], sep="\n")
+    console.print(
+        f"{out}: written", _a_table(adaptation), _capture_table(adaptation), *_remarks(cell, adaptation)[1:], sep="\n"
+    )
 
 
-def _json(out: Path, found: Adaptation) -> dict[str, Any]:
-    std = [None] * 12 + [_number(x) for x in found.steps.r_s.std]
-    a = found.steps.a[1:].tolist()
+def _json(out: Path, adaptation: Adaptation) -> dict[str, Any]:
+    std = [None] * 12 + [_number(x) for x in adaptation.steps.r_s.std]
+    a = adaptation.steps.a[1:].tolist()
     return {
         "out": str(out),
         "a": {f"a{i}": {"value": value, "std": std[i - 1]} for i, value in enumerate(a, start=1)},
-        "algorithm_1": found.steps.run.outcome,
-        "t_int_s": found.steps.run.window.t_int_s,
-        "t_unst_s": found.steps.run.window.t_unst_s,
-        "r_s_rms_mohm": 1e3 * found.steps.r_s.rms_ohm,
-        "error_mv": 1e3 * _error_v(found),
+        "algorithm_1": adaptation.steps.run.outcome,
+        "t_int_s": adaptation.steps.run.window.t_int_s,
+        "t_unst_s": adaptation.steps.run.window.t_unst_s,
+        "r_s_rms_mohm": 1e3 * adaptation.steps.r_s.rms_ohm,
+        "error_mv": 1e3 * _error_v(adaptation),
         "captures": [
             {
                 "name": c.name,
@@ -76,45 +78,45 @@ def _json(out: Path, found: Adaptation) -> dict[str, Any]:
                 "score_after_percent": _number(c.score_after),
                 "held_back": c.held_back,
             }
-            for c in found.captures
+            for c in adaptation.captures
         ],
-        "score_before_percent": _number(found.score_before),
-        "score_after_percent": _number(found.score_after),
+        "score_before_percent": _number(adaptation.score_before),
+        "score_after_percent": _number(adaptation.score_after),
     }
 
 
-def _error_v(found: Adaptation) -> float:
-    return math.nan if found.cell.ladder is None else found.cell.ladder.error_v
+def _error_v(adaptation: Adaptation) -> float:
+    return math.nan if adaptation.cell.ladder is None else adaptation.cell.ladder.error_v
 
 
 def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _remarks(cell: str, found: Adaptation) -> list[str]:
-    run, std = found.steps.run, found.steps.r_s.std
-    names = ", ".join(c.name for c in found.captures)
+def _remarks(cell: str, adaptation: Adaptation) -> list[str]:
+    run, std = adaptation.steps.run, adaptation.steps.r_s.std
+    names = ", ".join(c.name for c in adaptation.captures)
     return [
         f"a1..a15 by the thesis's steps 2 and 3 from {names};",
         f"capacity and open-circuit voltage from {Path(cell).name}. Algorithm 1: {run.outcome}.",
         "a1..a12 have no error: (3.18) leads them to the weighted mean of their bounds.",
         f"Standard errors of a13, a14, a15: {std[0]:.2g} ohm, {std[1]:.2g}, {std[2]:.2g} ohm (nan: at a bound).",
-        f"Error of the voltage above SOC 0.1: {1e3 * _error_v(found):.1f} mV RMS.",
-        f"Interval score of replays started in mid-load: {found.score_before:.2f} % before, {found.score_after:.2f} % after.",
+        f"Error of the voltage above SOC 0.1: {1e3 * _error_v(adaptation):.1f} mV RMS.",
+        f"Interval score of replays started in mid-load: {adaptation.score_before:.2f} % before, {adaptation.score_after:.2f} % after.",
     ]
 
 
-def _a_table(found: Adaptation) -> Table:
+def _a_table(adaptation: Adaptation) -> Table:
     """Return a1..a15 as a table with a row for each element."""
     table = Table("element", "amplitude", "exponent", "offset", box=box.SIMPLE_HEAD)
     for name, first in (("R_ts", 1), ("R_tl", 4), ("C_ts", 7), ("C_tl", 10), ("R_s", 13)):
-        table.add_row(f"{name}: a{first}..a{first + 2}", *(f"{x:.4g}" for x in found.steps.a[first : first + 3]))
+        table.add_row(f"{name}: a{first}..a{first + 2}", *(f"{x:.4g}" for x in adaptation.steps.a[first : first + 3]))
     return table
 
 
-def _capture_table(found: Adaptation) -> Table:
+def _capture_table(adaptation: Adaptation) -> Table:
     table = Table("capture", "SOC", "RMS", "before", "after", "held back", box=box.SIMPLE_HEAD)
-    for c in found.captures:
+    for c in adaptation.captures:
         scores = (f"{x:.2f} %" if math.isfinite(x) else "-" for x in (c.score_before, c.score_after))
         table.add_row(
             c.name, f"{c.initial_soc:.3f}", f"{1e3 * c.voltage_rms_v:.1f} mV", *scores, "yes" if c.held_back else "no"

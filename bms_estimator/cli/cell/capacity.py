@@ -78,28 +78,28 @@ def capacity(
     """
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
-    found = measure_capacity(loaded, model, offset_std_a=current_offset_std_a)
-    if not 1.0 / MAX_RATIO < found.capacity_ah / model.cell.capacity_ah < MAX_RATIO:
+    measured = measure_capacity(loaded, model, offset_std_a=current_offset_std_a)
+    if not 1.0 / MAX_RATIO < measured.capacity_ah / model.cell.capacity_ah < MAX_RATIO:
         raise UserError(
-            f"{found.capacity_ah:.4g} Ah, but {model.cell.capacity_ah:.4g} Ah is declared: is the current in amperes and "
+            f"{measured.capacity_ah:.4g} Ah, but {model.cell.capacity_ah:.4g} Ah is declared: is the current in amperes and "
             "the time in seconds?"
         )
-    result = _result(found, model)
+    result = _result(measured, model)
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
         Console().print(_shown(result))
 
 
-def _result(found: Capacity, cell: CellModel) -> CapacityResult:
+def _result(measured: Capacity, cell: CellModel) -> CapacityResult:
     return CapacityResult(
-        capacity_ah=found.capacity_ah,
-        capacity_std_ah=found.std_ah,
+        capacity_ah=measured.capacity_ah,
+        capacity_std_ah=measured.std_ah,
         declared_ah=cell.cell.capacity_ah,
-        current_offset_a=found.offset_a,
-        current_offset_std_a=found.offset_std_a,
-        anchors=[_anchor(a, off) for a, off in zip(found.anchors, found.residual, strict=True)],
-        rejected=list(found.rejected),
+        current_offset_a=measured.offset_a,
+        current_offset_std_a=measured.offset_std_a,
+        anchors=[_anchor(a, off) for a, off in zip(measured.anchors, measured.residual, strict=True)],
+        rejected=list(measured.rejected),
     )
 
 

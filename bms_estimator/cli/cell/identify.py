@@ -69,27 +69,27 @@ def identify_command(
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     started_s = time.perf_counter()
-    found = identify(loaded, model, refine_ocv=not keep_ocv, initial_soc=soc, temperature_c=temperature_c)
+    identification = identify(loaded, model, refine_ocv=not keep_ocv, initial_soc=soc, temperature_c=temperature_c)
     seconds = time.perf_counter() - started_s
     start = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
-    write_as_named(out, found.cell, _remarks(start, found))
+    write_as_named(out, identification.cell, _remarks(start, identification))
     if as_json:
-        sys.stdout.write(json.dumps(_json(out, found, seconds)) + "\n")
+        sys.stdout.write(json.dumps(_json(out, identification, seconds)) + "\n")
     else:
-        Console().print(_tables(out, found, seconds))
+        Console().print(_tables(out, identification, seconds))
 
 
-def _json(out: Path, found: Identification, seconds: float) -> dict[str, Any]:
+def _json(out: Path, identification: Identification, seconds: float) -> dict[str, Any]:
     return {
         "out": str(out),
         "elements": [
             {"soc": soc}
             | {f"{name}_ohm": value for name, (value, _) in row.items()}
             | {f"{name}_ohm_std": std for name, (_, std) in row.items()}
-            for soc, row in found.elements.items()
+            for soc, row in identification.elements.items()
         ],
-        "temperature_c": _temperatures(found),
-        "error_mv": 1e3 * _error_v(found),
+        "temperature_c": _temperatures(identification),
+        "error_mv": 1e3 * _error_v(identification),
         "captures": [
             {
                 "name": c.name,
@@ -103,69 +103,71 @@ def _json(out: Path, found: Identification, seconds: float) -> dict[str, Any]:
                 "score_after_percent": _number(c.score_after),
                 "held_back": c.held_back,
             }
-            for c in found.captures
+            for c in identification.captures
         ],
-        "left_out": list(found.left_out),
-        "ocv_correction_rms_mv": 1e3 * found.ocv_correction_v,
-        "score_before_percent": _number(found.score_before),
-        "score_after_percent": _number(found.score_after),
+        "left_out": list(identification.left_out),
+        "ocv_correction_rms_mv": 1e3 * identification.ocv_correction_v,
+        "score_before_percent": _number(identification.score_before),
+        "score_after_percent": _number(identification.score_after),
         "seconds": seconds,
     }
 
 
-def _temperatures(found: Identification) -> tuple[float, float]:
-    ladder = found.cell.ladder
+def _temperatures(identification: Identification) -> tuple[float, float]:
+    ladder = identification.cell.ladder
     return (math.nan, math.nan) if ladder is None else ladder.temperature_c
 
 
-def _error_v(found: Identification) -> float:
-    return math.nan if found.cell.ladder is None else found.cell.ladder.error_v
+def _error_v(identification: Identification) -> float:
+    return math.nan if identification.cell.ladder is None else identification.cell.ladder.error_v
 
 
 def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _remarks(cell: str, found: Identification) -> list[str]:
-    fitted = ", ".join(f"{c.name} ({1e3 * c.voltage_rms_v:.1f} mV RMS)" for c in found.captures)
-    low_c, high_c = _temperatures(found)
+def _remarks(cell: str, identification: Identification) -> list[str]:
+    fitted = ", ".join(f"{c.name} ({1e3 * c.voltage_rms_v:.1f} mV RMS)" for c in identification.captures)
+    low_c, high_c = _temperatures(identification)
     lines = [
         f"Resistances identified from {fitted}, SOC above 0.1;",
         f"capacity and open-circuit voltage from {Path(cell).name}. Cell temperatures {low_c:g} to {high_c:g} C.",
     ]
-    if found.ocv_correction_v:
-        lines.append(f"OCV: that of {Path(cell).name}, corrected by {1e3 * found.ocv_correction_v:.1f} mV RMS.")
-    return [*lines, f"{_scores(found)}."]
+    if identification.ocv_correction_v:
+        lines.append(
+            f"OCV: that of {Path(cell).name}, corrected by {1e3 * identification.ocv_correction_v:.1f} mV RMS."
+        )
+    return [*lines, f"{_scores(identification)}."]
 
 
-def _scores(found: Identification) -> str:
-    if not math.isfinite(found.score_after):
+def _scores(identification: Identification) -> str:
+    if not math.isfinite(identification.score_after):
         return "No capture is long enough for replays cut in mid-load"
-    held = sum(c.held_back for c in found.captures)
+    held = sum(c.held_back for c in identification.captures)
     return (
-        f"Replays cut in mid-load, started 0.2 wrong: interval score {found.score_before:.2f} % before, "
-        f"{found.score_after:.2f} % after; {held} of {len(found.captures)} captures held back from what they judge"
+        f"Replays cut in mid-load, started 0.2 wrong: interval score {identification.score_before:.2f} % before, "
+        f"{identification.score_after:.2f} % after; {held} of {len(identification.captures)} captures held back from what they judge"
     )
 
 
-def _tables(out: Path, found: Identification, seconds: float) -> Group:
+def _tables(out: Path, identification: Identification, seconds: float) -> Group:
     """Return the result as tables."""
-    shown = Table("SOC", *(f"{soc:g}" for soc in found.elements), title=f"{out}: written", box=box.SIMPLE_HEAD)
+    shown = Table("SOC", *(f"{soc:g}" for soc in identification.elements), title=f"{out}: written", box=box.SIMPLE_HEAD)
     shown.title_justify = "left"
-    for name in next(iter(found.elements.values())):
-        cells = (found.elements[soc][name] for soc in found.elements)
+    for name in next(iter(identification.elements.values())):
+        cells = (identification.elements[soc][name] for soc in identification.elements)
         shown.add_row(f"{name} \\[mohm], 25 °C", *(f"{1e3 * value:.4g} ± {1e3 * std:.2g}" for value, std in cells))
     fits = Table(box=box.SIMPLE_HEAD)
     for column in ("capture", "°C", "SOC", "count", "RMS", "before", "after", "held back"):
         fits.add_column(column, justify="left" if column in ("capture", "held back") else "right")
-    for c in found.captures:
+    for c in identification.captures:
         fits.add_row(*_row(c))
-    low_c, high_c = _temperatures(found)
-    lines = [f"cell temperatures {low_c:g} to {high_c:g} °C; outside, the band widens", _scores(found)]
-    if found.ocv_correction_v:
-        lines.append(f"OCV corrected by {1e3 * found.ocv_correction_v:.1f} mV RMS")
-    if found.left_out:
-        lines.append(f"skipped, because the current is too small for resistances: {', '.join(found.left_out)}")
+    low_c, high_c = _temperatures(identification)
+    lines = [f"cell temperatures {low_c:g} to {high_c:g} °C; outside, the band widens", _scores(identification)]
+    if identification.ocv_correction_v:
+        lines.append(f"OCV corrected by {1e3 * identification.ocv_correction_v:.1f} mV RMS")
+    if identification.left_out:
+        lines.append(f"skipped, because the current is too small for resistances: {', '.join(identification.left_out)}")
     return Group(shown, fits, *lines, f"{seconds:.1f} s")
 
 

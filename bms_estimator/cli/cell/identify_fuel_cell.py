@@ -144,5 +144,7 @@ def _tables(out: Path, values: dict[str, Value], fit: FuelCellFit, seconds: floa
     for key, v in values.items():
         std = "as before" if v.std is None else f"{v.std:.2g}"
         table.add_row(key, f"{v.value:.{DIGITS}g}", std, f"{v.of_start:.{DIGITS}g}")
-    left = [f"{name}: {1e3 * rms_v:.1f} mV RMS" for name, rms_v in fit.rms_v.items()]
-    return Group(table, *left, *(f"{key}: {reason}" for key, reason in fit.undetermined.items()), f"{seconds:.1f} s")
+    residuals = [f"{name}: {1e3 * rms_v:.1f} mV RMS" for name, rms_v in fit.rms_v.items()]
+    return Group(
+        table, *residuals, *(f"{key}: {reason}" for key, reason in fit.undetermined.items()), f"{seconds:.1f} s"
+    )

@@ -171,24 +171,24 @@ def ocv(
             curves.append(ExternalCurve(name, *columns))
     voltages_v = [_checked_voltage(recording) for recording in recordings]
     count = _cells_in_series(np.concatenate([*voltages_v, *(curve.ocv_v for curve in curves)]), series)
-    found = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
+    ocv_sources = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
     fitted: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
-    curve_v = fitted(found.points)(NODES)
-    generic = nearest_generic_cell(NODES, curve_v, found.capacity_ah, count)
-    ladder, elements = _elements(generic, found, recordings)
-    found = without_branches(found, ladder)
-    if form is Form.TABLE and found.hysteresis_v is None and has_plateau(NODES, curve_v, count):
-        found = center_on_typical_hysteresis(found, np.interp(NODES, *curve(generic, "hysteresis_v")))
-    fit = fitted(found.points)
-    _check_ends(fit, found)
-    result = _result(form, generic, fit, found)
-    cell = _cell(name_of(out), count, fit, found, recordings)
+    curve_v = fitted(ocv_sources.points)(NODES)
+    generic = nearest_generic_cell(NODES, curve_v, ocv_sources.capacity_ah, count)
+    ladder, elements = _elements(generic, ocv_sources, recordings)
+    ocv_sources = without_branches(ocv_sources, ladder)
+    if form is Form.TABLE and ocv_sources.hysteresis_v is None and has_plateau(NODES, curve_v, count):
+        ocv_sources = center_on_typical_hysteresis(ocv_sources, np.interp(NODES, *curve(generic, "hysteresis_v")))
+    fit = fitted(ocv_sources.points)
+    _check_ends(fit, ocv_sources)
+    result = _result(form, generic, fit, ocv_sources)
+    cell = _cell(name_of(out), count, fit, ocv_sources, recordings)
     write_cell(out, CellModel.model_validate({**cell, "ladder": ladder, **elements}), _remarks(result))
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
         console = Console()
-        console.print(_table(out, result, found))
+        console.print(_table(out, result, ocv_sources))
         console.print(_sources_table(result))
 
 
@@ -221,7 +221,7 @@ def _cells_in_series(voltage_v: NDArray[np.float64], configured: int | None) -> 
     return count
 
 
-def _check_ends(fit: ChenMoraFit | TableFit, found: OcvSources) -> None:
+def _check_ends(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> None:
     """Check that the curve, extrapolated beyond its points, does not fall to 0 V.
 
     Raises:
@@ -231,23 +231,23 @@ def _check_ends(fit: ChenMoraFit | TableFit, found: OcvSources) -> None:
     if empty_v > MIN_EMPTY_RATIO * middle_v:
         return
     raise UserError(
-        f"the points begin at SOC {found.points.soc[0]:.2f}, and their curve would be {empty_v:.2f} V at SOC 0: give captures "
-        f"down to empty, or the right capacity; {found.capacity_ah:g} Ah is too much if the cell was emptied [--capacity-ah]"
+        f"the points begin at SOC {ocv_sources.points.soc[0]:.2f}, and their curve would be {empty_v:.2f} V at SOC 0: give captures "
+        f"down to empty, or the right capacity; {ocv_sources.capacity_ah:g} Ah is too much if the cell was emptied [--capacity-ah]"
     )
 
 
-def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, found: OcvSources) -> OcvResult:
-    tests, points = found.tests, found.points
+def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> OcvResult:
+    tests, points = ocv_sources.tests, ocv_sources.points
     parameters: dict[str, dict[str, float | None]] = {}
     if isinstance(fit, ChenMoraFit):
         for name, value, std in zip(NAMES, fit.a, fit.std, strict=True):
             parameters[name] = {"value": float(value), "std": float(std) if np.isfinite(std) else None}
     return OcvResult(
         form=form.value,
-        capacity_ah=found.capacity_ah,
-        capacity_measured_ah=_or_none(found.measured_ah),
+        capacity_ah=ocv_sources.capacity_ah,
+        capacity_measured_ah=_or_none(ocv_sources.measured_ah),
         generic=generic.cell.name,
-        usual_hysteresis=found.usual_hysteresis,
+        usual_hysteresis=ocv_sources.usual_hysteresis,
         series_count=generic.cell.series_count,
         points=points.soc.size,
         soc=points.soc.tolist(),
@@ -258,14 +258,14 @@ def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, found: 
         rms_inside_mv=1e3 * rms_v(fit.residual_v[(points.soc > STEEP_SOC) & (points.soc < 1.0 - STEEP_SOC)]),
         error_mv=(1e3 * fit.error_at(TENTHS)).tolist() if isinstance(fit, TableFit) else [],
         parameters=parameters,
-        sources=_source_results(fit, found),
+        sources=_source_results(fit, ocv_sources),
         captures={t.name: {"rests": len(t.rests), "glitches": t.glitches, "soc_final": t.end_soc} for t in tests},
         remaining_v=[rest.remaining_v for test in tests for rest in test.rests],
         rejected=[line for t in tests for line in t.rejected],
     )
 
 
-def _source_results(fit: ChenMoraFit | TableFit, found: OcvSources) -> list[SourceResult]:
+def _source_results(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> list[SourceResult]:
     return [
         SourceResult(
             name=source.name,
@@ -276,7 +276,7 @@ def _source_results(fit: ChenMoraFit | TableFit, found: OcvSources) -> list[Sour
             hysteresis_mv=None if source.hysteresis_v is None else 1e3 * float(source.hysteresis_v.mean()),
             notes=list(source.notes),
         )
-        for i, source in enumerate(found.sources)
+        for i, source in enumerate(ocv_sources.sources)
     ]
 
 
@@ -284,22 +284,24 @@ def _or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _elements(generic: CellModel, found: OcvSources, recordings: list[Recording]) -> tuple[Ladder, dict[str, object]]:
+def _elements(
+    generic: CellModel, ocv_sources: OcvSources, recordings: list[Recording]
+) -> tuple[Ladder, dict[str, object]]:
     """Return resistances over SOC, and a1..a15 by section.
 
     Both come from the rests of the warmest capture; without rests, from the generic cell.
     """
-    test = _nearest_to_reference(found.tests)
+    test = _nearest_to_reference(ocv_sources.tests)
     if test is None:
         return scaled_generic_ladder(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
-    rests = initial_elements(next(r.samples for r in recordings if r.name == test.name), test, found.capacity_ah)
+    rests = initial_elements(next(r.samples for r in recordings if r.name == test.name), test, ocv_sources.capacity_ah)
     return scaled_generic_ladder(generic, rests, float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C))), dict(
         rests.sections
     )
 
 
 def _cell(
-    name: str, series_count: int, fit: ChenMoraFit | TableFit, found: OcvSources, recordings: list[Recording]
+    name: str, series_count: int, fit: ChenMoraFit | TableFit, ocv_sources: OcvSources, recordings: list[Recording]
 ) -> dict[str, object]:
     """Return the section ``cell`` with limits of a valid sample, and the section ``ocv``."""
     middle_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
@@ -307,15 +309,15 @@ def _cell(
     peak_a = max((float(np.nanmax(np.abs(each.samples["current_a"]))) for each in recordings), default=0.0)
     cell = Cell(
         name=name,
-        capacity_ah=round(found.capacity_ah, 4),
-        capacity_std=MEASURED_CAPACITY_STD if found.capacity_ah == found.measured_ah else None,
+        capacity_ah=round(ocv_sources.capacity_ah, 4),
+        capacity_std=MEASURED_CAPACITY_STD if ocv_sources.capacity_ah == ocv_sources.measured_ah else None,
         series_count=series_count,
         nominal_voltage_v=round(middle_v, 2),
         voltage_min_v=round(min(MIN_VOLTAGE_RATIO * middle_v, empty_v), 2),
         voltage_max_v=round(MAX_VOLTAGE_RATIO * full_v, 2),
-        current_max_a=round(max(CURRENT_MAX_C * found.capacity_ah, 1.5 * peak_a), 3),
+        current_max_a=round(max(CURRENT_MAX_C * ocv_sources.capacity_ah, 1.5 * peak_a), 3),
     )
-    ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(found.hysteresis_v, found.hysteresis_std_v)
+    ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(ocv_sources.hysteresis_v, ocv_sources.hysteresis_std_v)
     return {"cell": cell, "ocv": ocv}
 
 
@@ -337,7 +339,7 @@ def _remarks(result: OcvResult) -> list[str]:
     ]
 
 
-def _table(out: Path, result: OcvResult, found: OcvSources) -> Table:
+def _table(out: Path, result: OcvResult, ocv_sources: OcvSources) -> Table:
     """Return the result as a table."""
     table = Table(title=f"{out}: written", title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
@@ -357,7 +359,7 @@ def _table(out: Path, result: OcvResult, found: OcvSources) -> Table:
         remaining_mv = 1e3 * np.abs(result.remaining_v)
         rows["relaxation after a rest"] = f"{np.median(remaining_mv):.2f} mV, at most {remaining_mv.max():.2f} mV"
         rows["rejected rests"] = f"{len(result.rejected)}"
-        rows["skipped glitches"] = f"{sum(test.glitches for test in found.tests)}"
+        rows["skipped glitches"] = f"{sum(test.glitches for test in ocv_sources.tests)}"
     if result.error_mv:
         rows["error of the curve at SOC 0, 0.1 ... 1"] = " ".join(f"{mv:.0f}" for mv in result.error_mv) + " mV"
     for name, parameter in result.parameters.items():

@@ -49,17 +49,17 @@ def capture(
     check_out(out, [], force=force)
     sink = table_sink(out)
     since_s, until_s = epoch_s(since, -math.inf), epoch_s(until, math.inf)
-    found = asyncio.run(fetch_blocks(pack, since_s, until_s, (server, creds, ca)))
-    if not found.blocks:
-        raise UserError(no_samples_reason(pack, found))
+    fetched = asyncio.run(fetch_blocks(pack, since_s, until_s, (server, creds, ca)))
+    if not fetched.blocks:
+        raise UserError(no_samples_reason(pack, fetched))
     rows = 0
     with sink:
-        for block in found.samples():
+        for block in fetched.samples():
             sink.write(block)
             rows += block.size
-    first_s, last_s = found.span_s
-    typer.echo(f"{out}: {rows} samples in {found.blocks} blocks of {pack}, {iso_utc(first_s)} to {iso_utc(last_s)}")
-    for line in _warnings(found, since_s):
+    first_s, last_s = fetched.span_s
+    typer.echo(f"{out}: {rows} samples in {fetched.blocks} blocks of {pack}, {iso_utc(first_s)} to {iso_utc(last_s)}")
+    for line in _warnings(fetched, since_s):
         typer.echo(f"warning: {pack}: {line}", err=True)
 
 
@@ -81,24 +81,26 @@ async def fetch_blocks(pack: str, since_s: float, until_s: float, address: Serve
         return await fetch(nc, pack, since_s=since_s, until_s=until_s)
 
 
-def no_samples_reason(pack: str, found: "BlockCapture") -> str:
+def no_samples_reason(pack: str, fetched: "BlockCapture") -> str:
     """Return the error text for a pack without samples."""
-    damaged = f"; {found.damaged} of its messages are not blocks" if found.damaged else ""
+    damaged = f"; {fetched.damaged} of its messages are not blocks" if fetched.damaged else ""
     return (
         f"{pack}: the server has no samples of it in this period{damaged}; is the name right, and does its edge send? "
         "(`fleet packs list` prints the names; server.raw_days limits the age of blocks)"
     )
 
 
-def _warnings(found: "BlockCapture", since_s: float) -> list[str]:
-    first_s, _ = found.span_s
+def _warnings(fetched: "BlockCapture", since_s: float) -> list[str]:
+    first_s, _ = fetched.span_s
     lines = []
     if since_s > -math.inf and first_s > since_s + MAX_START_DELAY_S:
         lines.append(f"the stored samples begin at {iso_utc(first_s)}, after the requested {iso_utc(since_s)}")
-    if found.missing:
-        gaps = ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in found.missing[:MAX_SHOWN_GAPS])
-        more = f" and {len(found.missing) - MAX_SHOWN_GAPS} more gaps" if len(found.missing) > MAX_SHOWN_GAPS else ""
+    if fetched.missing:
+        gaps = ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in fetched.missing[:MAX_SHOWN_GAPS])
+        more = (
+            f" and {len(fetched.missing) - MAX_SHOWN_GAPS} more gaps" if len(fetched.missing) > MAX_SHOWN_GAPS else ""
+        )
         lines.append(f"blocks {gaps}{more} are missing: lost, or yet to be sent again by the edge")
-    if found.damaged:
-        lines.append(f"{found.damaged} messages are not blocks")
+    if fetched.damaged:
+        lines.append(f"{fetched.damaged} messages are not blocks")
     return lines

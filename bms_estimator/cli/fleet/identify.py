@@ -58,26 +58,26 @@ def identify(
     A new cell is identified from two thirds of the samples. The last third decides whether the new or the old cell
     predicts the voltage better. A cell file is written only if the new one is better; otherwise the reason is given.
     """
-    where = (server, creds, ca)
+    address = (server, creds, ca)
     names = _names(packs or [], from_file)
     check_out(out / RESULTS, [], force=force)
-    known = asyncio.run(known_packs(where))
+    known = asyncio.run(known_packs(address))
     refuse_unknown(names, known)
-    found = list["ReidentificationResult"]()
-    for outcome in _outcomes(names, known, (epoch_s(since, -math.inf), epoch_s(until, math.inf)), where, processes):
-        found.append(outcome)
+    results = list["ReidentificationResult"]()
+    for outcome in _outcomes(names, known, (epoch_s(since, -math.inf), epoch_s(until, math.inf)), address, processes):
+        results.append(outcome)
         if outcome.cell_file:
             write_text(out / f"{outcome.pack}.toml", outcome.cell_file, make_folder=True)
         if sys.stderr.isatty():
-            typer.echo(f"{len(found)} of {len(names)}: {outcome.pack}", err=True)
-    _write_results(out / RESULTS, found)
-    changed = asyncio.run(_put(found, known, where)) if put else []
+            typer.echo(f"{len(results)} of {len(names)}: {outcome.pack}", err=True)
+    _write_results(out / RESULTS, results)
+    changed = asyncio.run(_put(results, known, address)) if put else []
     if as_json:
-        typer.echo(json.dumps([_row(one) for one in found]))
+        typer.echo(json.dumps([_row(one) for one in results]))
     else:
-        better = sum(bool(one.cell_file) for one in found)
-        typer.echo(f"{out}: {better} of {len(found)} packs have a better cell")
-        Console().print(_table(found))
+        better = sum(bool(one.cell_file) for one in results)
+        typer.echo(f"{out}: {better} of {len(results)} packs have a better cell")
+        Console().print(_table(results))
     for pack in changed:
         typer.echo(f"warning: {pack}: its row was changed meanwhile; its new cell was not uploaded", err=True)
 
@@ -86,13 +86,13 @@ def _outcomes(
     names: Sequence[str],
     known: PackRegistry,
     span_s: tuple[float, float],
-    where: ServerAddress,
+    address: ServerAddress,
     processes: int | None,
 ) -> Iterator["ReidentificationResult"]:
     from bms_estimator.fleet.identification.batch import Task, reidentify_all  # noqa: PLC0415 - needs NATS
     from bms_estimator.fleet.identification.reidentify import ReidentificationResult  # noqa: PLC0415 - slow to import
 
-    tasks, (server, creds, ca) = [], where
+    tasks, (server, creds, ca) = [], address
     for name in names:
         kind = known.kind(name)
         if isinstance(kind, PackSpec) and not known.reason(name):
@@ -125,16 +125,16 @@ def _listed(path: Path) -> list[str]:
     return [row[column or 0].strip() for row in listed if len(row) > (column or 0) and not row[0].startswith("#")]
 
 
-async def _put(found: Sequence["ReidentificationResult"], known: PackRegistry, where: ServerAddress) -> list[str]:
+async def _put(results: Sequence["ReidentificationResult"], known: PackRegistry, address: ServerAddress) -> list[str]:
     """Upload new cells and the rows that name them. Return the packs whose rows another client has changed."""
     from bms_estimator.fleet.identification.reidentify import cell_name  # noqa: PLC0415
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.packs.pack_bucket import put, read_bucket  # noqa: PLC0415
 
     cells, rows, changed = dict[str, bytes](), dict[str, bytes](), list[str]()
-    async with connected(*where) as nc:
+    async with connected(*address) as nc:
         stored_rows = await read_bucket(nc, PACKS_BUCKET)
-        for one in found:
+        for one in results:
             kind = known.kind(one.pack)
             if not one.cell_file or not isinstance(kind, PackSpec):
                 continue
@@ -158,20 +158,20 @@ def _row(one: "ReidentificationResult") -> dict[str, object]:
     }
 
 
-def _write_results(path: Path, found: Sequence["ReidentificationResult"]) -> None:
-    rows, table = list(map(_row, found)), io.StringIO()
+def _write_results(path: Path, results: Sequence["ReidentificationResult"]) -> None:
+    rows, table = list(map(_row, results)), io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_text(path, table.getvalue(), make_folder=True)
 
 
-def _table(found: Sequence["ReidentificationResult"]) -> Table:
+def _table(results: Sequence["ReidentificationResult"]) -> Table:
     """Return a table of the values before and after."""
     table = Table(box=box.SIMPLE_HEAD)
     for column in ("pack", "hours", "Ah", "R_s [mohm]", "RMS [mV]", "method", "reason"):
         table.add_column(column, justify="left" if column in ("pack", "method", "reason") else "right")
-    for one in found:
+    for one in results:
         table.add_row(
             one.pack,
             _number(one.hours, 1),

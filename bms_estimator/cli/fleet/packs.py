@@ -108,22 +108,22 @@ def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:
         raise UserError(f"{', '.join(unknown)}: not in the table of packs; `fleet packs list` prints it")
 
 
-async def known_packs(where: ServerAddress) -> PackRegistry:
+async def known_packs(address: ServerAddress) -> PackRegistry:
     """Return the server's table of packs and cells."""
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.packs.pack_bucket import PackBucket  # noqa: PLC0415
 
-    async with connected(*where) as nc:
+    async with connected(*address) as nc:
         bucket = PackBucket(nc)
         await bucket.refresh()
     return bucket.packs
 
 
-async def _load(path: Path, table: PackTable, files: dict[str, str], where: ServerAddress, *, remove: bool) -> str:
+async def _load(path: Path, table: PackTable, files: dict[str, str], address: ServerAddress, *, remove: bool) -> str:
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket  # noqa: PLC0415
 
-    async with connected(*where) as nc:
+    async with connected(*address) as nc:
         stored = {name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()}
         check_models(path, table, stored | files)
         cells = await write_bucket(nc, CELLS_BUCKET, {name: text.encode() for name, text in files.items()})
@@ -142,11 +142,11 @@ async def _load(path: Path, table: PackTable, files: dict[str, str], where: Serv
     return f"{path}: {len(rows)} packs of {kinds} kinds: {changes}"
 
 
-async def _remove(packs: set[str], where: ServerAddress) -> None:
+async def _remove(packs: set[str], address: ServerAddress) -> None:
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.packs.pack_bucket import read_bucket, remove_keys  # noqa: PLC0415
 
-    async with connected(*where) as nc:
+    async with connected(*address) as nc:
         refuse_unknown(packs, await read_bucket(nc, PACKS_BUCKET))
         await remove_keys(nc, PACKS_BUCKET, packs)
 

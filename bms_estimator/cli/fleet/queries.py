@@ -38,13 +38,13 @@ def collect(
         asyncio.run(_collect((server, creds, ca), folder, period))
 
 
-async def _collect(where: ServerAddress, folder: Path, period_s: float) -> None:
+async def _collect(address: ServerAddress, folder: Path, period_s: float) -> None:
     from bms_estimator.fleet.nats.connection import close, connect  # noqa: PLC0415
     from bms_estimator.fleet.queries.collector import Collector  # noqa: PLC0415
     from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
     from bms_estimator.process.tasks import end  # noqa: PLC0415
 
-    server, creds, ca = where
+    server, creds, ca = address
     stop = stop_on_signal()
     connecting, stopping = (
         asyncio.ensure_future(connect(server, "collector", creds=creds, ca=ca)),

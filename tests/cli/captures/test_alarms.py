@@ -16,7 +16,7 @@ def pack(tmp_path: Path) -> Path:
     return file
 
 
-def test_it_says_what_would_have_been_raised_when_and_at_what(
+def test_lists_raised_alarms_with_times_and_values(
     tmp_path: Path, pack: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = [Line(30), Line(10, voltage_v=8.6), Line(30), Line(20, temperature_c=61.0), Line(80)]
@@ -40,7 +40,7 @@ def test_it_says_what_would_have_been_raised_when_and_at_what(
 
 
 @pytest.mark.parametrize(
-    ("alarms", "code", "said"),
+    ("alarms", "code", "message"),
     [
         ("soc_low = {limit = 0.2, clear = 0.1}", 2, "alarms.soc_low.clear = 0.1: must not be below limit = 0.2"),
         ("pack_over_voltage = {limit_v = 4.2}", 0, "alarms.pack_over_voltage.limit_v = 4.2: outside 7.3 to 9 V"),
@@ -54,14 +54,14 @@ def test_it_says_what_would_have_been_raised_when_and_at_what(
         ("hook = [{topic = 'a', payload = '$nothing'}]", 2, "payload: 'nothing': must be one of $json"),
     ],
 )
-def test_check_says_what_cannot_be(
-    pack: Path, capsys: pytest.CaptureFixture[str], alarms: str, code: int, said: str
+def test_check_reports_invalid_limits(
+    pack: Path, capsys: pytest.CaptureFixture[str], alarms: str, code: int, message: str
 ) -> None:
     with pack.open("a") as file:
         file.write(alarms)
     ended, out, err = run(capsys, "config", "check", pack)
     assert ended == code
-    assert said in err
+    assert message in err
     assert ("good" in out) == (code == 0)
 
 

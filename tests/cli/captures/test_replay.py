@@ -54,7 +54,7 @@ SAMPLES = 600
 
 @pytest.fixture
 def capture(tmp_path):
-    """Ten minutes at rest and under 1 A in turns."""
+    """Write a capture of ten minutes with alternating rests and loads of 1 A."""
     path = tmp_path / "small.csv"
     rows = [(t, 0.0, 3.9) if t // 60 % 2 == 0 else (t, 1.0, 3.82) for t in range(SAMPLES)]
     lines = [f"{time},{current},{voltage}" for time, current, voltage in rows]
@@ -75,7 +75,7 @@ def columns_of_parquet(path):
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def test_a_real_capture_comes_to_one_json_object(data, capsys):
+def test_real_capture_gives_one_json_object(data, capsys):
     capture = data / "leaf" / "hppc_25c_from_full.csv.gz"
     code, out, err = run(capsys, "replay", capture, "--cell", "leaf", "--json")
     assert (code, err) == (0, "")
@@ -114,7 +114,7 @@ def test_estimates_sample_by_sample_agree_with_the_summary(name, capture, tmp_pa
     assert math.sqrt(np.mean(columns["innovation_v"] ** 2)) == pytest.approx(result["innovation_rms_v"])
 
 
-def test_csv_and_parquet_hold_the_same_to_the_last_bit(capture, tmp_path, capsys):
+def test_csv_and_parquet_are_equal_bit_for_bit(capture, tmp_path, capsys):
     for name in ("a.csv", "a.parquet"):
         assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", tmp_path / name)[0] == 0
     first, second = columns_of_csv(tmp_path / "a.csv"), columns_of_parquet(tmp_path / "a.parquet")
@@ -123,19 +123,19 @@ def test_csv_and_parquet_hold_the_same_to_the_last_bit(capture, tmp_path, capsys
         assert np.array_equal(values, second[name], equal_nan=True), name
 
 
-def test_the_given_soc_is_where_it_starts(capture, capsys):
+def test_replay_starts_at_the_given_soc(capture, capsys):
     started = []
     for soc in ("0.3", "0.7"):
         code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", soc, "--json")
         assert code == 0
         started.append(json.loads(out)["soc_initial"])
-    assert started == pytest.approx([0.3, 0.7], abs=0.15)  # the first voltage counts, too
+    assert started == pytest.approx([0.3, 0.7], abs=0.15)  # the first voltage corrects the SOC
     code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", "1.5")
     assert code == 2
     assert "'--soc'" in err
 
 
-def test_for_people(capture, capsys):
+def test_table_shows_the_summary(capture, capsys):
     code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650")
     assert code == 0
     assert "small.csv" in out
@@ -144,7 +144,7 @@ def test_for_people(capture, capsys):
     assert "kept" in out
 
 
-def test_what_a_person_can_mend_ends_with_code_2_and_names_it(capture, tmp_path, capsys):
+def test_user_errors_end_with_code_2(capture, tmp_path, capsys):
     wrong = tmp_path / "wrong.csv"
     wrong.write_text(capture.read_text().replace("voltage_v", "volts"))
     words = tmp_path / "words.csv"
@@ -176,7 +176,7 @@ def test_what_a_person_can_mend_ends_with_code_2_and_names_it(capture, tmp_path,
 
 
 @pytest.mark.parametrize("given", ["option", "pack", "option over pack"])
-def test_generic_cell_has_the_capacity_that_is_given(given, capture, tmp_path, capsys):
+def test_generic_cell_has_the_given_capacity(given, capture, tmp_path, capsys):
     pack, out = tmp_path / "pack.toml", tmp_path / "out.csv"
     in_file = {"pack": "capacity_ah = 3\n", "option over pack": "capacity_ah = 50\n"}.get(given, "")
     pack.write_text(f'[pack]\ncell = "nmc"\n{in_file}')
@@ -186,7 +186,7 @@ def test_generic_cell_has_the_capacity_that_is_given(given, capture, tmp_path, c
     assert drawn_ah == pytest.approx(SAMPLES / 2 / 3600, rel=0.02)  # 1 A for half of the time
 
 
-def test_the_capture_is_never_written_over(capture, tmp_path, capsys):
+def test_capture_is_never_overwritten(capture, tmp_path, capsys):
     before, link = capture.read_bytes(), tmp_path / "link.csv"
     link.symlink_to(capture)
     for out in (capture, link):
@@ -196,7 +196,7 @@ def test_the_capture_is_never_written_over(capture, tmp_path, capsys):
     assert capture.read_bytes() == before
 
 
-def test_a_cut_gzip_is_named(capture, tmp_path, capsys):
+def test_truncated_gzip_is_reported(capture, tmp_path, capsys):
     whole, cut = tmp_path / "whole.csv.gz", tmp_path / "cut.csv.gz"
     with gzip.open(whole, "wb") as packed, capture.open("rb") as plain:
         shutil.copyfileobj(plain, packed)
@@ -207,7 +207,7 @@ def test_a_cut_gzip_is_named(capture, tmp_path, capsys):
     assert "cut.csv.gz: gzip data damaged or cut short" in err
 
 
-def test_estimates_from_before_outlive_a_capture_that_cannot_be_read(capture, tmp_path, capsys):
+def test_unreadable_capture_does_not_replace_old_estimates(capture, tmp_path, capsys):
     out, wrong = tmp_path / "out.csv", tmp_path / "wrong.csv"
     assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out)[0] == 0
     before = out.read_bytes()
@@ -224,8 +224,8 @@ def test_a_capture_without_a_usable_sample_is_an_error(tmp_path, capsys):
     assert "nan.csv: no usable sample; dropped: 1 not finite, 1 outside the cell's range" in err
 
 
-def test_what_is_in_another_unit_is_guessed(capture, tmp_path, capsys):
-    """All columns, or those above a few milliamperes."""
+def test_error_suggests_the_unit_of_the_columns(capture, tmp_path, capsys):
+    """The current may be scaled in all rows, or only above a few milliamperes."""
     rows = read_csv(capture).to_pylist()
     head = ",".join(rows[0])
     tables = {
@@ -239,7 +239,7 @@ def test_what_is_in_another_unit_is_guessed(capture, tmp_path, capsys):
         assert guess in " ".join((out + err).split())
 
 
-def test_a_temperature_that_is_none_or_was_not_measured_is_said(tmp_path, capsys):
+def test_missing_and_implausible_temperatures_are_reported(tmp_path, capsys):
     for cell_c, words in (
         (297.0, "10 implausible values: the band is wider"),
         (math.nan, "not measured: the band is wider"),
@@ -251,7 +251,7 @@ def test_a_temperature_that_is_none_or_was_not_measured_is_said(tmp_path, capsys
         assert words in " ".join(out.split())
 
 
-def test_time_that_runs_backwards_is_said(tmp_path, capsys):
+def test_backward_time_steps_are_reported(tmp_path, capsys):
     backwards = tmp_path / "backwards.csv"
     backwards.write_text("time_s,current_a,voltage_v\n" + "".join(f"{9 - j},0.1,3.8\n" for j in range(10)))
     code, out, _ = run(capsys, "replay", backwards, "--cell", "ncr18650")
@@ -260,13 +260,13 @@ def test_time_that_runs_backwards_is_said(tmp_path, capsys):
     assert re.search(r"duration +0.0 s", out)
 
 
-def test_a_folder_is_no_capture(tmp_path, capsys):
+def test_folder_is_rejected_as_capture(tmp_path, capsys):
     code, _, err = run(capsys, "replay", tmp_path, "--cell", "ncr18650")
     assert code == 2
     assert f"{tmp_path}: is a directory" in err
 
 
-def test_a_real_capture_gives_what_estimate_gives_to_the_last_bit(data, tmp_path, capsys):
+def test_replay_equals_estimate_bit_for_bit(data, tmp_path, capsys):
     capture, out = data / "leaf" / "cc_1c.csv.gz", tmp_path / "out.csv"
     assert run(capsys, "replay", capture, "--cell", "leaf", "--soc", 0.2, "--out", out)[0] == 0
     found = estimate(load_capture(capture), load_cell("leaf"), initial_soc=0.2)
@@ -279,7 +279,7 @@ def packed(path):
 
 
 def raw(path):
-    """The same samples as a board of text lines was recorded."""
+    """Convert samples to the recording of a board that prints text lines."""
     recorded = path.with_name("small.bms")
     with CaptureWriter(recorded, CaptureHeader(mode="text")) as writer:
         for line in path.read_text().splitlines()[1:]:
@@ -288,7 +288,7 @@ def raw(path):
     return recorded.read_bytes()
 
 
-def test_documented_replays_of_the_captures_that_come_with_the_tests_run_as_they_stand(monkeypatch, capsys):
+def test_documented_replays_run(monkeypatch, capsys):
     root = Path(__file__).parents[3]
     text = (root / "docs/cell/validate.md").read_text()
     commands = re.findall(r"bms-estimator (replay tests/data/.+)", text)
@@ -314,13 +314,13 @@ def replay_stdin(monkeypatch, capsys, data, *arguments):
     [Path.read_bytes, packed, as_parquet, raw, lambda path: gzip.compress(raw(path))],
     ids=["CSV", "CSV.gz", "Parquet", "raw", "raw.gz"],
 )
-def test_a_capture_comes_from_stdin_as_from_a_file(form, capture, monkeypatch, capsys):
+def test_capture_from_stdin_equals_that_from_a_file(form, capture, monkeypatch, capsys):
     code, out, err = replay_stdin(monkeypatch, capsys, form(capture), "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["samples"] == SAMPLES
 
 
-def test_a_closed_stdin_is_told(monkeypatch, capsys):
+def test_closed_stdin_is_reported(monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdin", None)
     assert run(capsys, "replay", "-", "--cell", "ncr18650") == (
         2,
@@ -329,15 +329,15 @@ def test_a_closed_stdin_is_told(monkeypatch, capsys):
     )
 
 
-def test_what_is_wrong_on_stdin_is_named_without_a_path(monkeypatch, capsys):
-    for data, said in [
+def test_error_on_stdin_shows_no_path(monkeypatch, capsys):
+    for data, message in [
         (b"time_s,current_a,voltage_v\n0,none,3.7\n", "stdin: line 2: current_a = 'none': must be a number"),
         (b"", "stdin: empty: the first line must name the columns"),
         (b"\x1f\x8b\x08 no gzip", "stdin: gzip data damaged or cut short"),
     ]:
         code, out, err = replay_stdin(monkeypatch, capsys, data)
         assert (code, out) == (2, "")
-        assert err.startswith(f"error: {said}")
+        assert err.startswith(f"error: {message}")
 
 
 def currents(capsys, out, *arguments):
@@ -347,7 +347,7 @@ def currents(capsys, out, *arguments):
     return np.unique(columns_of_csv(out)["current_a"]).tolist()
 
 
-def test_the_sign_of_a_tables_current_is_given_by_the_pack_or_the_option(capture, tmp_path, capsys):
+def test_sign_of_a_table_is_that_of_the_pack_or_the_option(capture, tmp_path, capsys):
     out, pack = tmp_path / "out.csv", tmp_path / "pack.toml"
     pack.write_text('[sensor]\ncurrent_sign = "charge_positive"\n')
     charge, discharge = (("--current-sign", f"{sign}_positive") for sign in ("charge", "discharge"))
@@ -357,7 +357,7 @@ def test_the_sign_of_a_tables_current_is_given_by_the_pack_or_the_option(capture
     assert currents(capsys, out, capture, "--pack", pack, *discharge) == [0.0, 1.0]
 
 
-def test_the_battery_data_format_keeps_its_sign_whatever_the_board_has(capture, tmp_path, capsys):
+def test_battery_data_format_has_its_own_sign(capture, tmp_path, capsys):
     bdf, out, pack = tmp_path / "small.bdf", tmp_path / "out.csv", tmp_path / "pack.toml"
     bdf.write_text(capture.read_text().replace("time_s,current_a,voltage_v", "Test Time / s,Current / A,Voltage / V"))
     for sign in ("charge_positive", "discharge_positive"):
@@ -366,7 +366,7 @@ def test_the_battery_data_format_keeps_its_sign_whatever_the_board_has(capture, 
     assert currents(capsys, out, bdf, "--pack", pack, "--current-sign", "discharge_positive") == [0.0, 1.0]
 
 
-def test_a_recording_of_another_protocol_than_that_of_the_settings_is_named(tmp_path, capsys):
+def test_recording_of_another_protocol_is_rejected(tmp_path, capsys):
     capture, pack = tmp_path / "meter.bmsraw", tmp_path / "pack.toml"
     with CaptureWriter(capture, CaptureHeader("junctek", "/dev/ttyUSB0", 115_200, "charge_positive")) as writer:
         writer.write(0.0, b":r50=1,34,5166,1030,109337,11738441,62100651,48663,125,0,99,0,644,9117,\r\n")

@@ -72,7 +72,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The whole report's text, written once."""
+    """Return the text of the whole report, computed once."""
     out = tmp_path_factory.mktemp("thesis")
     with pytest.raises(SystemExit) as ended:
         main(["thesis", "--out", str(out)])
@@ -87,7 +87,7 @@ def page(whole):
 
 
 @pytest.mark.thorough
-def test_every_table_stands_printed_beside_recomputed(page):
+def test_tables_have_printed_and_recomputed_columns(page):
     for key in TABLES:
         table = page.articles[f"table-{key}"]
         heads = " | ".join(table["heads"])
@@ -115,7 +115,7 @@ def test_every_item_has_a_verdict_and_a_reason(page):
 
 
 @pytest.mark.thorough
-def test_nothing_is_called_reproduced_that_hangs_on_unpublished_recordings(page):
+def test_items_from_unpublished_recordings_are_not_called_reproduced(page):
     for key in ("8", "9", "11", "13"):
         article = page.articles[f"table-{key}"]
         assert article["verdict"] == NO_DATA
@@ -130,7 +130,7 @@ def test_a_fit_gives_the_number_of_its_free_parameters(page):
 
 
 @pytest.mark.thorough
-def test_items_without_data_are_not_those_that_other_printed_numbers_contradict(page):
+def test_items_without_data_are_not_contradicted(page):
     contradicted = {key for key, found in page.articles.items() if found["verdict"] == CONTRADICTED}
     assert contradicted == {"table-4", "table-6", "table-7", "table-12", "figure-20"}
     recordings = [found for found in page.articles.values() if "recordings are not published" in found["reason"]]
@@ -165,7 +165,7 @@ def test_closing_note_lists_every_item(whole, page):
 
 
 def cells(whole, key):
-    """Rows of the table of one article."""
+    """Return the rows of the table of one article."""
     article = re.search(rf'<article id="{key}">.*?</article>', whole, re.DOTALL).group()
     return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(<td.*?)</tr>", article)]
 
@@ -176,8 +176,8 @@ def test_errata_are_numbered(whole):
 
 
 @pytest.mark.thorough
-def test_one_start_gives_what_tables_2_and_3_print(whole):
-    """To the printed digits, four to seven; small parameters of Table 3 as they began."""
+def test_one_start_reproduces_tables_2_and_3(whole):
+    """All printed digits (four to seven) agree; the small parameters of Table 3 keep their initial values."""
     for key in ("table-2", "table-3"):
         rows = cells(whole, key)
         assert len(rows) == 15
@@ -186,7 +186,7 @@ def test_one_start_gives_what_tables_2_and_3_print(whole):
 
 
 @pytest.mark.thorough
-def test_small_parameters_of_table_3_are_off_by_what_the_start_was(whole):
+def test_small_parameters_of_table_3_keep_the_error_of_the_start(whole):
     off = {row[0]: float(row[8]) for row in cells(whole, "table-3")}
     assert [off[f"a{i}"] for i in (1, 3, 6, 13, 15)] == pytest.approx([6.48, 14.3, 19.7, 36.0, 5.99], abs=0.05)
 
@@ -195,7 +195,7 @@ def test_small_parameters_of_table_3_are_off_by_what_the_start_was(whole):
 def test_static_beats_dynamic_with_the_printed_parameters(whole):
     dynamic, static = ([float(cell) for cell in row[2:]] for row in cells(whole, "table-12"))
     assert (dynamic[0], static[0]) == pytest.approx((0.0826, 0.0812), abs=5e-5)
-    assert dynamic[2] < 0.5 * static[2]  # a13 to a15 fitted anew
+    assert dynamic[2] < 0.5 * static[2]  # with refitted a13 to a15
 
 
 def test_one_table(tmp_path, capsys):
@@ -216,7 +216,7 @@ def test_one_figure(tmp_path, capsys):
     assert page.articles["figure-19"]["shapes"] > 5
 
 
-def test_what_a_person_can_mend_ends_with_code_2(tmp_path, capsys, data):
+def test_user_errors_end_with_code_2(tmp_path, capsys, data):
     steps, rests = data / "leaf" / "cc_1c.csv.gz", tmp_path / "rests.csv"
     rows = relaxation()[["time_s", "current_a", "voltage_v"]]
     np.savetxt(rests, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
@@ -239,7 +239,7 @@ def test_what_a_person_can_mend_ends_with_code_2(tmp_path, capsys, data):
     assert "cannot be written" in err
 
 
-def test_real_captures_carry_chapter_5(tmp_path, capsys, shared_data):
+def test_chapter_5_runs_on_real_captures(tmp_path, capsys, shared_data):
     captures = [shared_data / "ncr18650" / name for name in (RELAXATION, SLOW, FAST, STEPS)]
     code, out, _ = run(capsys, "thesis", *captures, "--cell", "ncr18650", "--table", "11", "--out", tmp_path)
     assert code == 0

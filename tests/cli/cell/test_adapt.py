@@ -15,7 +15,7 @@ from tests.command_line import run
 
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
-    """A capture of steps as a file."""
+    """Write a capture of steps to a file."""
     samples = capture(steps(0), seed=0)
     rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
     path = tmp_path / "steps.csv"
@@ -39,7 +39,7 @@ def test_adapt_writes_a_cell_with_the_series_resistance_of_the_capture(table, tm
     assert dc_ohm == pytest.approx(r_s(0.5, TRUTH.a), rel=0.3)
 
 
-def test_a_file_that_makes_replays_worse_is_not_written(table, tmp_path, capsys, monkeypatch):
+def test_cell_file_with_worse_replays_is_not_written(table, tmp_path, capsys, monkeypatch):
     scores = iter([1.0, 9.0])
     monkeypatch.setattr(adapt, "interval_score", lambda *_: next(scores))
     out = tmp_path / "worse.toml"

@@ -34,7 +34,7 @@ def test_the_capacity_of_a_capture_as_json(capsys, capture):
     assert (np.abs(off[:, 0]) < 3.0 * off[:, 1]).all()
 
 
-def test_a_known_sensor_makes_it_more_certain(capsys, capture):
+def test_known_sensor_offset_reduces_the_error(capsys, capture):
     stds = []
     for offset in ("0.02", "0.0"):
         arguments = ("capacity", capture, "--cell", "ncr18650", "--current-offset-std-a", offset, "--json")
@@ -42,14 +42,14 @@ def test_a_known_sensor_makes_it_more_certain(capsys, capture):
     assert stds[1] < 0.7 * stds[0]
 
 
-def test_people_see_the_anchors_and_the_capacity(capsys, capture):
+def test_table_shows_anchors_and_capacity(capsys, capture):
     code, text, _ = run(capsys, "capacity", capture, "--cell", "ncr18650")
     assert code == 0
     assert "15 min" in text
     assert "Ah, declared 3 Ah" in text
 
 
-def test_milliamperes_are_no_capacity(capsys, capture, tmp_path):
+def test_current_in_milliamperes_is_detected(capsys, capture, tmp_path):
     rows = np.loadtxt(capture, delimiter=",", skiprows=1)
     rows[:, 1] *= 1e3
     wrong = tmp_path / "ma.csv"
@@ -59,8 +59,8 @@ def test_milliamperes_are_no_capacity(capsys, capture, tmp_path):
     assert "Ah, but 3 Ah is declared: is the current in amperes" in " ".join(err.split())
 
 
-def test_a_real_cell_holds_what_a_slow_discharge_gave(capsys, shared_data):
-    """C/20 gave 2.99 Ah of cell 1."""
+def test_capacity_of_a_real_cell_agrees_with_a_slow_discharge(capsys, shared_data):
+    """The discharge of cell 1 at C/20 gave 2.99 Ah."""
     capture = shared_data / "ncr18650" / "cell1_hppc.csv.gz"
     arguments = ("capacity", capture, "--cell", "ncr18650", "--current-offset-std-a", "0.002", "--json")
     found = json.loads(run(capsys, *arguments)[1])
@@ -68,7 +68,7 @@ def test_a_real_cell_holds_what_a_slow_discharge_gave(capsys, shared_data):
     assert found["capacity_std_ah"] < 0.15
 
 
-def test_no_rests_are_refused_with_what_to_do(tmp_path, capsys):
+def test_error_on_missing_rests_suggests_a_remedy(tmp_path, capsys):
     samples = relaxation()
     samples["current_a"] += 0.5
     capture = save(tmp_path / "loaded.csv", samples)
@@ -78,7 +78,7 @@ def test_no_rests_are_refused_with_what_to_do(tmp_path, capsys):
     assert "rest the cell for half an hour" in err
 
 
-def test_a_wrong_sign_is_named_and_no_longer_rest_advised(capsys, capture):
+def test_wrong_sign_is_detected(capsys, capture):
     code, _, err = run(capsys, "capacity", capture, "--cell", "ncr18650", "--current-sign", "charge_positive")
     assert code == 2
     assert "check the sign of the current (--current-sign)" in err
@@ -86,7 +86,7 @@ def test_a_wrong_sign_is_named_and_no_longer_rest_advised(capsys, capture):
 
 
 @pytest.mark.parametrize(
-    ("cell", "said"),
+    ("cell", "message"),
     [
         ("lto", "rests, at 3.322..4.160 V, are beyond the curve of the cell, 1.500..2.700 V: check the cell file"),
         (
@@ -96,15 +96,15 @@ def test_a_wrong_sign_is_named_and_no_longer_rest_advised(capsys, capture):
         ("lmo", "anchors disagree by 5.3 times their expected errors: check the curve of the cell file"),
     ],
 )
-def test_a_wrong_cell_is_named_and_no_longer_rest_advised(capsys, capture, cell, said):
+def test_wrong_cell_is_detected(capsys, capture, cell, message):
     code, _, err = run(capsys, "capacity", capture, "--cell", cell, "--capacity-ah", "3")
     assert code == 2
-    assert said in err
+    assert message in err
     assert "longer rests" not in err
     assert "rest again" not in err
 
 
-def test_the_same_capture_twice_is_no_new_data(capsys, capture, tmp_path):
+def test_duplicate_capture_is_rejected(capsys, capture, tmp_path):
     other = tmp_path / "copy.csv"
     other.write_bytes(capture.read_bytes())
     code, _, err = run(capsys, "capacity", capture, other, "--cell", "ncr18650")

@@ -1,4 +1,4 @@
-"""A cell file from what a service has learned: from a pack of generic cells to a file that a replacement starts from."""
+"""``cell export``: cell file from the learned state of a service, and a service that starts from it."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ DECLARED_AH = 1.1 * OXIDE.capacity_ah
 
 
 def drive(seed: int, **changes: object):
-    """A discharge of six like cells, from full."""
+    """Simulate a discharge of six equal cells from full."""
     case = Case("", seed=seed, soc=1.0, unseen_h=0.0, hours=1.6, **changes)
     seen = capture(case)
     seen.samples["voltage_v"] *= SERIES
@@ -29,7 +29,7 @@ def drive(seed: int, **changes: object):
 
 @pytest.fixture(scope="module")
 def pack(tmp_path_factory) -> Path:
-    """A pack's file, and the checkpoint of a service that saw one discharge."""
+    """Write a pack file, and the checkpoint of a service after one discharge."""
     folder = tmp_path_factory.mktemp("pack")
     file = folder / "pack.toml"
     file.write_text(
@@ -49,7 +49,7 @@ def exported(pack) -> Path:
     return pack.with_name("learned.toml")
 
 
-def test_the_file_holds_what_was_learned(capsys, pack, exported):
+def test_file_contains_the_learned_values(capsys, pack, exported):
     code, text, err = run(capsys, "cell", "export", pack, "--out", exported, "--force", "--json")
     assert (code, err) == (0, "")
     found = json.loads(text)
@@ -72,8 +72,8 @@ def test_the_file_holds_what_was_learned(capsys, pack, exported):
     assert cell.ladder.weak_ohm[0][0] / generic.ladder.weak_ohm[0][0] == pytest.approx(found["r_s_factor"], rel=1e-4)
 
 
-def test_a_replacement_that_starts_from_it_is_better(capsys, pack, exported):
-    """Another drive, entered at an unknown SOC: nearer to the truth, with a narrower band that holds it."""
+def test_service_that_starts_from_the_file_is_better(capsys, pack, exported):
+    """In another drive from an unknown SOC, the estimate is closer to the true SOC with a narrower valid band."""
     run(capsys, "cell", "export", pack, "--out", exported, "--force")
     seen = drive(2, load_c=0.4)
     half = seen.samples[seen.samples.size // 4 :]
@@ -91,7 +91,7 @@ def test_a_replacement_that_starts_from_it_is_better(capsys, pack, exported):
     assert cover > 0.95
 
 
-def test_without_a_checkpoint_there_is_nothing_to_export(tmp_path, capsys, pack):
+def test_missing_checkpoint_is_an_error(tmp_path, capsys, pack):
     other = tmp_path / "pack.toml"
     other.write_text(pack.read_text().replace(str(pack.parent), str(tmp_path)))
     code, _, err = run(capsys, "cell", "export", other, "--out", tmp_path / "x.toml")
@@ -107,7 +107,7 @@ def test_without_a_checkpoint_there_is_nothing_to_export(tmp_path, capsys, pack)
         ("nmc", "nca", "it belongs to another pack or cell"),
     ],
 )
-def test_the_checkpoint_of_another_pack_is_refused(tmp_path, capsys, pack, was, now, why):
+def test_checkpoint_of_another_pack_is_rejected(tmp_path, capsys, pack, was, now, why):
     other = tmp_path / "pack.toml"
     other.write_text(pack.read_text().replace(was, now))
     (saved,) = (pack.parent / "state").glob("*.npz")
@@ -117,7 +117,7 @@ def test_the_checkpoint_of_another_pack_is_refused(tmp_path, capsys, pack, was, 
     assert saved.exists()
 
 
-def test_a_checkpoint_of_another_format_is_refused(tmp_path, capsys, pack):
+def test_checkpoint_of_another_format_is_rejected(tmp_path, capsys, pack):
     (saved,) = (pack.parent / "state").glob("*.npz")
     with np.load(saved) as file:
         fields = dict(file)
@@ -129,7 +129,7 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path, capsys, pack):
     assert "format 99, this version reads" in err
 
 
-def test_a_file_is_not_replaced_unasked(tmp_path, capsys, pack):
+def test_existing_file_is_replaced_only_with_force(tmp_path, capsys, pack):
     out = tmp_path / "mine.toml"
     out.write_text("mine")
     code, _, err = run(capsys, "cell", "export", pack, "--out", out)
@@ -138,7 +138,7 @@ def test_a_file_is_not_replaced_unasked(tmp_path, capsys, pack):
     assert out.read_text() == "mine"
 
 
-def test_it_does_not_write_over_what_it_reads(capsys, pack):
+def test_input_is_never_overwritten(capsys, pack):
     checkpoint = next((pack.parent / "state").glob("*.npz"))
     for out in (pack, checkpoint):
         before = out.read_bytes()

@@ -16,7 +16,7 @@ from tests.command_line import run
 
 PEM = load_fuel_cell("pem_30w")
 GROWN = np.array([1.0, 1.3, *[1.0] * 14])
-"""A stack whose resistance is 30 % above the file's."""
+"""Stack with a resistance 30 % above that of the file."""
 
 
 def table(path: Path, **columns: np.ndarray) -> Path:
@@ -26,7 +26,7 @@ def table(path: Path, **columns: np.ndarray) -> Path:
 
 
 def negated(path: Path, folder: Path) -> Path:
-    """The file with its current as one that is positive on charge."""
+    """Return a copy of the file with the opposite sign of the current."""
     rows = np.genfromtxt(path, delimiter=",", names=True)
     rows["current_a"] *= -1.0
     return table(folder / f"negated_{path.name}", **{name: rows[name] for name in rows.dtype.names})
@@ -68,7 +68,7 @@ def test_identify_writes_a_file_that_replays_use(capsys, curve: Path, steps: Pat
     assert after < 0.2 * before
 
 
-def test_what_the_fit_leaves_is_told_of_each_file_though_two_have_one_name(capsys, steps: Path, tmp_path: Path) -> None:
+def test_residual_is_reported_for_files_of_equal_names(capsys, steps: Path, tmp_path: Path) -> None:
     (tmp_path / "later").mkdir()
     later = tmp_path / "later" / steps.name
     later.write_text("".join(steps.read_text().splitlines(keepends=True)[:-20]))
@@ -79,14 +79,14 @@ def test_what_the_fit_leaves_is_told_of_each_file_though_two_have_one_name(capsy
     assert found[f"{later}_rms_mv"] == pytest.approx(3.0, rel=0.05)
 
 
-def test_identify_says_what_the_data_do_not_tell(capsys, curve: Path, tmp_path: Path) -> None:
+def test_identify_reports_undetermined_parameters(capsys, curve: Path, tmp_path: Path) -> None:
     code, printed, _ = run(capsys, "identify", curve, "--cell", "pem_30w", "--out", tmp_path / "mine.toml")
     assert code == 0
     assert "c_dl_farad: not determined by these data; it needs steps of the current" in " ".join(printed.split())
 
 
 @pytest.mark.parametrize("as_curve", [True, False])
-def test_a_current_that_is_positive_on_charge_is_turned(
+def test_charge_positive_current_is_negated(
     capsys, curve: Path, steps: Path, tmp_path: Path, *, as_curve: bool
 ) -> None:
     turned = negated(curve if as_curve else steps, tmp_path)
@@ -99,7 +99,7 @@ def test_a_current_that_is_positive_on_charge_is_turned(
 
 
 @pytest.mark.parametrize("celsius", ["inf", "-273.15", "-127"])
-def test_a_temperature_that_no_cell_has_counts_as_none(capsys, curve: Path, tmp_path: Path, celsius: str) -> None:
+def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path: Path, celsius: str) -> None:
     lines = curve.read_text().splitlines()
     told = tmp_path / curve.name
     told.write_text("\n".join([f"{lines[0]},temperature_c", *(f"{line},{celsius}" for line in lines[1:])]))
@@ -120,7 +120,7 @@ def test_a_temperature_that_no_cell_has_counts_as_none(capsys, curve: Path, tmp_
         ("nan", "'nan': no decimal number"),
     ],
 )
-def test_an_option_with_such_a_temperature_is_refused(
+def test_option_with_an_implausible_temperature_is_rejected(
     capsys, curve: Path, tmp_path: Path, celsius: str, why: str
 ) -> None:
     command = "identify", curve, "--cell", "pem_30w", "--out", tmp_path / "mine.toml"
@@ -129,7 +129,7 @@ def test_an_option_with_such_a_temperature_is_refused(
     assert why in err
 
 
-def test_replay_survives_a_temperature_that_no_cell_has(capsys, tmp_path: Path) -> None:
+def test_replay_accepts_implausible_temperatures(capsys, tmp_path: Path) -> None:
     celsius = np.array([40.0, -273.15, 40.0, 40.0])
     columns = {"time_s": np.arange(4.0), "current_a": np.full(4, 3.0), "voltage_v": np.full(4, 9.4)}
     path = table(tmp_path / "cold.csv", **columns, temperature_c=celsius)
@@ -155,7 +155,7 @@ def test_replay_learns_and_has_no_soc(capsys, steps: Path, tmp_path: Path) -> No
     assert "SOC" not in printed
 
 
-def test_a_pack_file_names_it(capsys, tmp_path: Path) -> None:
+def test_pack_file_may_name_a_fuel_cell(capsys, tmp_path: Path) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text('[pack]\ncell = "pem_30w"\nseries = 2\n[sensor]\nvoltage_resolution_v = 0.03\n')
     code, printed, err = run(capsys, "config", "check", pack)
@@ -168,7 +168,7 @@ def test_a_pack_file_names_it(capsys, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "expected"),
     [
         ("series = 3", "the board's range ends at 25.0 V, but this pack has 40.1 V at no load"),
         (
@@ -178,24 +178,26 @@ def test_a_pack_file_names_it(capsys, tmp_path: Path) -> None:
         ("[identifier]\nenabled = true", "identifier.enabled = true: ignored: the identifier is of batteries"),
     ],
 )
-def test_check_warns_of_what_is_ignored_or_out_of_range(capsys, tmp_path: Path, settings: str, said: str) -> None:
+def test_check_warns_about_ignored_and_implausible_settings(
+    capsys, tmp_path: Path, settings: str, expected: str
+) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text(f'[pack]\ncell = "pem_30w"\n{settings}\n')
     code, _, err = run(capsys, "config", "check", pack)
     assert code == 0
     assert err.startswith(f"warning: {pack}: ")
     assert err.count("\n") == 1
-    assert said in err
+    assert expected in err
 
 
 @pytest.mark.parametrize("settings", ["", '[observer]\nlaw = "learning"', "[identifier]\nenabled = false"])
-def test_check_has_nothing_to_say_of_a_stack_that_may_be(capsys, tmp_path: Path, settings: str) -> None:
+def test_check_accepts_plausible_stacks(capsys, tmp_path: Path, settings: str) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text(f'[pack]\ncell = "pem_30w"\n{settings}\n')
     assert run(capsys, "config", "check", pack)[::2] == (0, "")
 
 
-def test_stacks_in_parallel_beyond_tafel_s_line_are_refused_in_one_line(capsys, tmp_path: Path) -> None:
+def test_parallel_stacks_beyond_the_tafel_range_are_rejected(capsys, tmp_path: Path) -> None:
     pack, cell = tmp_path / "pack.toml", tmp_path / "mine.toml"
     losses = PEM.fuel_cell.model_copy(update={"exchange_current_a": 0.4})
     write_cell(cell, PEM.model_copy(update={"fuel_cell": losses}))
@@ -205,7 +207,7 @@ def test_stacks_in_parallel_beyond_tafel_s_line_are_refused_in_one_line(capsys, 
     assert err == "error: pem_30w: exchange_current_a of 3 in parallel is 1.2: must be less than 1\n"
 
 
-def test_help_offers_a_fuel_cell_where_one_is_taken(capsys) -> None:
+def test_help_mentions_fuel_cells_where_supported(capsys) -> None:
     offered = {c for c in ("capacity", "identify", "replay", "simulate", "thesis", "validate") if _offers(capsys, c)}
     assert offered == {"identify", "replay"}
 
@@ -231,9 +233,7 @@ def _offers(capsys, command: str) -> bool:
     ],
     ids=" ".join,
 )
-def test_what_makes_no_sense_for_a_fuel_cell_says_so_in_one_line(
-    capsys, arguments, steps: Path, tmp_path: Path
-) -> None:
+def test_unsuitable_commands_reject_a_fuel_cell(capsys, arguments, steps: Path, tmp_path: Path) -> None:
     pack, soc = tmp_path / "pack.toml", tmp_path / "soc.toml"
     pack.write_text('[pack]\ncell = "pem_30w"\n')
     soc.write_text('[pack]\ncell = "pem_30w"\ninitial_soc = 0.5\n')
@@ -244,7 +244,7 @@ def test_what_makes_no_sense_for_a_fuel_cell_says_so_in_one_line(
     assert "is a fuel cell" in err
 
 
-def test_files_that_cannot_be_used_are_named(capsys, curve: Path, steps: Path, tmp_path: Path) -> None:
+def test_error_names_the_unusable_file(capsys, curve: Path, steps: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.csv"
     short.write_text("current_a,voltage_v\n1.0,10.0\n2.0,9.0\n")
     hole = tmp_path / "hole.csv"

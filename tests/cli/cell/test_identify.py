@@ -14,7 +14,7 @@ ERRORS = ["samples", "voltage_rms_mv", "mean_abs_percent", "max_abs_percent"]
 
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory):
-    """Two captures as files."""
+    """Write two captures to files."""
     folder = tmp_path_factory.mktemp("captures")
     for seed in (0, 7):
         samples = capture(steps(seed), seed=seed)
@@ -57,7 +57,7 @@ def test_identify_writes_a_cell_that_validates_on_another_capture(tables, tmp_pa
     assert validated["initial_soc_from"] == "first rest"
 
 
-def test_for_people(tables, tmp_path, capsys):
+def test_tables_show_the_result(tables, tmp_path, capsys):
     captures = [tables / "steps0.csv", tables / "steps7.csv"]
     code, text, _ = run(capsys, "identify", *captures, "--cell", "ncr18650", "--out", tmp_path / "c.toml", "--keep-ocv")
     assert code == 0
@@ -72,7 +72,7 @@ def test_for_people(tables, tmp_path, capsys):
     assert "SOC 0.9000 (given)" in text
 
 
-def test_what_a_person_can_mend_ends_with_code_2_and_its_numbers(tables, tmp_path, capsys):
+def test_user_errors_end_with_code_2(tables, tmp_path, capsys):
     rows = np.loadtxt(tables / "steps0.csv", delimiter=",", skiprows=1) * [1, -1, 1]
     flipped = tmp_path / "flipped.csv"
     np.savetxt(flipped, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
@@ -89,7 +89,7 @@ def test_what_a_person_can_mend_ends_with_code_2_and_its_numbers(tables, tmp_pat
     assert "is also an input" in err
 
 
-def test_the_sign_of_a_tables_current_can_be_given(tables, tmp_path, capsys):
+def test_sign_of_the_current_is_an_option(tables, tmp_path, capsys):
     rows = np.loadtxt(tables / "steps7.csv", delimiter=",", skiprows=1) * [1, -1, 1]
     flipped = tmp_path / "flipped.csv"
     np.savetxt(flipped, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
@@ -105,7 +105,7 @@ def test_the_sign_of_a_tables_current_can_be_given(tables, tmp_path, capsys):
     assert load_cell(tmp_path / "first.toml").ladder == load_cell(tmp_path / "second.toml").ladder
 
 
-def test_what_makes_replays_worse_is_not_written(tables, tmp_path, capsys, monkeypatch):
+def test_cell_file_with_worse_replays_is_not_written(tables, tmp_path, capsys, monkeypatch):
     scores = iter([1.0, 9.0, 9.0])
     monkeypatch.setattr(identify, "interval_score", lambda *_: next(scores))
     out = tmp_path / "worse.toml"

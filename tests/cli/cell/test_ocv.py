@@ -19,7 +19,7 @@ def save(path, samples):
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory):
-    """Two relaxation tests of a simulated cell, as files."""
+    """Write two relaxation tests of a simulated cell to files."""
     folder = tmp_path_factory.mktemp("relaxation")
     return [save(folder / f"run{seed}.csv", relaxation(seed=seed)) for seed in (0, 1)]
 
@@ -78,7 +78,7 @@ def test_several_captures_are_fitted_jointly(captures, tmp_path, capsys):
     assert 0.01 < cell.r_tl.offset_ohm < 0.05
 
 
-def test_for_people(captures, tmp_path, capsys):
+def test_table_shows_the_result(captures, tmp_path, capsys):
     out = tmp_path / "c.toml"
     code, text, _ = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", out)
     assert code == 0
@@ -91,7 +91,7 @@ def test_for_people(captures, tmp_path, capsys):
     assert "a21" in text
 
 
-def test_cells_in_series_are_counted_by_their_voltage(tmp_path, capsys):
+def test_number_of_cells_is_estimated_from_the_voltage(tmp_path, capsys):
     samples = relaxation()
     samples["voltage_v"] *= 6.0
     code, text, _ = run(
@@ -110,14 +110,14 @@ def test_cells_in_series_are_counted_by_their_voltage(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("why", BAD)
-def test_bad_input_ends_with_code_2_and_the_numbers_that_show_it(tmp_path, capsys, why):
+def test_invalid_input_ends_with_code_2(tmp_path, capsys, why):
     make, capacity_ah, message = BAD[why]
     capture, out = save(tmp_path / "bad.csv", make()), tmp_path / "c.toml"
     code, text, err = run(capsys, "ocv", capture, "--capacity-ah", capacity_ah, "--out", out)
     assert (code, text) == (2, "")
     assert " ".join(message.split()) in " ".join(err.split())
     assert "Traceback" not in err
-    assert why == "span" or "bad.csv: " in err  # the span is that of all captures together
+    assert why == "span" or "bad.csv: " in err  # the SOC span is that of all captures together
     assert not out.exists()
 
 
@@ -130,7 +130,7 @@ def test_bad_input_ends_with_code_2_and_the_numbers_that_show_it(tmp_path, capsy
     ],
     ids=["dead", "millivolts", "too many cells"],
 )
-def test_a_voltage_that_no_cells_have_is_refused(volt, options, why, tmp_path, capsys):
+def test_implausible_voltage_is_rejected(volt, options, why, tmp_path, capsys):
     samples = relaxation()
     samples["voltage_v"] = volt(samples["voltage_v"])
     capture, out = save(tmp_path / "bad.csv", samples), tmp_path / "c.toml"
@@ -140,7 +140,7 @@ def test_a_voltage_that_no_cells_have_is_refused(volt, options, why, tmp_path, c
     assert not out.exists()
 
 
-def test_a_capture_is_not_overwritten(captures, capsys):
+def test_capture_is_not_overwritten(captures, capsys):
     before = captures[0].read_bytes()
     code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0], "--force")
     assert code == 2
@@ -148,7 +148,7 @@ def test_a_capture_is_not_overwritten(captures, capsys):
     assert captures[0].read_bytes() == before
 
 
-def test_a_folder_that_does_not_exist(captures, tmp_path, capsys):
+def test_missing_output_folder_is_an_error(captures, tmp_path, capsys):
     code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", tmp_path / "no" / "c.toml")
     assert code == 2
     assert "Traceback" not in err
@@ -157,7 +157,7 @@ def test_a_folder_that_does_not_exist(captures, tmp_path, capsys):
     assert "absent.csv" in err
 
 
-def test_an_empty_capture(tmp_path, capsys):
+def test_empty_capture_is_an_error(tmp_path, capsys):
     empty = tmp_path / "empty.csv"
     empty.write_text("time_s,current_a,voltage_v\n")
     code, _, err = run(capsys, "ocv", empty, "--capacity-ah", "3", "--out", tmp_path / "c.toml")
@@ -166,7 +166,7 @@ def test_an_empty_capture(tmp_path, capsys):
     assert "empty.csv" in err
 
 
-def test_a_capture_without_a_number_in_it(tmp_path, capsys):
+def test_capture_without_numbers_is_an_error(tmp_path, capsys):
     samples = relaxation(rounds=1)
     samples["voltage_v"] = np.nan
     capture = save(tmp_path / "nan.csv", samples)
@@ -175,7 +175,7 @@ def test_a_capture_without_a_number_in_it(tmp_path, capsys):
     assert err == f"error: nan.csv: none of {samples.size} samples has finite time, current and voltage\n"
 
 
-def test_the_sign_of_a_tables_current_can_be_given(tmp_path, capsys):
+def test_sign_of_the_current_is_an_option(tmp_path, capsys):
     samples = relaxation()
     samples["current_a"] *= -1.0
     arguments = ("ocv", save(tmp_path / "charge.csv", samples), "--capacity-ah", "3", "--out", tmp_path / "c.toml")
@@ -186,8 +186,8 @@ def test_the_sign_of_a_tables_current_can_be_given(tmp_path, capsys):
     assert "20 rests of charge.csv" in (tmp_path / "c.toml").read_text()
 
 
-def test_what_each_capture_is_is_found_out(tmp_path, capsys, data):
-    """A slow discharge, a given curve with hysteresis and rests of a pouch cell of another make: each by itself."""
+def test_kind_of_each_source_is_recognized(tmp_path, capsys, data):
+    """Sources are a slow discharge, a tabulated curve with hysteresis, and rests of another pouch cell."""
     out = tmp_path / "m50.toml"
     folder = data / "lgm50"
     arguments = ("ocv", folder / "rate_0p1c_25c.csv.gz", folder / "ocv_25c.csv", "--out", out)
@@ -215,8 +215,8 @@ def test_what_each_capture_is_is_found_out(tmp_path, capsys, data):
 
 
 @pytest.mark.parametrize("way", ["dis", "chg"])
-def test_a_lone_slow_curve_of_lfp_knows_that_the_other_lies_elsewhere(tmp_path, capsys, shared_data, way):
-    """A plateau is where hysteresis is worth a tenth of the charge and more: that of the generic cell is taken."""
+def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, capsys, shared_data, way):
+    """On a plateau, hysteresis corresponds to a tenth of the charge or more; that of the generic cell is used."""
     folder, out, pair = shared_data / "a123", tmp_path / "lone.toml", tmp_path / "pair.toml"
     files = {name: folder / f"c30_{name}_p25.csv.gz" for name in ("dis", "chg")}
     for captures, to in (([files[way]], out), (list(files.values()), pair)):
@@ -231,8 +231,8 @@ def test_a_lone_slow_curve_of_lfp_knows_that_the_other_lies_elsewhere(tmp_path, 
     assert "Elements: those of the generic lfp" in out.read_text()
 
 
-def test_a_lone_slow_curve_of_a_layered_oxide_is_brought_to_rest(tmp_path, capsys, data):
-    """The LG M50's published curve: at C/10 its discharge lies 17 mV below it in the mean, by half that with what branches take."""
+def test_unpaired_slow_curve_of_a_layered_oxide_is_corrected(tmp_path, capsys, data):
+    """The mean of the LG M50's discharge at C/10 is 17 mV below the published curve; correcting the RC pairs halves that."""
     out, folder = tmp_path / "lone.toml", data / "lgm50"
     code, text, _ = run(capsys, "ocv", folder / "rate_0p1c_25c.csv.gz", "--out", out)
     assert code == 0
@@ -248,8 +248,8 @@ def test_a_lone_slow_curve_of_a_layered_oxide_is_brought_to_rest(tmp_path, capsy
     assert np.array(found.weak_ohm) == pytest.approx(np.array(usual.weak_ohm), rel=1e-3)
 
 
-def test_a_curve_that_would_fall_to_nothing_is_none(tmp_path, capsys, shared_data):
-    """With 2.9 Ah declared as 4, the points end far from empty."""
+def test_curve_that_falls_to_0_v_is_rejected(tmp_path, capsys, shared_data):
+    """With a declared capacity of 4 Ah instead of 2.9 Ah, the points end far from empty."""
     capture = shared_data / "panasonic18650pf" / "25_hppc.csv.gz"
     code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "4", "--out", tmp_path / "large.toml")
     assert code == 2
@@ -268,7 +268,7 @@ def test_rests_of_a_pouch_cell(tmp_path, capsys, data):
     assert found["error_mv"][0] > 3.0 * np.median(found["error_mv"])
 
 
-def test_two_captures_of_one_name_are_two(captures, tmp_path, capsys):
+def test_captures_of_equal_names_are_distinguished(captures, tmp_path, capsys):
     other = tmp_path / captures[0].name
     other.write_bytes(captures[1].read_bytes())
     code, text, _ = run(

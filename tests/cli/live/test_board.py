@@ -17,7 +17,7 @@ from tests.serial_line import usb_port
 
 
 def board(capsys, *arguments):
-    """Exit code, stdout, stderr of the command."""
+    """Run the command and return exit code, stdout and stderr."""
     with pytest.raises(SystemExit) as ended:
         main(["board", *arguments])
     out, err = capsys.readouterr()
@@ -26,7 +26,7 @@ def board(capsys, *arguments):
 
 @contextlib.contextmanager
 def virtual(**options):
-    """Path of a board that runs in a thread."""
+    """Run a board in a thread and yield its path."""
     with VirtualBoard(lambda _: Reading(2.5, 22.2, 25.0), **options) as made:
         loop = asyncio.new_event_loop()
         task = loop.create_task(made.run())
@@ -40,31 +40,31 @@ def virtual(**options):
 
 @pytest.fixture
 def patient(monkeypatch):
-    """For boards that answer."""
+    """Set long timeouts, for boards that respond."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(device_detection, "REFERENCE_S", LONG_S)
 
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """For those that never do."""
+    """Set short timeouts, for boards that do not respond."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.5)
 
 
 @pytest.mark.usefixtures("patient")
-def test_it_shows_what_the_board_says_of_itself(capsys):
+def test_shows_the_properties_of_the_board(capsys):
     with virtual(rate_hz=50, serial=0xC0FFEE, parts=BoardParts(supply_v=4.8)) as path:
         code, out, err = board(capsys, path)
     assert (code, err) == (0, "")
-    said = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert (said["firmware"], said["serial"], said["rate"]) == ("0.2.0", "00c0ffee", "50 Hz")
-    assert (said["voltage"], said["bandgap"]) == ("divider 6.1", "1.1000 V")
-    assert said["current"] == "0.1 V/A at 5 V, ratiometric, zero at 0.500000 of the reference"
-    assert float(said["reference"].split()[0]) == pytest.approx(4.8, rel=1e-3)
+    message = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert (message["firmware"], message["serial"], message["rate"]) == ("0.2.0", "00c0ffee", "50 Hz")
+    assert (message["voltage"], message["bandgap"]) == ("divider 6.1", "1.1000 V")
+    assert message["current"] == "0.1 V/A at 5 V, ratiometric, zero at 0.500000 of the reference"
+    assert float(message["reference"].split()[0]) == pytest.approx(4.8, rel=1e-3)
 
 
 @pytest.mark.usefixtures("patient")
-def test_the_voltage_at_aref_sets_the_bandgap_and_with_it_the_reference(capsys):
+def test_voltage_at_aref_sets_bandgap_and_reference(capsys):
     with virtual(rate_hz=50) as path:
         code, out, err = board(capsys, path, "--aref-v", "4.7", "--serial", "77")
         assert (code, err) == (0, "")
@@ -73,14 +73,14 @@ def test_the_voltage_at_aref_sets_the_bandgap_and_with_it_the_reference(capsys):
         assert float(bandgap.split()[-2]) == pytest.approx(1.1 * 4.7 / 5.0, rel=1e-3)
         assert serial == "serial: was 00000001, now 0000004d"
         _, out, _ = board(capsys, path)
-    said = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert said["serial"] == "0000004d"
-    assert float(said["reference"].split()[0]) == pytest.approx(4.7, rel=1e-3)
+    message = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert message["serial"] == "0000004d"
+    assert float(message["reference"].split()[0]) == pytest.approx(4.7, rel=1e-3)
 
 
 @pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("aref_v", ["3.3", "6", "0", "-5"])
-def test_a_voltage_that_cannot_be_at_aref_changes_nothing(capsys, monkeypatch, aref_v):
+def test_implausible_voltage_at_aref_is_rejected(capsys, monkeypatch, aref_v):
     monkeypatch.setattr(device_detection, "REFERENCE_SAMPLES", 10)
     with virtual() as path:
         code, _, err = board(capsys, path, "--aref-v", aref_v, "--serial", "7")
@@ -93,14 +93,14 @@ def test_a_voltage_that_cannot_be_at_aref_changes_nothing(capsys, monkeypatch, a
 
 
 @pytest.mark.parametrize("serial", ["0", "-1", "4294967296", "x"])
-def test_a_serial_number_that_the_board_cannot_hold(capsys, serial):
+def test_serial_number_out_of_range_is_rejected(capsys, serial):
     code, out, err = board(capsys, "/dev/none", "--serial", serial)
     assert (code, out) == (2, "")
     assert "--serial" in err
 
 
 @pytest.mark.usefixtures("patient")
-def test_a_board_that_prints_text_takes_no_commands(capsys):
+def test_text_board_rejects_commands(capsys):
     with virtual(mode="text") as path:
         code, out, err = board(capsys, path, "--serial", "7")
     assert (code, out) == (2, "")
@@ -109,7 +109,7 @@ def test_a_board_that_prints_text_takes_no_commands(capsys):
 
 
 @pytest.mark.usefixtures("impatient")
-def test_a_port_on_which_nobody_is(capsys):
+def test_port_without_a_board_is_reported(capsys):
     master, slave = os.openpty()
     path = os.ttyname(slave)
     try:
@@ -119,7 +119,7 @@ def test_a_port_on_which_nobody_is(capsys):
         os.close(master)
 
 
-def test_a_port_that_is_not_there(capsys, tmp_path, monkeypatch):
+def test_missing_port_is_reported(capsys, tmp_path, monkeypatch):
     path = tmp_path / "none"
     assert board(capsys, str(path)) == (2, "", f"error: {path}: it does not exist\n")
     monkeypatch.setattr(list_ports, "comports", list)
@@ -128,7 +128,7 @@ def test_a_port_that_is_not_there(capsys, tmp_path, monkeypatch):
     assert board(capsys) == (2, "", "error: auto: 2 serial ports are connected; choose one: /dev/a, /dev/b\n")
 
 
-def test_a_port_that_is_none(capsys, tmp_path):
+def test_file_that_is_no_port_is_reported(capsys, tmp_path):
     path = tmp_path / "file"
     path.write_text("")
     code, out, err = board(capsys, str(path))

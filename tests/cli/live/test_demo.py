@@ -1,4 +1,4 @@
-"""``demo`` as a program: what a client of its broker sees, from the first state to offline."""
+"""Process of command ``demo``: messages to a client of its broker, from the first state to offline."""
 
 import asyncio
 import contextlib
@@ -31,7 +31,7 @@ async def demo(*arguments):
 
 
 async def listening(port):
-    """A listener, once the broker is there."""
+    """Return a listener after the broker has started."""
     async with asyncio.timeout(LONG_S):
         while True:
             listener = Listener(SimpleNamespace(port=port))
@@ -40,7 +40,7 @@ async def listening(port):
             await asyncio.sleep(0.1)
 
 
-async def test_a_client_of_its_broker_sees_the_service_come_work_and_go():
+async def test_client_receives_states_from_start_to_offline():
     port, page = free_port(), free_port()
     where = ("--port", port, "--page-port", page)
     async with demo("--seconds", 4, *where) as process:
@@ -80,7 +80,7 @@ async def test_a_client_of_its_broker_sees_the_service_come_work_and_go():
 
 
 @pytest.mark.thorough
-async def test_a_board_whose_time_passes_faster_takes_the_estimate_with_it():
+async def test_estimate_follows_a_board_with_a_faster_clock():
     port = free_port()
     async with demo("--speed", 5, "--port", port):
         listener = await listening(port)
@@ -99,7 +99,7 @@ async def test_a_board_whose_time_passes_faster_takes_the_estimate_with_it():
     assert state["lock"] is True
 
 
-async def test_a_port_that_is_taken_is_said():
+async def test_occupied_port_is_reported():
     server = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
     async with server, demo("--seconds", 1, "--port", port) as process:

@@ -1,4 +1,4 @@
-"""``history``: a table that a program can read, of the database that the service writes."""
+"""``history``: CSV export of the service's database."""
 
 import csv
 import io
@@ -8,13 +8,13 @@ import pytest
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
 from tests.command_line import run
-from tests.store.test_history import at, keep
+from tests.store.test_history import at, record
 
 
 @pytest.fixture
 async def pack(tmp_path):
     (tmp_path / "pack.toml").write_text(f'[state]\nfolder = "{tmp_path}"\n')
-    await keep(tmp_path / "pack.sqlite", [at(30.0 * s) for s in range(10)])
+    await record(tmp_path / "pack.sqlite", [at(30.0 * s) for s in range(10)])
     return tmp_path / "pack.toml"
 
 
@@ -30,7 +30,7 @@ def test_minutes_are_printed_with_their_units_and_times(pack, capsys):
     assert len(others) == 4
 
 
-def test_a_span_in_longer_steps_goes_to_a_file_that_is_not_replaced_unasked(pack, capsys):
+def test_longer_steps_are_written_to_a_file_that_is_not_overwritten(pack, capsys):
     out_file = pack.with_name("out.csv")
     arguments = ["history", pack, "--since", "2023-11-14T22:15", "--until", "2023-11-14T22:17:00", "--out", out_file]
     assert run(capsys, *arguments, "--step", 3600) == (0, "", "")
@@ -45,7 +45,7 @@ def test_events_are_printed(pack, capsys):
     assert [row["name"] for row in table(out)] == ["start", "sensor_online"]
 
 
-async def test_it_reads_while_the_service_runs(pack, capsys):
+async def test_history_is_read_while_the_service_runs(pack, capsys):
     async with Database(pack.with_name("pack.sqlite")) as database, History(database, days=1) as history:
         history.publish(at(600.0))
         await history._write()
@@ -54,10 +54,10 @@ async def test_it_reads_while_the_service_runs(pack, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [(["--step", "90"], "must be whole minutes"), (["--folder", "/nonexistent"], "no history there")],
 )
-def test_what_cannot_be_is_said(pack, capsys, arguments, said):
+def test_invalid_arguments_are_reported(pack, capsys, arguments, message):
     code, out, err = run(capsys, "history", pack, *arguments)
     assert (code, out) == (2, "")
-    assert said in err
+    assert message in err

@@ -1,4 +1,4 @@
-"""Live view on a real pseudo-terminal: its content by size, and a terminal that is not read."""
+"""Live view on a real pseudo-terminal: content by screen size, without blocking the service."""
 
 import asyncio
 import re
@@ -31,13 +31,13 @@ def shows_soc(terminal: PseudoTerminal) -> bool:
 
 
 @pytest.mark.parametrize(("columns", "rows"), SIZES, ids=str)
-def test_a_screen_of_any_size_shows_soc_band_and_true_soc(demo: PseudoTerminal, columns: int, rows: int) -> None:
+def test_main_values_are_shown_on_any_screen_size(demo: PseudoTerminal, columns: int, rows: int) -> None:
     demo.resize(columns, rows)
     demo.until(lambda: len(demo.screen()) == rows and max(map(len, demo.screen())) == columns)
     demo.until(lambda: shows_soc(demo))
 
 
-def test_a_demo_that_is_interrupted_says_what_came_of_it_and_leaves_the_terminal_as_it_was() -> None:
+def test_interrupted_demo_prints_a_summary_and_restores_the_terminal() -> None:
     with PseudoTerminal("demo", "--port", str(free_port())) as terminal:
         terminal.until(lambda: shows_soc(terminal))
         terminal.process.send_signal(signal.SIGINT)

@@ -15,12 +15,12 @@ from tests.patience import LONG_S
 
 @pytest.fixture(autouse=True)
 def wide(monkeypatch):
-    """Avoid broken cells of the table."""
+    """Set a wide terminal, so that table cells are not wrapped."""
     monkeypatch.setenv("COLUMNS", "240")
 
 
 def ports(capsys, *arguments):
-    """Exit code, stdout of the command."""
+    """Run the command and return exit code and stdout."""
     with pytest.raises(SystemExit) as ended:
         main(["ports", *arguments])
     out, err = capsys.readouterr()
@@ -30,7 +30,7 @@ def ports(capsys, *arguments):
 
 @contextlib.contextmanager
 def simulated(*arguments):
-    """Path of a simulated board, and its process."""
+    """Run a simulated board and yield its path and process."""
     with subprocess.Popen([PROGRAM, "simulate", *arguments], stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process.stdout.readline().strip(), process
@@ -38,7 +38,7 @@ def simulated(*arguments):
             process.kill()
 
 
-def test_it_names_the_ports_that_are_there_and_no_others(capsys):
+def test_lists_existing_ports(capsys):
     there = [port.device for port in list_ports.comports()]
     code, out = ports(capsys)
     assert code == 0
@@ -56,7 +56,7 @@ def test_it_names_the_ports_that_are_there_and_no_others(capsys):
         (("--text", "--load", "constant", "--current-a", "0"), r"prints text, [34]\S* V, \S+ A"),
     ],
 )
-def test_a_board_answers_the_probe_and_goes_on(capsys, monkeypatch, options, answer):
+def test_probe_identifies_a_board_without_disturbing_it(capsys, monkeypatch, options, answer):
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", LONG_S)
     with simulated(*options) as (path, process):
         for _ in range(2):
@@ -67,8 +67,8 @@ def test_a_board_answers_the_probe_and_goes_on(capsys, monkeypatch, options, ans
         assert process.poll() is None
 
 
-def test_what_is_no_board_is_not_called_one(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "500")  # no row is folded
+def test_other_devices_are_not_identified_as_boards(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "500")  # rows are not wrapped
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.3)
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", 0.1)
     master, slave = os.openpty()
@@ -86,7 +86,7 @@ def test_what_is_no_board_is_not_called_one(capsys, tmp_path, monkeypatch):
     assert "cannot be opened" in rows[str(tmp_path / "none")]
 
 
-def test_without_probe_nothing_is_opened(capsys, tmp_path):
+def test_ports_are_opened_only_with_probe(capsys, tmp_path):
     code, out = ports(capsys, str(tmp_path / "none"))
     assert code == 0
     assert "cannot be opened" not in out

@@ -1,4 +1,4 @@
-"""``record`` as a program: received bytes are in the file, however the recorder ends."""
+"""Process of command ``record``: all received bytes are in the file for any kind of end."""
 
 import contextlib
 import json
@@ -36,7 +36,7 @@ def program(*arguments, **options):
 
 @pytest.fixture(scope="module")
 def board():
-    """Path of a simulated board. At its 100 samples per second the line holds two seconds for a recorder that waits."""
+    """Run a simulated board and yield its path. At 100 Hz the line buffers two seconds for a blocked recorder."""
     with program("simulate", "--load", "constant") as process:
         yield process.stdout.readline().strip()
 
@@ -57,38 +57,38 @@ def reads(path):
 
 
 def samples(path):
-    """Return the samples of a decoder that receives the complete reads."""
+    """Return the samples of a decoder that receives all complete reads."""
     decoder = FrameDecoder()
     return sum(decoder.feed(arrival_s, data).size for arrival_s, data in reads(path))
 
 
 def long_enough(path):
-    """Return whether a growing capture holds a second's samples."""
+    """Return True if a growing capture holds samples of a second."""
     return size(path) > 1_000 and samples(path) >= 100
 
 
 def replayed(capsys, path):
-    """Exit code, summary, stderr of a replay."""
+    """Replay a capture and return exit code, summary and stderr."""
     with pytest.raises(SystemExit) as ended:
         main(["replay", str(path), "--cell", "chen_mora", "--json"])
     out, err = capsys.readouterr()
     return ended.value.code or 0, json.loads(out), err
 
 
-def test_every_byte_of_the_line_is_in_the_file_and_ctrl_c_ends_it(line: Line, tmp_path, capsys):
+def test_all_bytes_are_recorded_until_ctrl_c(line: Line, tmp_path, capsys):
     out = tmp_path / "line.bms"
     line.plug()
     with program("record", out, "--port", line.path, "--text", "--baud", 115200) as process:
-        while "port opened" not in (said := process.stderr.readline()):
-            assert said, "the recorder has ended"
+        while "port opened" not in (message := process.stderr.readline()):
+            assert message, "the recorder has ended"
         sent = b""
-        for part in 10 * (TEXT[:7], TEXT[7:]):  # no line comes in one read
+        for part in 10 * (TEXT[:7], TEXT[7:]):  # each line is split over two reads
             line.write(part)
             sent += part
             until(lambda sent=sent: b"".join(data for _, data in reads(out)) == sent, f"byte {len(sent)}")
         process.send_signal(signal.SIGINT)
-        said, err = process.communicate(timeout=LONG_S)
-    assert (process.returncode, said) == (0, "")
+        message, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, message) == (0, "")
     assert re.search(r"^\d+\.\d s, 180 bytes, 10 frames, 0 lost, 0 CRC errors, 0 other faults$", err, re.MULTILINE)
     header = read_header(out)
     assert (header.mode, header.port, header.baud) == ("text", str(line.path), 115200)
@@ -99,7 +99,7 @@ def test_every_byte_of_the_line_is_in_the_file_and_ctrl_c_ends_it(line: Line, tm
     assert result["samples"] + sum(result["dropped"].values()) == 10
 
 
-def test_a_recorder_that_is_killed_leaves_all_to_the_last_whole_record(board, tmp_path, capsys):
+def test_killed_recorder_leaves_complete_records(board, tmp_path, capsys):
     out, cut = tmp_path / "killed.bms", tmp_path / "cut.bms"
     with program("record", out, "--port", board) as process:
         until(lambda: long_enough(out), "a second")
@@ -111,7 +111,7 @@ def test_a_recorder_that_is_killed_leaves_all_to_the_last_whole_record(board, tm
     assert result["gaps"] == 0
 
     whole = reads(out)
-    for cut_bytes in (1, 3, len(whole[-1][1]) + 10):  # within the checksum, the data, the record's head
+    for cut_bytes in (1, 3, len(whole[-1][1]) + 10):  # within the checksum, the data, and the record's header
         cut.write_bytes(out.read_bytes()[:-cut_bytes])
         assert reads(cut) == whole[:-1]
         code, result, err = replayed(capsys, cut)
@@ -122,20 +122,20 @@ def test_a_recorder_that_is_killed_leaves_all_to_the_last_whole_record(board, tm
 
 @pytest.fixture(scope="module")
 def recorded(board, tmp_path_factory):
-    """A capture of a second or more."""
+    """Record a capture of at least a second."""
     out = tmp_path_factory.mktemp("recorded") / "one.bms"
     with program("record", out, "--port", board) as process:
         until(lambda: long_enough(out), "a second")
         process.send_signal(signal.SIGINT)
-        said, err = process.communicate(timeout=LONG_S)
-    assert (process.returncode, said) == (0, "")
+        message, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, message) == (0, "")
     counts = re.search(r" bytes, ([\d,]+) frames, 0 lost, 0 CRC errors, 0 other faults\n$", err)
     assert counts
     assert int(counts[1].replace(",", "")) == samples(out) >= 100
     return out
 
 
-def test_it_ends_by_itself_after_the_seconds(board, tmp_path):
+def test_recording_ends_after_the_duration(board, tmp_path):
     with program("record", tmp_path / "short.bms", "--port", board, "--seconds", 0.1) as process:
         _, err = process.communicate(timeout=LONG_S)
     assert process.returncode == 0
@@ -143,7 +143,7 @@ def test_it_ends_by_itself_after_the_seconds(board, tmp_path):
     assert reads(tmp_path / "short.bms")
 
 
-def test_the_samples_are_those_the_board_sent(recorded, tmp_path, capsys):
+def test_samples_are_those_sent_by_the_board(recorded, tmp_path, capsys):
     table = tmp_path / "one.csv"
     with pytest.raises(SystemExit):
         main(["replay", str(recorded), "--cell", "chen_mora", "--out", str(table)])
@@ -153,7 +153,7 @@ def test_the_samples_are_those_the_board_sent(recorded, tmp_path, capsys):
     assert np.allclose(np.diff(times), 1 / 100, rtol=0.0, atol=1e-5)
 
 
-def test_a_damaged_record_is_said_and_what_is_before_it_is_read(recorded, tmp_path, capsys):
+def test_damaged_record_is_reported_and_earlier_ones_are_read(recorded, tmp_path, capsys):
     damaged, whole = tmp_path / "damaged.bms", reads(recorded)
     middle = len(whole) // 2
     data = bytearray(recorded.read_bytes())
@@ -166,7 +166,7 @@ def test_a_damaged_record_is_said_and_what_is_before_it_is_read(recorded, tmp_pa
     assert result["samples"] == samples(damaged) > 10
 
 
-def test_a_damaged_length_does_not_lose_the_rest_in_silence(recorded, tmp_path, capsys):
+def test_damaged_length_is_reported(recorded, tmp_path, capsys):
     damaged, whole = tmp_path / "damaged.bms", reads(recorded)
     middle = len(whole) // 2
     data = bytearray(recorded.read_bytes())
@@ -178,17 +178,17 @@ def test_a_damaged_length_does_not_lose_the_rest_in_silence(recorded, tmp_path, 
     assert f"the last {unread:,} bytes are no complete record" in err
 
 
-def test_an_existing_file_is_left_as_it_is(tmp_path):
+def test_existing_file_is_not_overwritten(tmp_path):
     out = tmp_path / "kept.bms"
     out.write_bytes(b"kept")
     with program("record", out, "--port", "/dev/none") as process:
-        said, err = process.communicate(timeout=LONG_S)
-    assert (process.returncode, said) == (2, "")
+        message, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, message) == (2, "")
     assert err == f"error: {out}: exists already; a capture is never overwritten\n"
     assert out.read_bytes() == b"kept"
 
 
-def test_a_disk_that_is_full_ends_it_and_what_is_there_can_be_replayed(board, tmp_path, capsys):
+def test_full_disk_ends_the_recording_and_the_file_is_readable(board, tmp_path, capsys):
     out = tmp_path / "full.bms"
     limit = ["bash", "-c", 'ulimit -f 4; exec "$0" "$@"']  # 4 KiB
     command = [*limit, PROGRAM, "record", out, "--port", board]
@@ -202,11 +202,11 @@ def test_a_disk_that_is_full_ends_it_and_what_is_there_can_be_replayed(board, tm
     assert result["samples"] == samples(out) > 10
     head = len(MAGIC) + 4 + int.from_bytes(out.read_bytes()[len(MAGIC) :][:4], "little") + 2
     unread = size(out) - head - sum(RECORD_OVERHEAD_BYTES + len(data) for _, data in reads(out))
-    said = f"warning: {out}: the last {unread:,} bytes are no complete record"
-    assert (said in err) == (unread > 0)  # the limit may lie between two records
+    message = f"warning: {out}: the last {unread:,} bytes are no complete record"
+    assert (message in err) == (unread > 0)  # the limit may lie between two records
 
 
-def test_a_board_that_is_not_there_is_said(tmp_path):
+def test_missing_board_is_reported(tmp_path):
     with program("record", tmp_path / "none.bms", "--port", tmp_path / "none") as process:
         assert f"waiting for {tmp_path / 'none'}: it does not exist" in process.stderr.readline()
         process.send_signal(signal.SIGINT)

@@ -13,17 +13,17 @@ from tests.patience import LONG_S
 
 
 def program(*arguments):
-    """The real program, to its end."""
+    """Run the program until it ends."""
     return subprocess.run([PROGRAM, *arguments], capture_output=True, text=True, timeout=LONG_S, check=False)
 
 
-def test_a_pack_file_that_is_not_there(tmp_path):
+def test_missing_pack_file_is_an_error(tmp_path):
     ended = program("run", tmp_path / "none.toml")
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr == f"error: {tmp_path / 'none.toml'}: cannot be read: No such file or directory\n"
 
 
-def test_a_capture_that_exists_is_not_written_over(tmp_path):
+def test_existing_capture_is_not_overwritten(tmp_path):
     pack, capture = tmp_path / "pack.toml", tmp_path / "kept.bms"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
     capture.write_bytes(b"kept")
@@ -34,7 +34,7 @@ def test_a_capture_that_exists_is_not_written_over(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (b"[pack\n", "not valid TOML"),
         (b"[pack]\nseries = 2\nseries = 3\n", "not valid TOML"),
@@ -43,17 +43,17 @@ def test_a_capture_that_exists_is_not_written_over(tmp_path):
         (b'[pack]\ncell = "none.toml"\n', "none.toml"),
     ],
 )
-def test_a_pack_file_that_is_no_pack_file(content, said, tmp_path, capsys):
+def test_invalid_pack_file_is_an_error(content, message, tmp_path, capsys):
     pack = tmp_path / "pack.toml"
     pack.write_bytes(content)
     code, out, err = run(capsys, "run", pack)
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
     assert err.startswith("error: ")
-    assert said in err
+    assert message in err
 
 
-def test_a_broker_address_that_is_none(tmp_path, capsys):
+def test_invalid_broker_url_is_an_error(tmp_path, capsys):
     pack = tmp_path / "pack.toml"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
     code, _, err = run(capsys, "run", pack, "--mqtt", "nonsense")
@@ -62,14 +62,14 @@ def test_a_broker_address_that_is_none(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("options", [("--port", "/dev/none"), ("--record", "new.bms"), ("--view",)])
-def test_what_is_of_one_board_is_not_for_several_packs(options, tmp_path, capsys):
+def test_options_of_one_board_are_rejected_for_several_packs(options, tmp_path, capsys):
     packs = [tmp_path / "one.toml", tmp_path / "two.toml"]
     for pack in packs:
         pack.write_text("")
     assert run(capsys, "run", *packs, *options) == (2, "", "error: --port, --record and --view are for one pack\n")
 
 
-def test_help_lists_every_command_and_the_version_is_the_packages(capsys):
+def test_help_lists_all_commands_and_version_prints_the_version(capsys):
     code, out, _ = run(capsys, "--help")
     assert code == 0
     assert [name for name in COMMANDS if f" {name} " not in out] == []
@@ -88,7 +88,7 @@ def test_every_command_can_be_imported_and_has_help(command, capsys):
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("arguments", [("config", "show"), ("--version",), ("ports", "/dev/null")])
-def test_an_output_that_cannot_be_written(arguments, unbuffered):
+def test_unwritable_stdout_is_reported(arguments, unbuffered):
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     with Path("/dev/full").open("w") as full:
         ended = subprocess.run(
@@ -100,7 +100,7 @@ def test_an_output_that_cannot_be_written(arguments, unbuffered):
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("arguments", [("config", "show"), ("--version",), ("ports", "/dev/null")])
-def test_an_output_that_nobody_reads(arguments, unbuffered):
+def test_closed_stdout_ends_quietly(arguments, unbuffered):
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     read, write = os.pipe()
     os.close(read)

@@ -1,4 +1,4 @@
-"""``simulate`` as a program: a path, then a board's bytes on it, until it is interrupted."""
+"""Process of command ``simulate``: bytes of a board on the printed path, until an interrupt."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ RATE_HZ = 50
 
 @contextlib.contextmanager
 def simulate(*arguments):
-    """The program, and the path that it printed."""
+    """Run the program and yield it with the path that it prints."""
     command = [PROGRAM, "simulate", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -57,11 +57,11 @@ def decoded(data):
 
 
 def _step_s(data):
-    """Between the last two samples [s]."""
+    """Return the time between the last two samples [s]."""
     return np.diff(decoded(data)[0]["time_s"])[-1]
 
 
-def test_frames_of_the_pack_that_was_asked_for_until_ctrl_c():
+def test_frames_of_the_configured_pack_until_ctrl_c():
     arguments = ("--series", "6", "--load", "constant", "--current-a", "0.5", "--rate-hz", str(RATE_HZ))
     with simulate(*arguments) as (process, path):
         assert Path(path).is_char_device()
@@ -76,14 +76,14 @@ def test_frames_of_the_pack_that_was_asked_for_until_ctrl_c():
         assert np.allclose(np.diff(block["time_s"]), 1.0 / RATE_HZ, rtol=0.0, atol=1e-5)
         assert block["current_a"].mean() == pytest.approx(0.5, abs=0.05)
         assert block["voltage_v"].mean() == pytest.approx(6 * 3.9, abs=1.0)
-        assert _step_s(later) == pytest.approx(1.0 / 100, rel=0.01)  # it obeys the host
+        assert _step_s(later) == pytest.approx(1.0 / 100, rel=0.01)  # the rate requested by the host
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=LONG_S)
     assert (process.returncode, out) == (0, "")
     assert re.fullmatch(r"[\d,]+ samples in \d+\.\d s, SOC \d+\.\d\d%\n", err)
 
 
-def test_text_lines_as_a_hobby_sketch_prints_them():
+def test_text_lines_have_the_format_of_a_sketch():
     with simulate("--text", "--current-a", "0.2", "--load", "constant") as (process, path):
         with opened(path) as line:
             lines = read(line, lambda data: data.count(b"\r\n") >= 20).split(b"\r\n")[:-1]
@@ -93,7 +93,7 @@ def test_text_lines_as_a_hobby_sketch_prints_them():
     assert np.mean([float(line.split(b",")[1]) for line in lines]) == pytest.approx(0.2, abs=0.05)
 
 
-def test_it_ends_by_itself_after_the_seconds_of_its_time():
+def test_simulation_ends_after_the_simulated_duration():
     with simulate("--seconds", "4", "--speed", "20", "--load", "constant", "--current-a", "0") as (process, _):
         out, err = process.communicate(timeout=LONG_S)
     assert (process.returncode, out) == (0, "")
@@ -114,7 +114,7 @@ def test_it_ends_by_itself_after_the_seconds_of_its_time():
         ("--protocol", "jbd", "--series", "40"),
     ],
 )
-def test_what_there_is_not_is_named(arguments, capsys):
+def test_unknown_names_are_reported(arguments, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["simulate", *arguments])
     out, err = capsys.readouterr()

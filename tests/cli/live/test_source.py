@@ -18,13 +18,13 @@ def pack(tmp_path: Path) -> Path:
 
 
 def linux(pack: Path) -> Path:
-    """Settings of a pack at a chip of this machine, or what looks like it."""
+    """Write settings of a pack with a simulated sensor chip of this machine."""
     folder = hwmon(pack.parent / "sys", in1_input=53120, curr1_input=-2510)
     pack.write_text(f'[source]\nkind = "linux"\nchip = "{folder}"\ninterval_s = 0.01\n')
     return pack
 
 
-def test_a_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys):
+def test_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys):
     code, out, _ = run(capsys, "config", "check", linux(pack))
     assert code == 0
     assert "hwmon3 of this machine; no broker" in out
@@ -38,14 +38,14 @@ def test_a_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(("command", "options"), [("run", ("--no-view",)), ("record", ("x.raw", "--pack"))])
-def test_a_port_is_refused_where_there_is_none(command, options, pack, capsys):
+def test_port_option_is_rejected_without_a_serial_source(command, options, pack, capsys):
     code, _, err = run(capsys, command, *options, linux(pack), "--port", "/dev/ttyACM0")
     assert code == 2
     assert "port: applies to a serial port, but the settings have another [source]" in err
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ('profile = "opendtu"', "source.url: missing, and there is no [mqtt] whose broker could be meant"),
         ('profile = "opendtu"\nurl = "mqtt://a"\npassword_file = "/none"', "password_file = /none: cannot be read"),
@@ -60,14 +60,14 @@ def test_a_port_is_refused_where_there_is_none(command, options, pack, capsys):
         ),
     ],
 )
-def test_what_is_wrong_with_it_is_named(text, said, pack, capsys):
+def test_invalid_source_settings_are_reported(text, message, pack, capsys):
     pack.write_text(f'[source]\nkind = "mqtt"\n{text}\n')
     code, out, err = run(capsys, "config", "check", pack)
     assert (code, out) == (2, "")
-    assert said in err
+    assert message in err
 
 
-def test_what_show_prints_of_a_profile_is_read_back_as_the_same_settings(pack, tmp_path, capsys):
+def test_output_of_show_with_a_profile_is_read_back(pack, tmp_path, capsys):
     pack.write_text(
         '[source]\nkind = "mqtt"\nprofile = "venus"\nprefix = "c0619ab"\ninstance = "1"\nurl = "mqtt://a"\n'
     )

@@ -14,7 +14,7 @@ def test_only_decimal_numbers_are_numbers(text: str, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize("text", ["0.5", "200"])
-def test_a_number_outside_its_limits_is_refused_with_them(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_number_outside_its_limits_is_rejected(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, "board", "/dev/null", "--divider", text)
     assert code == 2
     assert f"{text}: must be at least 1 and at most 100" in " ".join(err.replace("│", "").split())
@@ -30,7 +30,7 @@ def test_a_number_outside_its_limits_is_refused_with_them(text: str, capsys: pyt
         *("thesis --resolution-v", "validate --soc"),
     ],
 )
-def test_no_option_takes_what_python_would(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_python_number_formats_are_rejected(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, *f"{option}=0_1".split())
     assert code == 2
     assert "no decimal number" in err
@@ -52,14 +52,14 @@ def test_no_option_takes_what_python_would(option: str, capsys: pytest.CaptureFi
     ],
 )
 @pytest.mark.parametrize("text", ["1_200", "٣", "0x3", "3.0", "1e3", ""])
-def test_only_digits_are_a_whole_number(option: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_digits_are_an_integer(option: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, *f"{option}={text}".split(" "))
     assert code == 2
     assert "not an integer" in err
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "65536"])
-def test_a_whole_number_outside_its_limits_is_refused_with_them(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_integer_outside_its_limits_is_rejected(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, "demo", f"--port={text}")
     assert code == 2
     assert f"{text}: must be at least 1 and at most 65535" in " ".join(err.replace("│", "").split())

@@ -21,7 +21,7 @@ def pack(tmp_path):
     return tmp_path / "pack.toml"
 
 
-def test_init_writes_a_file_of_the_defaults_that_check_accepts(pack, capsys):
+def test_init_writes_defaults_that_check_accepts(pack, capsys):
     code, out, err = run(capsys, "config", "init", pack)
     assert (code, err) == (0, "")
     assert f"{pack}: written" in out
@@ -40,7 +40,7 @@ NEEDED = {
 """Required settings of ``[source]``, by kind."""
 
 
-def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, capsys):
+def test_file_contains_all_settings_and_accepts_them_uncommented(pack, capsys):
     run(capsys, "config", "init", pack)
     lines = pack.read_text().splitlines()
     for name, field in Settings.model_fields.items():
@@ -49,7 +49,7 @@ def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, cap
     sections = re.split(r"^(?=\[)", "\n".join(set_now), flags=re.MULTILINE)
     sources = [section for section in sections if section.startswith("[source]")]
     assert len(sources) == len(KINDS)
-    for source in sources:  # one of them
+    for source in sources:  # alternatives
         kind = tomllib.loads(source)["source"]["kind"]
         whole = source + NEEDED.get(kind, "")
         pack.write_text("\n".join([*(section for section in sections if section not in sources), whole]))
@@ -70,7 +70,7 @@ def long_probe(monkeypatch):
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
 
 
-def test_init_finds_out_what_is_there_and_sets_it(pack, capsys, long_probe):
+def test_init_configures_the_detected_device(pack, capsys, long_probe):
     device = SimulatedBms("jk", lambda _: Reading(1.0, 26.4, 21.0), cells=8)
     with running_device(device) as path:
         code, out, err = run(capsys, "config", "init", pack, "--probe", "--port", path)
@@ -82,7 +82,7 @@ def test_init_finds_out_what_is_there_and_sets_it(pack, capsys, long_probe):
     assert tomllib.loads(pack.read_text())["sensor"] == {"port": path, "protocol": "jk"}
 
 
-def test_init_says_that_nobody_is_there_and_writes_nothing(pack, capsys, tmp_path):
+def test_init_without_a_device_writes_nothing(pack, capsys, tmp_path):
     code, out, err = run(capsys, "config", "init", pack, "--probe", "--port", tmp_path / "none")
     assert (code, out) == (2, "")
     assert "no known device was found" in err
@@ -93,7 +93,7 @@ def test_init_says_that_nobody_is_there_and_writes_nothing(pack, capsys, tmp_pat
     assert "requires --probe" in err
 
 
-def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
+def test_init_does_not_overwrite_a_file(pack, capsys):
     pack.write_text("mine\n")
     code, out, err = run(capsys, "config", "init", pack)
     assert (code, out) == (2, "")
@@ -102,7 +102,7 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[pack]\nseries = 0\n", ["pack.series = 0", "greater than or equal to 1"]),
         ("[pack]\nsereis = 2\n", ["pack.sereis", "unknown key"]),
@@ -144,17 +144,17 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "capacity of one"]),
     ],
 )
-def test_what_is_wrong_is_named_with_what_is_allowed(text, said, pack, capsys):
+def test_error_names_the_setting_and_the_allowed_values(text, message, pack, capsys):
     pack.write_text(text)
     for command in ("check", "show"):
         code, out, err = run(capsys, "config", command, pack)
         assert (code, out) == (2, "")
-        assert [part for part in said if part not in err] == [], err
+        assert [part for part in message if part not in err] == [], err
         if "nonsense" not in text and "generic" not in err:
             assert err.startswith(f"error: {pack}: ")
 
 
-def test_all_faults_of_a_file_are_named_at_once(pack, capsys):
+def test_all_errors_of_a_file_are_reported_together(pack, capsys):
     pack.write_text("[pack]\nseries = 0\nparallel = -1\n[sensor]\nbaud = 1\n")
     code, _, err = run(capsys, "config", "check", pack)
     assert code == 2
@@ -177,7 +177,7 @@ def test_show_prints_the_settings_in_effect_as_toml(pack, capsys):
 
 
 @pytest.mark.parametrize("gain", ['"never"', "-2.0"])
-def test_what_show_prints_is_read_back_as_the_same_settings(gain, pack, tmp_path, capsys):
+def test_output_of_show_is_read_back(gain, pack, tmp_path, capsys):
     pack.write_text(f'[observer]\nrearm_gain = {gain}\n[mqtt]\nbase_topic = "home/b"\n[state]\nfolder = "kept"\n')
     code, out, _ = run(capsys, "config", "show", pack)
     assert code == 0
@@ -195,7 +195,7 @@ def test_units_and_limits_are_written_in_full(pack, capsys):
 
 
 def _shown(capsys):
-    """The defaults as shown without a file."""
+    """Return the output of ``show`` without a file, which has the defaults."""
     code, out, _ = run(capsys, "config", "show")
     assert code == 0
     return out
@@ -203,7 +203,7 @@ def _shown(capsys):
 
 @pytest.fixture
 def cell_file(tmp_path):
-    """Writes the shipped NCR18650 with some of ``[cell]`` changed."""
+    """Return a function that writes the shipped NCR18650 with changed values of ``[cell]``."""
 
     def write(**changes):
         cell = load_cell("ncr18650")
@@ -215,7 +215,7 @@ def cell_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("cell", "settings", "said"),
+    ("cell", "settings", "message"),
     [
         ({"capacity_ah": 1e5}, "", "cell.capacity_ah = 100000: no cell holds more than 2000 Ah"),
         ({}, "capacity_ah = 2900", "pack.capacity_ah = 2900: no cell holds more than 2000 Ah; is it in mAh?"),
@@ -229,12 +229,12 @@ def cell_file(tmp_path):
         ),
     ],
 )
-def test_check_warns_of_what_cannot_be(cell, settings, said, cell_file, pack, capsys):
+def test_check_warns_about_implausible_settings(cell, settings, message, cell_file, pack, capsys):
     pack.write_text(f'[pack]\ncell = "{cell_file(**cell)}"\n{settings}\n')
     code, out, err = run(capsys, "config", "check", pack)
     assert code == 0
     assert f"{pack}: good: " in out
-    assert f"warning: {pack}: {said}" in err
+    assert f"warning: {pack}: {message}" in err
 
 
 @pytest.mark.parametrize(
@@ -247,14 +247,14 @@ def test_check_warns_of_what_cannot_be(cell, settings, said, cell_file, pack, ca
         'cell = "lfp"\ncapacity_ah = 100\nseries = 4',
     ],
 )
-def test_check_has_nothing_to_say_of_a_pack_that_may_be(settings, pack, capsys):
+def test_check_accepts_plausible_packs(settings, pack, capsys):
     pack.write_text(f"[pack]\n{settings}\n")
     code, _, err = run(capsys, "config", "check", pack)
     assert (code, err) == (0, "")
 
 
 @pytest.mark.parametrize("name", ["mqtt-password", "/run/credentials/bms-estimator.service/mqtt-password"])
-def test_check_warns_of_a_credential_that_only_the_running_service_sees(name, pack, capsys, monkeypatch):
+def test_check_warns_about_credentials_of_the_service(name, pack, capsys, monkeypatch):
     monkeypatch.delenv("CREDENTIALS_DIRECTORY", raising=False)
     pack.write_text(f'[mqtt]\npassword_file = "{name}"\n')
     code, out, err = run(capsys, "config", "check", pack)
@@ -263,7 +263,7 @@ def test_check_warns_of_a_credential_that_only_the_running_service_sees(name, pa
     assert f"warning: {pack}: mqtt.password_file = {name}: not checked" in err
 
 
-def test_check_finds_a_credential_by_its_name_alone(pack, tmp_path, capsys, monkeypatch):
+def test_check_finds_a_credential_by_its_name(pack, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     (tmp_path / "mqtt-password").write_text("secret\n")
     (tmp_path / "mqtt-password").chmod(0o600)
@@ -271,7 +271,7 @@ def test_check_finds_a_credential_by_its_name_alone(pack, tmp_path, capsys, monk
     assert run(capsys, "config", "check", pack)[::2] == (0, "")
 
 
-def test_check_fails_on_a_password_file_that_is_nowhere(pack, tmp_path, capsys):
+def test_check_fails_on_a_missing_password_file(pack, tmp_path, capsys):
     pack.write_text(f'[mqtt]\npassword_file = "{tmp_path / "none"}"\n')
     code, _, err = run(capsys, "config", "check", pack)
     assert code == 2
@@ -279,14 +279,14 @@ def test_check_fails_on_a_password_file_that_is_nowhere(pack, tmp_path, capsys):
     assert "cannot be read" in err
 
 
-def test_generic_cell_is_of_the_size_that_the_pack_says(pack, capsys):
+def test_generic_cell_has_the_capacity_of_the_pack(pack, capsys):
     pack.write_text('[pack]\ncell = "lfp"\ncapacity_ah = 100\nseries = 4\nparallel = 2\n')
     code, out, _ = run(capsys, "config", "check", pack)
     assert code == 0
     assert "lfp, 4 in series, 13 V, 200 Ah" in out
 
 
-def test_check_tries_the_files_of_influxdb_and_warns_of_those_of_the_service_alone(tmp_path, capsys):
+def test_check_reads_influxdb_files_and_warns_about_credentials(tmp_path, capsys):
     pack = tmp_path / "pack.toml"
     pack.write_text(f'[influx]\nbucket = "bms"\ntoken_file = "{tmp_path / "none"}"\n')
     code, _, err = run(capsys, "config", "check", pack)

@@ -1,4 +1,4 @@
-"""States and alarms in a real InfluxDB, and what becomes of them when it is away or refuses."""
+"""InfluxDB sink with a real server, during outages, and with rejections."""
 
 import asyncio
 import socket
@@ -44,7 +44,7 @@ def sink(url: str, **options: Any) -> InfluxSink:
     return InfluxSink(InfluxSettings(**told), first_delay_s=0.1)
 
 
-async def test_what_is_written_can_be_queried(influxdb: InfluxDB) -> None:
+async def test_written_lines_can_be_queried(influxdb: InfluxDB) -> None:
     async with sink(influxdb.url) as writing:
         state = at(0, voltage_v=51.25, cells_v=[3.25, None, 3.5])
         writing.publish(state._replace(alarms=(LOW,)))
@@ -61,7 +61,7 @@ async def test_what_is_written_can_be_queried(influxdb: InfluxDB) -> None:
         assert alarm["text"] == 'charge "it" soon, \\now or never'
 
 
-async def test_what_comes_while_the_server_is_away_is_written_when_it_is_back(influxdb: InfluxDB) -> None:
+async def test_lines_of_an_outage_are_written_afterwards(influxdb: InfluxDB) -> None:
     async with sink(influxdb.url) as writing:
         await asyncio.to_thread(influxdb.stop)
         with structlog.testing.capture_logs() as logs:
@@ -78,7 +78,7 @@ async def test_what_comes_while_the_server_is_away_is_written_when_it_is_back(in
     assert writing.dropped == 0
 
 
-async def test_at_the_end_what_waits_is_written(influxdb: InfluxDB) -> None:
+async def test_queued_lines_are_written_at_shutdown(influxdb: InfluxDB) -> None:
     async with sink(influxdb.url, every_s=3600.0) as writing:
         writing.publish(at(600, frames_received=777))
     assert writing.waiting == 0
@@ -86,7 +86,7 @@ async def test_at_the_end_what_waits_is_written(influxdb: InfluxDB) -> None:
 
 
 class Answers(BaseHTTPRequestHandler):
-    """Answers as it is told, and keeps what it was asked."""
+    """HTTP handler that gives configured responses and stores the requests."""
 
     def do_POST(self) -> None:
         server: Any = self.server
@@ -115,7 +115,7 @@ def server() -> Iterator[Any]:
         thread.join()
 
 
-async def test_influxdb_2_is_asked_as_it_wants_to_be(server: Any, tmp_path: Path) -> None:
+async def test_influxdb_2_request_has_bucket_and_token(server: Any, tmp_path: Path) -> None:
     token = tmp_path / "token"
     token.write_text("secret\n")
     settings = InfluxSettings(url=server.url + "/in/", bucket="b c", org="home", token_file=token, every_s=0.1)
@@ -128,7 +128,7 @@ async def test_influxdb_2_is_asked_as_it_wants_to_be(server: Any, tmp_path: Path
     assert body.decode() == "\n".join(lines(None, at(0)))
 
 
-async def test_what_is_never_taken_is_given_up_and_all_else_is_tried_again(server: Any) -> None:
+async def test_permanently_rejected_lines_are_dropped_and_others_retried(server: Any) -> None:
     server.answers = [(302, b""), (503, b"busy"), (400, b"bad \x1b line"), (204, b"")]
     async with sink(server.url) as writing:
         with structlog.testing.capture_logs() as logs:
@@ -144,7 +144,7 @@ async def test_what_is_never_taken_is_given_up_and_all_else_is_tried_again(serve
     assert all(reason.isprintable() for reason in reasons)
 
 
-async def test_what_waits_is_bounded_and_goes_out_in_batches(server: Any) -> None:
+async def test_queue_is_bounded_and_sent_in_batches(server: Any) -> None:
     server.answers = [(503, b"")]
     async with sink(server.url) as writing:
         writing.publish(at(0))
@@ -158,7 +158,7 @@ async def test_what_waits_is_bounded_and_goes_out_in_batches(server: Any) -> Non
     assert max(body.count(b"\n") + 1 for _, _, body in server.asked) <= BATCH
 
 
-async def test_a_server_that_never_answers_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_server_without_response_does_not_block_shutdown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts
         async with sink(f"http://127.0.0.1:{silent.getsockname()[1]}") as writing:
@@ -167,7 +167,7 @@ async def test_a_server_that_never_answers_stops_nobody(monkeypatch: pytest.Monk
         assert writing.waiting == 20
 
 
-async def test_an_answer_that_breaks_off_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_truncated_response_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as listening:
 
@@ -190,7 +190,7 @@ async def test_an_answer_that_breaks_off_stops_nobody(monkeypatch: pytest.Monkey
         assert writing.waiting == 2
 
 
-async def test_a_name_that_no_host_can_have_stops_nobody() -> None:
+async def test_invalid_host_name_is_reported() -> None:
     with structlog.testing.capture_logs() as logs:
         async with sink("http://influx..local:8086") as writing:
             writing.publish(at(0))
@@ -200,7 +200,7 @@ async def test_a_name_that_no_host_can_have_stops_nobody() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("told", "message"),
     [
         ({"bucket": "b", "username": "me"}, "of no use with bucket"),
         ({"org": "o"}, "of no use without bucket"),
@@ -208,12 +208,12 @@ async def test_a_name_that_no_host_can_have_stops_nobody() -> None:
         ({"url": "udp://house"}, "url"),
     ],
 )
-def test_settings_that_cannot_be(told: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_invalid_settings_are_rejected(told: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         InfluxSettings(**({"database": "bms"} | told))
 
 
-def test_a_file_that_cannot_be_used_is_said_at_start(tmp_path: Path) -> None:
+def test_unusable_file_raises_an_error_at_start(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"influx\.token_file = .*none: cannot be read: No such file"):
         InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "none"))
     (tmp_path / "token").write_text("t\N{EURO SIGN}ken", encoding="utf-8")
@@ -224,7 +224,7 @@ def test_a_file_that_cannot_be_used_is_said_at_start(tmp_path: Path) -> None:
         InfluxSink(InfluxSettings(url="https://house", bucket="b", ca_file=tmp_path / "ca"))
 
 
-def test_a_window_without_samples_and_alarms_that_stay_are_no_lines() -> None:
+def test_snapshot_without_changes_has_no_lines() -> None:
     assert lines(None, NOTHING_YET) == []
     raised = NOTHING_YET._replace(alarms=(LOW,))
     [line] = lines(NOTHING_YET, raised)

@@ -1,4 +1,4 @@
-"""What Prometheus fetches: real requests, read back by the library's parser and judged by promtool where that is."""
+"""Prometheus sink: real scrapes, parsed by the library and checked by promtool if installed."""
 
 import asyncio
 import shutil
@@ -32,7 +32,7 @@ PROMTOOL = shutil.which("promtool")
 
 
 def full() -> Snapshot:
-    """With cells, energy and an alarm."""
+    """Return a snapshot with cells, energy and an alarm."""
     assert ONE.estimate
     told = {"cells_v": [3.25, None, 3.5], "energy_out_kwh": 1.5, "time_to_empty_s": 60.0, "temperature_c": 21.5}
     return ONE._replace(estimate=ONE.estimate.model_copy(update=told), alarms=(SOC_LOW,))
@@ -52,7 +52,7 @@ async def fetched(snapshot: Snapshot | None) -> str:
 
 
 def values(text: str) -> dict[tuple[str, ...], float]:
-    """By name and labels other than the device."""
+    """Return the values by name and labels other than the device."""
     found = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
@@ -83,7 +83,7 @@ async def test_a_scrape_has_the_values_in_base_units() -> None:
         assert (judged.returncode, judged.stderr) == (0, "")
 
 
-async def test_what_is_not_known_or_not_fresh_is_not_there() -> None:
+async def test_unknown_and_stale_values_have_no_metrics() -> None:
     assert values(await fetched(None)) == {}
     for stale in (NOTHING_YET, snapshot("no board")):
         told = values(await fetched(stale))
@@ -93,19 +93,19 @@ async def test_what_is_not_known_or_not_fresh_is_not_there() -> None:
     assert ("bms_soc_ratio",) not in values(await fetched(STACK))
 
 
-async def test_an_address_that_is_taken_is_said() -> None:
+async def test_occupied_address_raises_an_error() -> None:
     settings = PrometheusSettings(listen=f"127.0.0.1:{free_port()}")
     async with PrometheusSink(settings):
         with pytest.raises(UserError, match="each pack needs an address of its own"):
             await PrometheusSink(settings).__aenter__()
 
 
-def test_the_tables_name_existing_fields() -> None:
+def test_tables_name_existing_fields() -> None:
     fields = set(Estimate.model_fields) | set(Health.model_fields)
     assert {*KINDS, *LIST_ITEMS} <= fields
 
 
-def test_a_field_s_unit_becomes_that_of_prometheus() -> None:
+def test_units_are_converted_to_base_units() -> None:
     assert name_and_factor("remaining_energy_wh") == ("bms_remaining_energy_joules", 3600.0)
     assert name_and_factor("rss_mib") == ("bms_rss_bytes", 1048576.0)
     assert name_and_factor("innovation_v") == ("bms_innovation_volts", 1.0)
@@ -116,12 +116,12 @@ def test_a_field_s_unit_becomes_that_of_prometheus() -> None:
 @pytest.mark.parametrize(
     "listen", ["9108", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:65536", "a b:1", "http://x:1", "x..y:1"]
 )
-def test_an_address_that_is_none_is_refused(listen: str) -> None:
+def test_invalid_address_is_rejected(listen: str) -> None:
     with pytest.raises(ValueError, match=r"listen|port|label empty"):
         PrometheusSettings(listen=listen)
 
 
-def test_addresses_of_both_kinds() -> None:
+def test_ipv4_and_ipv6_addresses_are_accepted() -> None:
     told: Any = [PrometheusSettings(listen=listen) for listen in ("127.0.0.1:9108", "[::1]:1")]
     assert [(each.host, each.port) for each in told] == [("127.0.0.1", 9108), ("::1", 1)]
 

@@ -1,4 +1,4 @@
-"""What Home Assistant is told: few changes, never too late."""
+"""Home Assistant: discovery messages, and rates and delays of published values."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ HOME = HomeAssistantSettings()
 
 
 def described(found: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The components of a discovery message, without those that it removes."""
+    """Return the components of a discovery message, without removed ones."""
     return {key: component for key, component in found["components"].items() if set(component) != {"platform"}}
 
 
@@ -39,7 +39,7 @@ def with_values(**values: float | None) -> Snapshot:
 
 
 def noisy(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, Snapshot]]:
-    """A load that steps every twenty seconds, as an 18650's board measures it, and what follows from it."""
+    """Yield noisy measurements of an 18650 cell under a load that changes every twenty seconds."""
     rng, soc, load_a = np.random.default_rng(5), 0.9, 0.0
     for i in range(round(seconds / period_s)):
         now_s = i * period_s
@@ -71,7 +71,7 @@ MOVED = ("soc_std", "time_to_empty_s", "time_to_full_s", "cell_lowest", "cell_lo
 
 
 def restless(seconds: float, period_s: float = 0.1, one: Snapshot = ONE) -> Iterator[tuple[float, Snapshot]]:
-    """Every value is another one each time."""
+    """Yield snapshots in which every value changes."""
     assert one.estimate
     names = [key for key in (*SHOWN, *MOVED) if hasattr(one.estimate, key)]
     for i in range(round(seconds / period_s)):
@@ -83,7 +83,7 @@ def restless(seconds: float, period_s: float = 0.1, one: Snapshot = ONE) -> Iter
 
 
 def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str, dict[str, object]]]:
-    """When Home Assistant is told what on which of its topics."""
+    """Yield time, topic and content of the messages to Home Assistant."""
     messages, sent = MessageBuilder("bms", "pack"), PublishedState()
     for now_s, each in stream:
         due, sent = messages.live_messages(sent, each, now_s)
@@ -95,7 +95,7 @@ def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str,
 def rows(
     stream: Iterator[tuple[float, Snapshot]], components: dict[str, dict[str, object]] = COMPONENTS
 ) -> list[float]:
-    """When the recorder of Home Assistant writes a row: for each change of state or attribute of an entity it shows."""
+    """Return the times at which Home Assistant's recorder writes a row, for changed states or attributes of entities."""
     last: dict[str, object] = {}
     written = []
     shown = {key for key, component in components.items() if component.get("enabled_by_default", True)}
@@ -121,13 +121,13 @@ def test_home_assistant_records_at_most_20_rows_in_any_minute(
     assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MAX_ROWS_PER_MIN
 
 
-def test_a_fuel_cell_makes_no_more() -> None:
+def test_fuel_cell_has_no_more_rows() -> None:
     written = np.array(rows(restless(900.0, one=STACK), OF_STACK))
     assert written.size > 100
     assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MAX_ROWS_PER_MIN
 
 
-def test_of_a_fuel_cell_home_assistant_shows_what_it_has_and_what_is_learned() -> None:
+def test_fuel_cell_has_its_own_entities() -> None:
     values = next(payload for _, topic, payload in told(iter([(0.0, STACK)])))
     numbers = {key for key, component in OF_STACK.items() if component["platform"] == "sensor"}
     assert numbers == set(values)
@@ -137,7 +137,7 @@ def test_of_a_fuel_cell_home_assistant_shows_what_it_has_and_what_is_learned() -
     assert OF_STACK["r_ohm"]["unit_of_measurement"] == "Ω"
 
 
-def test_noise_alone_makes_no_rows() -> None:
+def test_noise_causes_no_rows() -> None:
     rng = np.random.default_rng(2)
     stream = (
         (float(i), with_values(voltage_v=3.705 + float(rng.normal(0.0, 0.002)), current_a=float(rng.normal(0.0, 0.01))))
@@ -159,26 +159,26 @@ def test_values_never_expire_while_estimates_come(rate_hz: float) -> None:
     assert max(np.diff(times_s)) < expiry_s
 
 
-def test_values_expire_when_no_estimate_comes() -> None:
+def test_values_expire_without_estimates() -> None:
     silent = ONE._replace(estimate=None)
     times_s = [t for t, _, _ in told((float(i), silent if i else ONE) for i in range(60))]
     assert times_s == [0.0]
 
 
-def test_a_change_comes_within_five_seconds_when_it_is_the_first_for_long() -> None:
+def test_rare_change_is_published_within_five_seconds() -> None:
     stream = ((float(i), with_values(current_a=0.0 if i < 43 else 3.0)) for i in range(60))
     changed_s = next(t for t, _, payload in told(stream) if payload.get("current_a") == 3.0)
     assert changed_s <= 48.0
 
 
-def test_values_are_rounded_to_what_they_resolve() -> None:
+def test_values_are_rounded_to_their_resolution() -> None:
     values = with_values(voltage_v=3.7049999, soc_percent=56.7890123, remaining_energy_wh=1.23456789)
     payload = next(p for _, _, p in told(iter([(0.0, values)])))
     assert (payload["voltage_v"], payload["soc_percent"], payload["remaining_energy_wh"]) == (3.7, 56.8, 1.2)
     assert payload["temperature_c"] is None
 
 
-def test_no_entity_has_more_attributes_than_the_reason() -> None:
+def test_only_alarms_have_attributes() -> None:
     for component in COMPONENTS.values():
         assert not component["state_topic"].endswith(("/health", "/state", "/parameters"))
         if "json_attributes_template" in component:
@@ -190,7 +190,7 @@ def test_no_entity_has_more_attributes_than_the_reason() -> None:
             }
 
 
-def test_raw_observer_values_are_disabled_until_the_user_wants_them() -> None:
+def test_observer_values_are_disabled_by_default() -> None:
     raw = {
         "delta_1",
         "delta_2",
@@ -220,16 +220,14 @@ def test_discovery_describes_every_entity_with_both_availabilities() -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "sample_period_s", "expire_s"), [(0.1, 1.0, 30), (10.0, 1.0, 30), (1.0, 25.0, 75)])
-def test_a_value_expires_after_three_periods_and_half_a_minute_at_least(
-    rate_hz: float, sample_period_s: float, expire_s: int
-) -> None:
+def test_values_expire_after_three_periods_or_30_s(rate_hz: float, sample_period_s: float, expire_s: int) -> None:
     info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
     components = discovery(HOME, DiscoveryInputs(info), ROOT, sample_period_s)["components"].values()
     assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
 
 
 def discoveries(*snapshots: Snapshot, commands: tuple[str, ...] = (), **settings: Any) -> list[dict[str, Any]]:
-    """All that is told while ``snapshots`` come."""
+    """Return the discovery messages for ``snapshots``."""
     messages, sent = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(**settings)), PublishedState()
     messages.commands = commands
     found = []
@@ -239,7 +237,7 @@ def discoveries(*snapshots: Snapshot, commands: tuple[str, ...] = (), **settings
     return found
 
 
-def test_cells_are_there_from_the_first_sample_that_has_them_and_stay() -> None:
+def test_cells_are_added_with_their_first_voltages_and_never_removed() -> None:
     cells = with_values(cells_v=[3.3, None, 3.31], cell_lowest=1, cell_lowest_v=3.3)
     before, after = discoveries(ONE, cells, ONE)
     new = set(after["components"]) - set(before["components"])
@@ -254,7 +252,7 @@ def test_cells_are_there_from_the_first_sample_that_has_them_and_stay() -> None:
     assert (cell["entity_category"], cell["enabled_by_default"], cell["name"]) == ("diagnostic", False, "Cell 2")
 
 
-def test_commands_are_there_where_they_are_allowed() -> None:
+def test_allowed_commands_have_controls() -> None:
     [none] = discoveries(ONE)
     assert {c["platform"] for c in described(none).values()} == {"sensor"}
     [some] = discoveries(ONE, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate"))
@@ -267,7 +265,7 @@ def test_commands_are_there_where_they_are_allowed() -> None:
     }
 
 
-def test_what_is_not_there_any_more_is_removed() -> None:
+def test_entities_of_an_earlier_configuration_are_removed() -> None:
     messages = MessageBuilder("bms", "pack", alarms=[name for name in ALARMS if name != "soc_low"])
     messages.commands = ("set_soc",)
     due, _ = messages.live_messages(PublishedState(), ONE, 0.0)
@@ -281,7 +279,7 @@ def test_what_is_not_there_any_more_is_removed() -> None:
     }
 
 
-def test_alarms_are_there_that_are_watched_and_hold_though_the_sensor_is_silent() -> None:
+def test_monitored_alarms_stay_available_while_the_sensor_is_silent() -> None:
     alarm = Alarm(
         name="soc_low",
         severity="warning",
@@ -303,7 +301,7 @@ def test_alarms_are_there_that_are_watched_and_hold_though_the_sensor_is_silent(
     assert of_alarm["value_template"] == ("{{ 'online' if value_json.watched or value_json.active else 'offline' }}")
 
 
-def test_the_names_are_home_assistants_or_the_users_and_the_ids_the_same_in_any_language() -> None:
+def test_ids_do_not_depend_on_names() -> None:
     cells = with_values(cells_v=[3.3])
     [english] = discoveries(cells)
     [german] = discoveries(cells, name="Hausbatterie", names={"voltage_v": "Klemmenspannung", "cell_v": "Zelle"})
@@ -321,19 +319,19 @@ def test_the_names_are_home_assistants_or_the_users_and_the_ids_the_same_in_any_
     assert ids[0] == ids[1]
 
 
-def test_an_unknown_name_is_refused_with_what_there_is() -> None:
+def test_error_on_an_unknown_name_lists_the_entities() -> None:
     with pytest.raises(UserError, match=r"home_assistant\.names\.volts: there is no such entity; .*voltage_v"):
         discoveries(names={"volts": "Spannung"})
 
 
-def test_charging_may_be_positive() -> None:
+def test_current_sign_is_configurable() -> None:
     messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(current_sign="charge_positive"))
     due, _ = messages.live_messages(PublishedState(), with_values(current_a=2.0, power_w=8.0, voltage_v=4.0), 0.0)
     values = next(json.loads(m.payload) for m in due if m.topic == f"{ROOT}/home_assistant")
     assert (values["current_a"], values["power_w"], values["voltage_v"]) == (-2.0, -8.0, 4.0)
 
 
-def test_of_a_pack_that_it_is_not_to_know_home_assistant_is_told_nothing_but_that() -> None:
+def test_disabled_discovery_removes_the_device() -> None:
     messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(enabled=False, discovery_prefix="ha"))
     due, _ = messages.live_messages(PublishedState(), ONE, 0.0)
     told = [m for m in due if "home_assistant" in m.topic or not m.topic.startswith("bms/")]

@@ -1,4 +1,4 @@
-"""Every published field with its type, as a file remembers it: ``python -m tests.sinks.mqtt.payload_record`` writes it anew."""
+"""Record of all published fields and types. ``python -m tests.sinks.mqtt.payload_record`` rewrites its file."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ RECORD = Path(__file__).with_name("payloads.json")
 
 
 def now() -> dict[str, Any]:
-    """What is published now."""
+    """Return version and fields of the present payloads."""
     schemas = schema()
     version = schemas.pop("payload_version")
     return {"payload_version": version, "fields": dict(sorted(fields(schemas)))}
@@ -23,13 +23,13 @@ def recorded() -> dict[str, Any]:
 
 
 def fields(schemas: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """``("parameters.a.*.value", "null, number")`` and so on."""
+    """Yield path and types of each field, such as ``("parameters.a.*.value", "null, number")``."""
     for topic, described in schemas.items():
         yield from _walk(topic, described, described.get("$defs", {}))
 
 
 def broken(before: dict[str, str], after: dict[str, str]) -> list[str]:
-    """What a reader relied on and will not find."""
+    """Return the removed and changed fields."""
     return [
         f"{name}: was {kind}, is {after.get(name, 'gone')}" for name, kind in before.items() if after.get(name) != kind
     ]

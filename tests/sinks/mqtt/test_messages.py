@@ -1,4 +1,4 @@
-"""What goes to a broker, without a broker."""
+"""Messages for a broker, without a broker."""
 
 import json
 import re
@@ -22,7 +22,7 @@ def topics(messages: list[Message]) -> list[str]:
     return [message.topic.removeprefix("bms/pack/") for message in messages]
 
 
-def test_a_broker_that_got_nothing_gets_everything_that_is_not_kept():
+def test_new_broker_receives_all_live_messages():
     messages, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     assert topics(messages) == [
         "parameters",
@@ -35,7 +35,7 @@ def test_a_broker_that_got_nothing_gets_everything_that_is_not_kept():
     assert sent.snapshot is ONE
 
 
-def test_what_is_retained_has_qos_1_and_what_is_live_is_neither():
+def test_retained_messages_have_qos_1_and_live_ones_qos_0():
     messages, _ = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     live = {"parameters", "home_assistant"}
     for message, topic in zip(messages, topics(messages), strict=True):
@@ -43,14 +43,14 @@ def test_what_is_retained_has_qos_1_and_what_is_live_is_neither():
     assert all((m.qos, m.retain) == (1, True) for m in (*MESSAGES.birth_messages(), *MESSAGES.offline_messages()))
 
 
-def test_a_state_is_kept_until_the_broker_has_it_and_there_is_none_without_samples():
+def test_states_must_be_delivered_and_need_samples():
     [state] = MESSAGES.must_deliver(ONE, ONE)
     assert (state.topic, state.qos, state.retain) == ("bms/pack/state", 1, False)
     assert topics(MESSAGES.must_deliver(ONE, ONE)) == ["state"]
     assert MESSAGES.must_deliver(ONE, NOTHING_YET) == []
 
 
-def test_an_event_is_kept_as_a_state_is_and_comes_before_it():
+def test_events_must_be_delivered_and_precede_the_state():
     event, *_, state = MESSAGES.must_deliver(None, ONE)
     assert (event.topic, event.qos, event.retain) == ("bms/pack/event", 1, False)
     told = json.loads(event.payload)
@@ -59,19 +59,19 @@ def test_an_event_is_kept_as_a_state_is_and_comes_before_it():
     assert state.topic == "bms/pack/state"
 
 
-def test_what_has_not_changed_is_not_said_again():
+def test_unchanged_messages_are_not_repeated():
     _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     messages, _ = MESSAGES.live_messages(sent, ONE, NOW + 1.0)
     assert topics(messages) == []
 
 
-def test_health_is_said_whenever_it_was_made_anew():
+def test_new_health_is_published():
     _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     messages, _ = MESSAGES.live_messages(sent, snapshot(), NOW + 1.0)
     assert topics(messages) == ["parameters", "health"]
 
 
-def test_another_setting_of_the_board_changes_info_and_only_another_board_the_discovery():
+def test_discovery_changes_only_with_the_board():
     _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     faster = ONE.info.model_copy(update={"board": {**ONE.info.board, "sample_rate_hz": "50"}})
     messages, sent = MESSAGES.live_messages(sent, ONE._replace(info=faster), NOW + 1.0)
@@ -81,14 +81,14 @@ def test_another_setting_of_the_board_changes_info_and_only_another_board_the_di
     assert topics(messages) == ["info", DISCOVERY]
 
 
-def test_parameters_come_not_before_the_first_sample():
+def test_parameters_are_published_from_the_first_sample_on():
     messages, sent = MESSAGES.live_messages(PublishedState(), NOTHING_YET, NOW)
     assert not {"parameters", "home_assistant"} & set(topics(messages))
     messages, _ = MESSAGES.live_messages(sent, ONE, NOW + 1.0)
     assert topics(messages)[0] == "parameters"
 
 
-def test_the_availabilities_that_are_right_are_those_last_said():
+def test_correct_availabilities_are_those_published_last():
     _, silent = MESSAGES.live_messages(PublishedState(), snapshot("no board"), NOW)
     right = {m.topic: m.payload for m in MESSAGES.availability(silent)}
     assert right == {"bms/pack/availability": b"online", "bms/pack/sensor/availability": b"offline"}
@@ -112,7 +112,7 @@ def test_every_payload_is_json_without_nan():
             json.loads(message.payload, parse_constant=pytest.fail)
 
 
-def test_no_message_comes_near_the_limit_of_the_broker_s_example():
+def test_messages_are_far_below_the_size_limit_of_the_example():
     limit = re.search(r"^message_size_limit (\d+)$", BROKER.read_text(), re.MULTILINE)
     assert limit
     messages, _ = MESSAGES.live_messages(PublishedState(), ONE, NOW)
@@ -122,7 +122,7 @@ def test_no_message_comes_near_the_limit_of_the_broker_s_example():
     )
 
 
-def test_an_alarm_is_said_when_it_changes_and_all_of_them_to_a_broker_that_got_nothing():
+def test_changed_alarms_are_published_and_all_to_a_new_broker():
     quiet = Alarm(
         name="soc_low",
         severity="warning",
@@ -149,7 +149,7 @@ def test_an_alarm_is_said_when_it_changes_and_all_of_them_to_a_broker_that_got_n
     assert [json.loads(m.payload)["name"] for m in MESSAGES.must_deliver(after, before)[:-1]] == ["alarm_cleared"]
 
 
-def test_what_a_broker_keeps_of_an_alarm_that_is_not_watched_any_more_is_removed():
+def test_retained_message_of_an_unmonitored_alarm_is_removed():
     assert not [m for m in MESSAGES.birth_messages() if "alarm" in m.topic]
     [message] = [
         m

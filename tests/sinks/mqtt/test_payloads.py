@@ -1,4 +1,4 @@
-"""What readers rely on does not change unsaid, and the document made from the models says what is sent."""
+"""Stability of payloads, and agreement of the AsyncAPI document with the sent messages."""
 
 import json
 from typing import Any
@@ -18,7 +18,7 @@ DOCUMENT = document("bms")
 WRITE = "make payloads writes tests/sinks/mqtt/payloads.json anew"
 
 
-def test_no_field_vanishes_or_changes_its_type_in_the_same_version() -> None:
+def test_no_field_is_removed_or_changes_its_type_without_a_new_version() -> None:
     before, after = recorded(), now()
     lost = broken(before["fields"], after["fields"])
     if after["payload_version"] == before["payload_version"]:
@@ -26,13 +26,13 @@ def test_no_field_vanishes_or_changes_its_type_in_the_same_version() -> None:
     assert after["payload_version"] >= before["payload_version"]
 
 
-def test_all_fields_are_remembered() -> None:
+def test_record_contains_all_fields() -> None:
     before, after = recorded(), now()
     assert after["payload_version"] == before["payload_version"], WRITE
     assert sorted(set(after["fields"]) - set(before["fields"])) == [], WRITE
 
 
-def test_a_field_that_is_gone_or_of_another_type_is_found() -> None:
+def test_removed_and_changed_fields_are_detected() -> None:
     fields = now()["fields"]
     assert broken(fields, fields | {"state.new": "number"}) == []
     assert broken(fields, fields | {"state.voltage_v": "string"}) == ["state.voltage_v: was number, is string"]
@@ -43,15 +43,15 @@ def test_a_field_that_is_gone_or_of_another_type_is_found() -> None:
 
 def test_the_version_is_published() -> None:
     messages = MessageBuilder("bms", "pack")
-    said = {
+    message = {
         m.topic.removeprefix("bms/pack/"): m.payload
         for m in (*messages.birth_messages(), *messages.live_messages(PublishedState(), ONE, NOW)[0])
     }
-    assert json.loads(said["info"])["payload_version"] == PAYLOAD_VERSION
-    assert json.loads(said["schema"])["payload_version"] == PAYLOAD_VERSION
+    assert json.loads(message["info"])["payload_version"] == PAYLOAD_VERSION
+    assert json.loads(message["schema"])["payload_version"] == PAYLOAD_VERSION
 
 
-def test_every_message_goes_out_as_the_table_of_topics_says() -> None:
+def test_messages_have_qos_and_retain_of_the_topic_table() -> None:
     messages, told = MessageBuilder("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
     sent = {
         m.topic.removeprefix("bms/pack/"): m
@@ -70,7 +70,7 @@ def references(node: Any) -> list[str]:
     return [found for inner in node for found in references(inner)] if isinstance(node, list) else []
 
 
-def test_all_that_the_document_points_at_is_in_it() -> None:
+def test_references_of_the_document_resolve() -> None:
     for reference in references(DOCUMENT):
         node = DOCUMENT
         for key in reference.removeprefix("#/").split("/"):
@@ -78,7 +78,7 @@ def test_all_that_the_document_points_at_is_in_it() -> None:
     assert {operation["action"] for operation in DOCUMENT["operations"].values()} == {"send", "receive"}
 
 
-def test_the_document_has_every_topic_with_its_own_fields() -> None:
+def test_document_has_all_topics_and_fields() -> None:
     addresses = {channel["address"] for channel in DOCUMENT["channels"].values()}
     for name in ("state", "sensor/availability", "alarm/{alarm}", *(f"request/{name}" for name in COMMANDS)):
         assert f"bms/{{device}}/{name}" in addresses
@@ -89,7 +89,7 @@ def test_the_document_has_every_topic_with_its_own_fields() -> None:
         assert all(f"{{{parameter}}}" in channel["address"] for parameter in channel["parameters"])
 
 
-def test_it_says_what_each_command_takes() -> None:
+def test_document_has_the_arguments_of_each_command() -> None:
     assert set(ARGUMENTS) == set(COMMANDS)
     payloads = {name: DOCUMENT["components"]["messages"][f"request_{name}"]["payload"] for name in COMMANDS}
     assert payloads["set_soc"]["required"] == ["soc"]
@@ -97,7 +97,7 @@ def test_it_says_what_each_command_takes() -> None:
     assert set(payloads["current_zero"]["properties"]) == {"transaction"}
 
 
-def test_the_command_prints_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_the_document(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, "asyncapi", "--base-topic", "site/bms")
     assert code == 0
     assert json.loads(out) == document("site/bms")

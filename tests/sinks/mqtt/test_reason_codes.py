@@ -1,4 +1,4 @@
-"""What a broker means is said in words, in log and health."""
+"""Reason codes of a broker in log and health."""
 
 import asyncio
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ def locked_broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 @pytest.mark.parametrize("supports_5", [True, False])
-async def test_a_wrong_password_is_called_that_and_is_nowhere_itself(
+async def test_wrong_password_is_reported_and_not_shown(
     locked_broker: Broker, tmp_path: Path, supports_5: bool
 ) -> None:
     (tmp_path / "password").write_text("s3cret")
@@ -56,7 +56,7 @@ async def test_a_wrong_password_is_called_that_and_is_nowhere_itself(
 
 
 @pytest.mark.parametrize(
-    ("code", "said"),
+    ("code", "expected"),
     [
         (142, "Session taken over (142): another client has the same name"),
         (139, "Server shutting down (139)"),
@@ -64,7 +64,7 @@ async def test_a_wrong_password_is_called_that_and_is_nowhere_itself(
         (141, "Keep alive timeout (141): it received nothing from this client for too long"),
     ],
 )
-async def test_a_broker_that_says_why_it_ends_a_connection_is_quoted(broker: Broker, code: int, said: str) -> None:
+async def test_reason_of_a_disconnect_is_reported(broker: Broker, code: int, expected: str) -> None:
     with structlog.testing.capture_logs() as logs:
         async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
             await live.wait("bms/pack/schema")
@@ -74,18 +74,18 @@ async def test_a_broker_that_says_why_it_ends_a_connection_is_quoted(broker: Bro
             assert sink.delivery.losses == 1
             network.away = False
             await until(lambda: len(live.all("bms/pack/schema")) == 2)
-    assert logs[1]["reason"] == said
+    assert logs[1]["reason"] == expected
 
 
 @pytest.fixture
 def narrow_broker(tmp_path: Path) -> Iterator[Broker]:
-    """Takes no message above 4 kB and answers one at a time."""
+    """Start a broker with a maximum message size of 4 kB that handles one message at a time."""
     broker = started(tmp_path, "allow_anonymous true\nmax_packet_size 4000\nmax_inflight_messages 1")
     yield broker
     broker.stop()
 
 
-async def test_what_is_longer_than_the_broker_takes_is_named_and_does_not_end_the_connection(
+async def test_message_above_the_size_limit_is_reported_and_not_sent(
     narrow_broker: Broker,
 ) -> None:
     with structlog.testing.capture_logs() as logs:
@@ -114,7 +114,7 @@ RETAINED = {
 
 
 @pytest.mark.parametrize("code", [131, 151])
-async def test_what_is_refused_for_now_comes_later_in_order(broker: Broker, code: int) -> None:
+async def test_temporarily_rejected_states_are_delivered_later_in_order(broker: Broker, code: int) -> None:
     with structlog.testing.capture_logs() as logs:
         async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, **QUICK) as sink:
             for number in range(50):
@@ -123,7 +123,7 @@ async def test_what_is_refused_for_now_comes_later_in_order(broker: Broker, code
             network.reject_code = code
             for number in range(50, 100):
                 sink.mqtt.publish(state(number))
-            await until(lambda: network.rejected.count(STATE) > WINDOW + 2)  # so the oldest alone is tried
+            await until(lambda: network.rejected.count(STATE) > WINDOW + 2)  # now only the oldest is retried
             assert STATE in sink.delivery.refused_topics
             network.reject_code = 0
             await until(lambda: sink.delivery.waiting == 0)
@@ -132,7 +132,7 @@ async def test_what_is_refused_for_now_comes_later_in_order(broker: Broker, code
     assert len([line for line in logs if line.get("topic") == STATE]) == 1
 
 
-async def test_what_is_retained_and_refused_for_now_is_said_again_after_a_pause(broker: Broker) -> None:
+async def test_temporarily_rejected_retained_message_is_sent_again_after_a_delay(broker: Broker) -> None:
     async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
         network.reject_code = 151
         sink.mqtt.publish(ONE)
@@ -147,7 +147,7 @@ async def test_what_is_retained_and_refused_for_now_is_said_again_after_a_pause(
             await live.wait(topic)
 
 
-async def test_what_is_retained_and_refused_for_long_is_not_said_with_each_snapshot(broker: Broker) -> None:
+async def test_rejected_retained_message_is_not_sent_with_each_snapshot(broker: Broker) -> None:
     async with Proxy(broker.port) as network, Sink(network.url, first_delay_s=LONG_S) as sink:
         network.reject_code = 151
         for _ in range(20):
@@ -155,12 +155,12 @@ async def test_what_is_retained_and_refused_for_long_is_not_said_with_each_snaps
             sink.mqtt.publish(snapshot())
             await until(lambda: network.rejected.count("bms/pack/health") > before)  # noqa: B023 - at once
         assert network.rejected.count("bms/pack/info") == network.rejected.count("bms/pack/schema") == 1
-        network.leave()  # or what waits for the pause holds the end up
+        network.leave()  # otherwise messages in backoff would delay the shutdown
         await until(lambda: sink.delivery.losses)
 
 
 @pytest.mark.parametrize("code", [135, 153])
-async def test_what_is_refused_for_good_is_given_up(broker: Broker, code: int) -> None:
+async def test_permanently_rejected_state_is_dropped(broker: Broker, code: int) -> None:
     async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
         await live.wait("bms/pack/schema")
         network.reject_code = code
@@ -172,9 +172,7 @@ async def test_what_is_refused_for_good_is_given_up(broker: Broker, code: int) -
         assert STATE in sink.delivery.refused_topics
 
 
-async def test_nothing_but_our_lines_is_said_of_a_broken_line(
-    broker: Broker, capfd: pytest.CaptureFixture[str]
-) -> None:
+async def test_lost_connection_causes_only_our_log_lines(broker: Broker, capfd: pytest.CaptureFixture[str]) -> None:
     with structlog.testing.capture_logs() as logs:
         async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
             for _ in range(3):

@@ -1,4 +1,4 @@
-"""Requests: bytes in, bytes out; whatever comes in, something sane comes out and nothing ends."""
+"""Requests: responses to valid, invalid and too many requests."""
 
 import json
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ from bms_estimator.sinks.mqtt.requests import (
 
 
 class Asked:
-    """Requests with a clock that the test sets, and handlers that note their calls."""
+    """Dispatcher with a clock set by the test, and handlers that record their calls."""
 
     def __init__(self, *commands: Any) -> None:
         self.delivery, self.now_s, self.granted = DeliveryStats(), 0.0, list[str]()
@@ -63,7 +63,7 @@ class Asked:
         (b'{"transaction": {"a": 1}}', "error", None),
     ],
 )
-async def test_a_request_is_answered(payload: bytes, status: str, transaction: object) -> None:
+async def test_request_gets_a_response(payload: bytes, status: str, transaction: object) -> None:
     asked = Asked("publish_rate")
     response = await asked("publish_rate", payload)
     assert set(response) == {"status", "data", "error", "transaction"}
@@ -73,14 +73,14 @@ async def test_a_request_is_answered(payload: bytes, status: str, transaction: o
     assert asked.delivery.requests == {"granted" if status == "ok" else "refused": 1}
 
 
-async def test_a_fault_of_a_handler_is_answered_and_counted_and_never_raised() -> None:
+async def test_exception_of_a_handler_gives_an_error_response() -> None:
     asked = Asked("publish_rate")
     response = await asked("publish_rate", b'{"fail": true, "transaction": "t"}')
     assert (response["status"], response["transaction"]) == ("error", "t")
     assert asked.delivery.requests == {"failed": 1}
 
 
-async def test_data_that_is_no_json_is_a_fault_of_the_handler() -> None:
+async def test_data_that_is_not_json_gives_an_error_response() -> None:
     asked = Asked("publish_rate")
 
     async def broken(_: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -91,7 +91,7 @@ async def test_data_that_is_no_json_is_a_fault_of_the_handler() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "reboot", "State", "state/", "é", "x" * 65_000])
-async def test_a_name_that_does_not_exist_gets_no_response_and_is_counted(name: str) -> None:
+async def test_unknown_name_is_counted_and_gets_no_response(name: str) -> None:
     asked = Asked()
     with structlog.testing.capture_logs() as logs:
         assert await asked(name) is None
@@ -99,14 +99,14 @@ async def test_a_name_that_does_not_exist_gets_no_response_and_is_counted(name: 
     assert len(str(logs)) < 300
 
 
-async def test_a_payload_of_more_than_4_kb_is_refused_unread() -> None:
+async def test_payload_above_4_kb_is_rejected() -> None:
     asked = Asked("publish_rate")
     padded = b'{"x": 1}' + b" " * MAX_PAYLOAD_BYTES
     assert (await asked("publish_rate", padded[:MAX_PAYLOAD_BYTES]))["status"] == "ok"
     assert "4096 bytes" in (await asked("publish_rate", padded))["error"]
 
 
-async def test_commands_are_off_unless_the_owner_named_them() -> None:
+async def test_commands_need_a_permission() -> None:
     for name in ("set_soc", "current_zero"):
         asked = Asked()
         assert "mqtt.commands" in (await asked(name))["error"]
@@ -131,7 +131,7 @@ async def test_commands_are_few_a_minute_and_do_not_wait_for_former_requests() -
     assert asked.delivery.requests["too_many"] == 3000 - len(asked.granted) - REQUESTS_PER_MIN
 
 
-async def test_a_burst_is_one_line_in_the_log_and_the_next_burst_another() -> None:
+async def test_each_burst_is_logged_once() -> None:
     asked = Asked("set_soc")
     with structlog.testing.capture_logs() as logs:
         for _ in range(10_000):
@@ -144,7 +144,7 @@ async def test_a_burst_is_one_line_in_the_log_and_the_next_burst_another() -> No
 
 
 @given(name=st.sampled_from(COMMANDS + FORMER_READS) | st.text(), payload=st.binary() | st.text().map(str.encode))
-async def test_whatever_is_asked_nothing_is_raised(name: str, payload: bytes) -> None:
+async def test_no_request_raises(name: str, payload: bytes) -> None:
     asked = Asked("set_soc", "current_zero")
     await asked(name, payload)
     assert sum(asked.delivery.requests.values()) == 1

@@ -47,7 +47,7 @@ async def never(_: Connection) -> None:
 
 @pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])
 async def url(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[str]:
-    """The broker's, directly or as one that does not know MQTT 5."""
+    """URL of the broker, directly or through a proxy without MQTT 5."""
     async with Proxy(broker.port, supports_5=request.param == "MQTT 5") as proxy:
         yield proxy.url
 
@@ -69,7 +69,7 @@ async def test_topics_and_retained_flags_are_as_documented(broker: Broker, url: 
     assert sink.delivery == DeliveryStats()
 
 
-async def test_retained_messages_are_sent_again_when_home_assistant_is_born(broker: Broker) -> None:
+async def test_retained_messages_are_sent_again_after_a_birth_message(broker: Broker) -> None:
     async with Listener(broker) as live, Sink(broker.url) as sink:
         sink.mqtt.publish(ONE)
         await live.wait(DISCOVERY)
@@ -83,7 +83,7 @@ async def test_retained_messages_are_sent_again_when_home_assistant_is_born(brok
         await live.wait("bms/pack/home_assistant", skip=before)
 
 
-async def test_a_broker_that_comes_late_goes_and_comes_back_is_served_and_drops_are_counted(tmp_path: Path) -> None:
+async def test_restarted_broker_is_served_and_drops_are_counted(tmp_path: Path) -> None:
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     broker = Broker(tmp_path)
@@ -91,7 +91,7 @@ async def test_a_broker_that_comes_late_goes_and_comes_back_is_served_and_drops_
         for _ in range(5):
             sink.mqtt.publish(ONE)
         assert (sink.delivery.drops, sink.delivery.waiting) == (AT_START + 5 - MAX_KEPT, MAX_KEPT)
-        for _ in range(2):  # persistence is off: each start has forgotten everything
+        for _ in range(2):  # without persistence, each restarted broker is empty
             broker.start()
             try:
                 async with Listener(broker) as live:
@@ -112,18 +112,18 @@ async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_
     assert sink.delivery.drops == AT_START + 1000 - MAX_KEPT
 
 
-async def test_a_connection_that_comes_after_it_was_given_up_leaves_nothing_to_the_loop(broker: Broker) -> None:
-    """The thread that connects goes on when its task is cancelled, and a loop may be about to close."""
+async def test_abandoned_connection_leaves_no_callbacks(broker: Broker) -> None:
+    """The connecting thread continues after its task is cancelled, and the event loop may be closing."""
     client = Client({"hostname": "127.0.0.1", "port": broker.port}, ProtocolVersion.V5, OPTIONS, DEFAULT_TIMEOUTS)
     before = asyncio.all_tasks()
     client.abandon()
     await asyncio.to_thread(client._client_connect)
-    await asyncio.sleep(0)  # what the thread left to the loop runs
+    await asyncio.sleep(0)  # runs the callbacks of the thread
     assert client._client.socket() is None
     assert asyncio.all_tasks() == before
 
 
-async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path: Path) -> None:
+async def test_lost_broker_is_retried_at_least_every_30_s(tmp_path: Path) -> None:
     pauses: list[float] = []
 
     class Impatient(ReconnectLoop):
@@ -139,13 +139,13 @@ async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path:
     assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"
 
 
-async def test_after_a_half_open_connection_the_availability_is_online(broker: Broker) -> None:
+async def test_availability_is_online_after_a_half_open_connection(broker: Broker) -> None:
     async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
         sink.mqtt.publish(ONE)
         await live.wait(DISCOVERY)
         network.cut()
         async with asyncio.timeout(LONG_S):
-            await network.half_open_ended.wait()  # else not before one and a half keep-alives
+            await network.half_open_ended.wait()  # it would otherwise end after 1.5 keepalive intervals
         before = len(live.messages)
         sink.mqtt.publish(ONE)
         await live.wait("bms/pack/state", skip=before)
@@ -157,9 +157,7 @@ async def test_after_a_half_open_connection_the_availability_is_online(broker: B
 
 @pytest.mark.parametrize("forged", [b"offline", b"", b"nonsense"])
 @pytest.mark.parametrize("topic", ["bms/pack/availability", "bms/pack/sensor/availability"])
-async def test_an_availability_that_somebody_else_wrote_is_put_right(
-    broker: Broker, url: str, topic: str, forged: bytes
-) -> None:
+async def test_availability_of_another_client_is_corrected(broker: Broker, url: str, topic: str, forged: bytes) -> None:
     async with Listener(broker) as live, Sink(url) as sink:
         sink.mqtt.publish(ONE)
         await live.wait(DISCOVERY)
@@ -170,7 +168,7 @@ async def test_an_availability_that_somebody_else_wrote_is_put_right(
     assert sink.delivery.corrections == 1
 
 
-async def test_a_broker_that_ends_and_publishes_our_will_is_not_somebody_else(broker: Broker) -> None:
+async def test_will_at_broker_shutdown_is_not_counted_as_a_correction(broker: Broker) -> None:
     with structlog.testing.capture_logs() as logs:
 
         def connections() -> int:
@@ -188,7 +186,7 @@ async def test_a_broker_that_ends_and_publishes_our_will_is_not_somebody_else(br
     assert not [line for line in logs if "somebody else" in line["event"]]
 
 
-async def test_somebody_who_keeps_writing_an_availability_is_not_answered_each_time(broker: Broker) -> None:
+async def test_corrections_of_an_availability_are_rate_limited(broker: Broker) -> None:
     loop = asyncio.get_running_loop()
     async with Listener(broker) as live, Sink(broker.url) as sink:
         sink.mqtt.publish(ONE)
@@ -204,7 +202,7 @@ async def test_somebody_who_keeps_writing_an_availability_is_not_answered_each_t
     assert 1 <= sink.delivery.corrections <= 1 + (loop.time() - began_s) / CORRECTION_S
 
 
-async def test_a_request_comes_back_as_a_response(broker: Broker, url: str) -> None:
+async def test_request_gets_a_response(broker: Broker, url: str) -> None:
     async with Listener(broker) as live, Sink(url) as sink:
         sink.mqtt.publish(ONE)
         await live.wait("bms/pack/availability")
@@ -221,7 +219,7 @@ async def test_a_former_request_is_answered_with_the_topic_to_subscribe_to(broke
     assert response["error"] == "no such request: subscribe to bms/pack/state"
 
 
-async def test_a_retained_request_that_waited_is_not_granted(broker: Broker, url: str) -> None:
+async def test_retained_request_is_not_granted_on_connection(broker: Broker, url: str) -> None:
     async with Listener(broker) as live:
         await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
         async with Sink(url) as sink:
@@ -232,7 +230,7 @@ async def test_a_retained_request_that_waited_is_not_granted(broker: Broker, url
     assert sink.delivery.requests == {"retained": 1, "granted": 1}
 
 
-async def test_a_retained_request_is_not_granted_while_connected_either(broker: Broker) -> None:
+async def test_retained_request_is_not_granted_while_connected(broker: Broker) -> None:
     async with Listener(broker) as live, Sink(broker.url) as sink:
         await live.wait("bms/pack/availability")
         await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
@@ -243,7 +241,7 @@ async def test_a_retained_request_is_not_granted_while_connected_either(broker: 
 
 
 @pytest.mark.parametrize("name_bytes", [50_000, 65_535 - len("bms/pack/request/")])
-async def test_no_topic_of_a_request_ends_the_service(broker: Broker, url: str, name_bytes: int) -> None:
+async def test_no_request_topic_ends_the_service(broker: Broker, url: str, name_bytes: int) -> None:
     async with Listener(broker, "bms/pack/response/#") as live, Sink(url) as sink:
         async with Listener(broker, "bms/pack/availability") as started:
             await started.wait("bms/pack/availability")
@@ -255,7 +253,7 @@ async def test_no_topic_of_a_request_ends_the_service(broker: Broker, url: str, 
     assert sink.delivery.requests["granted"] == sink.delivery.requests["unknown"] == 1
 
 
-async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None:
+async def test_flood_of_requests_is_counted_and_survived(broker: Broker, url: str) -> None:
     gate = asyncio.Event()
 
     async def slow(_: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -276,12 +274,12 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
             gate.set()
             await live.wait("bms/pack/response/current_zero")
         assert len(logs) < 10
-        while not live.all("bms/pack/response/publish_rate"):  # the first may still find no room
+        while not live.all("bms/pack/response/publish_rate"):  # the first requests may still be dropped
             await live.publish("bms/pack/request/publish_rate", qos=1)
             await asyncio.sleep(0.1)
 
 
-def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
+def test_receive_queue_is_bounded_in_bytes() -> None:
     delivery = DeliveryStats()
     inbox = ReceiveQueue(RequestDispatcher(delivery).count_refusal, MAX_BYTES, MAX_WAITING)
     for length in (MAX_BYTES - 1, 200_000_000) * (2 * MAX_WAITING):
@@ -292,7 +290,7 @@ def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
     assert delivery.requests == {"too_long": 2 * MAX_WAITING, "overflow": MAX_WAITING}
 
 
-async def test_a_fault_of_ours_is_offline_for_the_broker_and_raised(broker: Broker) -> None:
+async def test_internal_error_publishes_offline_and_is_raised(broker: Broker) -> None:
     async with Listener(broker) as live:
         sink = await Sink(broker.url).__aenter__()
         await live.wait("bms/pack/availability")
@@ -303,7 +301,7 @@ async def test_a_fault_of_ours_is_offline_for_the_broker_and_raised(broker: Brok
     assert fault.value.split(AttributeError)[1] is None
 
 
-async def test_the_demo_s_broker_which_knows_no_mqtt_5_is_served() -> None:
+async def test_broker_of_the_demo_without_mqtt_5_is_served() -> None:
     async with DemoBroker() as broker, aiomqtt.Client("127.0.0.1", broker.port) as client, Sink(broker.url) as sink:
         await client.subscribe([("bms/pack/state", 0), ("bms/pack/response/publish_rate", 1)])
         sink.mqtt.publish(ONE)
@@ -315,7 +313,7 @@ async def test_the_demo_s_broker_which_knows_no_mqtt_5_is_served() -> None:
 
 @pytest.fixture
 def mute_broker(tmp_path: Path) -> Iterator[Broker]:
-    """Its access list gives the estimator no right at all, which Mosquitto says to who writes by MQTT 5 only."""
+    """Start a broker that denies everything; Mosquitto reports that only for publications by MQTT 5."""
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     (tmp_path / "acl").write_text("topic read nothing\n")
@@ -324,7 +322,7 @@ def mute_broker(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-async def test_a_broker_that_denies_everything_without_a_word_is_found_out(mute_broker: Broker) -> None:
+async def test_silently_denying_broker_is_detected(mute_broker: Broker) -> None:
     with structlog.testing.capture_logs() as logs:
         async with Proxy(mute_broker.port, supports_5=False) as proxy, Sink(proxy.url, echo_s=0.5) as sink:
             await until(lambda: sink.delivery.refused_topics)
@@ -332,7 +330,7 @@ async def test_a_broker_that_denies_everything_without_a_word_is_found_out(mute_
     assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/availability"]
 
 
-async def test_each_retained_topic_that_must_not_be_written_is_named_once_where_the_broker_says_so(
+async def test_denied_retained_topics_are_logged_once(
     mute_broker: Broker,
 ) -> None:
     with structlog.testing.capture_logs() as logs:
@@ -345,7 +343,7 @@ async def test_each_retained_topic_that_must_not_be_written_is_named_once_where_
     assert sink.delivery.refused_topics == named
 
 
-async def test_a_broker_that_gives_back_late_is_not_called_one_that_refuses_for_good(broker: Broker) -> None:
+async def test_late_echo_removes_the_denial(broker: Broker) -> None:
     with structlog.testing.capture_logs() as logs:
         async with Sink(broker.url, echo_s=0.0) as sink, Listener(broker) as live:
             await live.wait("bms/pack/availability")
@@ -355,7 +353,7 @@ async def test_a_broker_that_gives_back_late_is_not_called_one_that_refuses_for_
 
 @pytest.fixture
 def refusing_broker(tmp_path: Path) -> Iterator[Broker]:
-    """Says that requests must not be read."""
+    """Start a broker that rejects the subscription of requests."""
     if MOSQUITTO is None or DYNAMIC_SECURITY is None:
         pytest.skip("mosquitto with its dynamic security is not installed (apt-get install mosquitto)")
     acls = [
@@ -379,9 +377,7 @@ def refusing_broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 @pytest.mark.parametrize("supports_5", [True, False])
-async def test_a_topic_that_the_broker_refuses_is_named_in_log_and_health(
-    refusing_broker: Broker, supports_5: bool
-) -> None:
+async def test_denied_topic_is_reported_in_log_and_health(refusing_broker: Broker, supports_5: bool) -> None:
     async with Proxy(refusing_broker.port, supports_5=supports_5) as proxy, Listener(refusing_broker) as live:
         with structlog.testing.capture_logs() as logs:
             async with Sink(proxy.url) as sink:
@@ -394,7 +390,7 @@ async def test_a_topic_that_the_broker_refuses_is_named_in_log_and_health(
 
 @pytest.fixture
 def secure_broker(tmp_path: Path) -> Iterator[Broker]:
-    """Wants a name, a password and TLS; certificate and password stand in its folder."""
+    """Start a broker that requires user name, password and TLS; its folder has the certificate and the password."""
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     key, certificate, passwords = (tmp_path / name for name in ("key.pem", "cert.pem", "passwords"))
@@ -442,6 +438,6 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
         ({"url": "mqtts://host", "ca_file": Path("/nonexistent/ca.pem")}, "mqtt.ca_file = /nonexistent/ca.pem"),
     ],
 )
-def test_settings_that_cannot_reach_a_broker_are_named(changes: dict[str, Any], named: str) -> None:
+def test_error_names_the_unusable_setting(changes: dict[str, Any], named: str) -> None:
     with pytest.raises(UserError, match=named):
         check(MqttSettings(**changes))
