@@ -1,9 +1,10 @@
 """Fixtures that every test may use."""
 
+import os
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.full_disk import disk_without_files, full_disk
@@ -13,9 +14,12 @@ from tests.simavr_board import firmware
 
 __all__ = ["broker", "disk_without_files", "firmware", "full_disk", "line"]
 
-# compilation and shared machines make times meaningless
-settings.register_profile("project", deadline=None)
-settings.load_profile("project")
+# no deadline: compilation and shared machines make times meaningless
+settings.register_profile("short", deadline=None, derandomize=True, database=None)
+settings.register_profile(
+    "long", deadline=None, max_examples=int(os.environ.get("INPUTS", "20000")), suppress_health_check=list(HealthCheck)
+)
+settings.load_profile("short")
 
 DATA = Path(__file__).parent / "data"
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
