@@ -9,6 +9,7 @@ BLE     := .venv-ble
 AUDIT   := .venv-audit
 NODE    := .node
 ARGS    ?=
+INPUTS  ?= 20000
 HOME_ASSISTANT ?= 2025.2.5
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
@@ -102,8 +103,8 @@ fuelcell: venv ## figures of the fuel cell, docs/theory/fuel-cell.md: half a min
 learning: venv ## what the learning law and each of its parts are worth, simulated
 	@$(BIN)/python -m tests.benchmarks.learning_law
 
-fuzz: venv ## mutated inputs to all that reads foreign bytes, e.g. make fuzz ARGS="--decoders 100000 --parsers 10000 --only text"
-	@$(BIN)/python -m tests.benchmarks.fuzz $(ARGS)
+fuzz: venv ## edited inputs to all readers of foreign bytes, e.g. make fuzz INPUTS=1000 ARGS="-k jbd": half an hour
+	INPUTS=$(INPUTS) $(BIN)/python -m pytest --numprocesses=2 --hypothesis-profile=long --timeout=7200 --show-capture=no tests/fuzz $(ARGS)
 
 load: venv ## 5,000 frames/s for 10 min over a PTY, a day of serial bytes, attacks on listeners, alarms and a fleet, e.g. make load ARGS="--minutes 1 --hours 2"
 	@$(BIN)/python -m tests.benchmarks.endurance $(ARGS)

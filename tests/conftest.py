@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.full_disk import disk_without_files, full_disk
@@ -15,9 +15,12 @@ from tests.simavr_board import firmware
 
 __all__ = ["broker", "disk_without_files", "firmware", "full_disk", "line"]
 
-# compilation and shared machines make times meaningless
-settings.register_profile("project", deadline=None)
-settings.load_profile("project")
+# no deadline: compilation and shared machines make times meaningless
+settings.register_profile("short", deadline=None, derandomize=True, database=None)
+settings.register_profile(
+    "long", deadline=None, max_examples=int(os.environ.get("INPUTS", "20000")), suppress_health_check=list(HealthCheck)
+)
+settings.load_profile("short")
 
 # OpenBLAS threads wait for each other in busy loops. With several workers that takes three times the CPU time of one
 # thread. Workers and the programs that tests start inherit the environment.

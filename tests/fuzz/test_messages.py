@@ -1,0 +1,61 @@
+"""Foreign messages and names with edited content: requests, published states, USB descriptions."""
+
+import asyncio
+import contextlib
+import io
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from bms_estimator.sinks.terminal.panels import Screen
+from bms_estimator.sinks.terminal.scene import ScreenState
+from rich.console import Console
+from serial.tools.list_ports_common import ListPortInfo
+
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.topic_cache import TopicCache
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
+from bms_estimator.sinks.terminal import text_line
+from bms_estimator.sources.serial.port_list import NoPortError, may_be_board, resolve_port
+from tests.fuzz.edited_seeds import edited_seeds
+
+JSON = (b"null", b'"version"', b": [", b'{"a":', b"\\ud800", b'"soc"', b'"transaction"')
+TOPICS = ("state", "health", "info", "parameters", "availability", "alarm/soc_low")
+CONSOLE = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, color_system=None)
+
+
+@edited_seeds("requests", *JSON)
+def test_requests(data: bytes) -> None:
+    stats = DeliveryStats()
+    requests = RequestDispatcher(stats, ("set_soc",))
+
+    async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        return {"soc": number(arguments, "soc", 0.0, 1.0)}
+
+    requests.register("set_soc", set_soc)
+    json.loads(asyncio.run(requests.handle("set_soc", data)) or "null")
+    assert stats.requests.total() == 1
+    assert not stats.requests["failed"]
+
+
+@edited_seeds("published", *JSON, b"\\u001b[2J", b'"active":true', b'"text":"', b'"cells_v":[')
+def test_published_messages_show_only_printable_text(data: bytes) -> None:
+    cache = TopicCache("bms")
+    for topic in TOPICS:
+        message = cache.take(f"bms/pack/{topic}", data, 0.0)
+        line = text_line.line(message) if message else None
+        assert line is None or line.isprintable()
+    if data:
+        screen = Screen(ScreenState("pack", cache.devices["pack"].topics, 0.0, 0.0))
+        text = "".join(segment.text for segment in CONSOLE.render(screen))
+        assert text.replace("\n", "").isprintable()
+
+
+@edited_seeds("ports", b"zigbee", b"auto", b"/dev/", b"../")
+def test_ports(data: bytes) -> None:
+    text = data.decode("utf-8", "surrogateescape")
+    port = ListPortInfo("ttyUSB0")
+    port.vid, port.pid, port.manufacturer, port.product, port.description = 0x1A86, 0x7523, text, text, text
+    may_be_board(port)
+    with contextlib.suppress(NoPortError):
+        resolve_port(text)

@@ -1,0 +1,134 @@
+"""Device protocols with edited bytes: no exception, and no more bytes counted than received."""
+
+import contextlib
+
+from hypothesis import strategies as st
+
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.devices import daly, jbd, jk
+from bms_estimator.protocols.devices.junctek import JunctekProtocol
+from bms_estimator.protocols.devices.pylontech import PylontechProtocol
+from bms_estimator.protocols.devices.text import TextProtocol
+from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
+from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
+from bms_estimator.protocols.firmware.protocol import BoardProtocol
+from bms_estimator.protocols.registry import make_protocol
+from bms_estimator.settings.sensor import SensorSettings
+from tests.fuzz.edited_seeds import edited, edited_seeds, seeds
+
+PACKETS = [unseal(frame) for data in seeds("frames") for frame in data.split(DELIMITER) if frame]
+EDITED_PACKETS = edited(PACKETS, (b"\x01\x01", b"\x01\x02"))
+FRAMES = st.lists((st.sampled_from(PACKETS) | EDITED_PACKETS).map(seal), min_size=1, max_size=6).map(b"".join)
+
+
+def decode(protocol: DeviceProtocol, data: bytes) -> None:
+    """Feed ``data`` in two chunks, and in one after the port was reopened."""
+    middle = len(data) // 2
+    protocol.feed(1.0, data[:middle])
+    protocol.next_output(1.5)
+    protocol.feed(2.0, data[middle:])
+    protocol.on_port_opened()
+    protocol.serial_number_in(data)
+    protocol.next_output(2.5)
+    protocol.feed(3.0, data)
+    protocol.next_output(3.5)
+    assert protocol.counters["bytes_received"] <= 2 * len(data)
+    _ = protocol.fault, protocol.description, protocol.board, protocol.clock_ppm, protocol.allowed_silence_s
+
+
+def decode_polled(name: str, data: bytes) -> None:
+    """Decode ``data`` as responses of a BMS."""
+    protocol = make_protocol(SensorSettings.model_validate({"protocol": name}))
+    decode(protocol, data)
+    assert protocol.counters["noise_bytes"] <= protocol.counters["bytes_received"] == 2 * len(data)
+
+
+def with_vedirect_checksums(data: bytes) -> bytes:
+    """Correct the checksum of each block."""
+    first, *others = data.split(b"\r\nChecksum\t")
+    blocks = [block + b"\r\nChecksum\t" for block in (first, *(other[1:] for other in others))]
+    return b"".join(block + bytes((-sum(block) & 0xFF,)) for block in blocks)
+
+
+def with_junctek_checksums(data: bytes) -> bytes:
+    """Correct the checksum of each line."""
+    lines = []
+    for line in data.split(b"\n"):
+        head, *values = line.strip().split(b",")
+        numbers = [int(value) for value in values[1:] if value.isdigit() and len(value) < 20]
+        lines.append(b",".join([head, b"%d" % (sum(numbers) % 255 + 1), *values[1:]]))
+    return b"\n".join(lines)
+
+
+def with_jbd_checksums(data: bytes) -> bytes:
+    """Correct the checksum of each frame, whose length is its fourth byte."""
+    begin = data.find(b"\xdd")
+    while 0 <= begin < len(data) - 4:
+        end = begin + 4 + data[begin + 3]
+        data = data[:end] + jbd.checksum(data[begin + 2 : end]) + b"\x77" + data[end + 3 :]
+        begin = data.find(b"\xdd", end)
+    return data
+
+
+def with_daly_checksums(data: bytes) -> bytes:
+    """Correct the checksum of each frame of 13 bytes."""
+    first, *frames = data.split(b"\xa5")
+    return first + b"".join(daly.sealed(b"\xa5" + frame[:11].ljust(11, b"\0")) + frame[12:] for frame in frames)
+
+
+def with_jk_checksum(data: bytes) -> bytes:
+    """Correct the first frame of 300 bytes, else the first frame with a length."""
+    begin = data.find(jk.START)
+    if begin >= 0:
+        frame = data[begin : begin + 299].ljust(299, b"\0")
+        return data[:begin] + frame + bytes((sum(frame) & 0xFF,)) + data[begin + 300 :]
+    before, start, body = data.partition(jk.OLD_START)
+    body = body[2:482]
+    return before + jk.old_sealed(start + (len(body) + 7).to_bytes(2, "big") + body + bytes((jk.OLD_END,)))
+
+
+@edited_seeds("frames", DELIMITER, b"\x01\x01", b"\x01\x02", b"\xff\xff\xff\xff", others=FRAMES)
+def test_frames(data: bytes) -> None:
+    decode(BoardProtocol(rate_hz=100), data)
+
+
+@edited_seeds("messages", DELIMITER, b"\x01\x02", others=EDITED_PACKETS.map(seal))
+def test_messages(data: bytes) -> None:
+    for decode_message in (Hello.decode, Ack.decode, SampleMessage.decode):
+        with contextlib.suppress(ProtocolError):
+            decode_message(unseal(data))
+
+
+@edited_seeds("text", b"V=", b"I=", b"T=", b"cells=", b'{"voltage":', b";", b" mA", b"kV")
+def test_text(data: bytes) -> None:
+    decode(TextProtocol(), data)
+
+
+@edited_seeds("vedirect", b"\r\nV\t", b"\r\nI\t", b"\r\nChecksum\t", b":7F0", repair=with_vedirect_checksums)
+def test_vedirect(data: bytes) -> None:
+    decode(VeDirectProtocol(), data)
+
+
+@edited_seeds("junctek", b":r50=1,", b",", b":R50=1,2,1,\r\n", repair=with_junctek_checksums)
+def test_junctek(data: bytes) -> None:
+    decode(JunctekProtocol(), data)
+
+
+@edited_seeds("pylontech", b"pylon>", b"Power Volt", b"Absent", b"bat 2", b" - ")
+def test_pylontech(data: bytes) -> None:
+    decode(PylontechProtocol(), data)
+
+
+@edited_seeds("jbd", b"\xdd\x03\0", b"\xdd\x04\0", b"\x77", repair=with_jbd_checksums)
+def test_jbd(data: bytes) -> None:
+    decode_polled("jbd", data)
+
+
+@edited_seeds("daly", b"\xa5\x01\x90\x08", b"\xa5\x01\x95\x08", repair=with_daly_checksums)
+def test_daly(data: bytes) -> None:
+    decode_polled("daly", data)
+
+
+@edited_seeds("jk", jk.OLD_START, jk.START, jk.START + b"\x02", b"\xc0\x01", b"\x79", repair=with_jk_checksum)
+def test_jk(data: bytes) -> None:
+    decode_polled("jk", data)
