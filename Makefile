@@ -1,4 +1,4 @@
-# Without a target: what there is to do.
+# Default target: the list of targets.
 
 VENV    := .venv
 BIN     := $(VENV)/bin
@@ -13,7 +13,7 @@ INPUTS  ?= 20000
 HOME_ASSISTANT ?= 2025.2.5
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
-# What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
+# Programs that the tests run: compiler and simulator of the board, a broker, systemd's checks.
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
@@ -28,7 +28,7 @@ $(READY): requirements.lock pyproject.toml
 	@.ci/venv "$(PYTHON)" "$(VENV)"
 	@touch $@
 
-apt: ## the Debian packages of the tests: installs what is missing when allowed, else names it
+apt: ## the Debian packages of the tests: installs missing ones if permitted, otherwise names them
 	@.ci/apt $(APT)
 
 check: venv ## style, import order of the layers, and types, in seconds
@@ -37,10 +37,10 @@ check: venv ## style, import order of the layers, and types, in seconds
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/mypy
 
-test: prepared ## style, types, firmware, and the tests of every promise
+test: prepared ## style, types, firmware, and all tests except the redundant and longer ones
 	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile --no-loadscope-reorder -m "not thorough" $(ARGS)
 
-test-all: prepared ## also the tests that repeat a promise in another way or for longer
+test-all: prepared ## also the redundant and longer tests
 	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 prepared: apt venv
@@ -52,23 +52,23 @@ demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--
 demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of which one is killed, the page: a minute
 	@$(BIN)/bms-estimator fleet demo $(ARGS)
 
-fleet: venv ## what a fleet costs, in processes on this machine, e.g. make fleet ARGS="--packs 10000 --minutes 5"
+fleet: venv ## cost of a fleet, in processes on this machine, e.g. make fleet ARGS="--packs 10000 --minutes 5"
 	@$(BIN)/python -m tests.benchmarks.fleet $(ARGS)
 
 fleet-kills: venv ## workers and servers of a fleet killed 100 times, one node and three, states compared bit by bit: 15 minutes
 	@$(BIN)/python -m tests.benchmarks.fleet_kills $(ARGS)
 
-nats: venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
+nats: venv ## a node of a NATS cluster killed while messages arrive, in each of its roles: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/mqtt/test_nats_server.py $(ARGS)
 
 real-home-assistant:
 	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)" || echo "no real Home Assistant here: its tests are skipped"
 
-home-assistant: apt venv ## tests with the real Home Assistant, which is made first, once: two minutes
+home-assistant: apt venv ## tests with the real Home Assistant, installed at the first run: two minutes
 	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)"
 	HOME_ASSISTANT=$(HOME_ASSISTANT) $(BIN)/python -m pytest -n0 tests/home_assistant $(ARGS)
 
-ble: ## a BMS over Bluetooth, against a simulated BlueZ; its extra needs another Python: make ble PYTHON=python3.12
+ble: ## a BMS over Bluetooth with a simulated BlueZ; the extra needs Python 3.12: make ble PYTHON=python3.12
 	@[ -x $(BLE)/bin/python ] || $(PYTHON) -m venv $(BLE)
 	@$(BLE)/bin/pip install --quiet --disable-pip-version-check -e '.[ble]' pytest pytest-asyncio pytest-timeout
 	$(BLE)/bin/python -m pytest -o addopts= --noconftest -rs tests/sources/bluetooth/test_source.py tests/sources/bluetooth/test_client.py $(ARGS)
@@ -76,31 +76,31 @@ ble: ## a BMS over Bluetooth, against a simulated BlueZ; its extra needs another
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)
 
-compare: ## methods side by side on all real captures, PyBOP among them, e.g. make compare ARGS="NCR Leaf": minutes
+compare: ## comparison of methods, including PyBOP, on all real captures, e.g. make compare ARGS="NCR Leaf": minutes
 	@[ -x $(COMPARE)/bin/python ] || $(PYTHON) -m venv $(COMPARE)
 	@$(COMPARE)/bin/pip install --quiet --disable-pip-version-check -e . pybop==26.3
 	@$(COMPARE)/bin/python -m tests.benchmarks.side_by_side $(ARGS)
 	@[ -n "$(findstring --json,$(ARGS))" ] || $(COMPARE)/bin/python -m tests.benchmarks.anywhere $(ARGS)
 
-anywhere: venv ## the SOC when switched on anywhere, on real captures, e.g. make anywhere ARGS=PF: minutes
+anywhere: venv ## SOC error from any starting point of real captures, e.g. make anywhere ARGS=PF: minutes
 	@$(BIN)/python -m tests.benchmarks.anywhere $(ARGS)
 
 chapter5: venv ## the experiments of the thesis's chapter 5 on real captures, beside Tables 11 and 13
 	@$(BIN)/python -m tests.benchmarks.chapter5
 
-resolution: venv ## the SOC by rate, steps and delay of a source, simulated, e.g. make resolution ARGS=house: two minutes
+resolution: venv ## SOC error by rate, steps and delay of a source, simulated, e.g. make resolution ARGS=house: two minutes
 	@$(BIN)/python -m tests.benchmarks.resolution $(ARGS)
 
-unseen: venv ## the SOC through kills, restarts and gaps, on real captures: minutes
+unseen: venv ## SOC error through kills, restarts and gaps, on real captures: minutes
 	@$(BIN)/python -m tests.benchmarks.unseen $(ARGS)
 
-ablation: venv ## what each part of the filter is worth, on real captures, e.g. make ablation ARGS=LFP: minutes
+ablation: venv ## ablation of the filter on real captures, e.g. make ablation ARGS=LFP: minutes
 	@$(BIN)/python -m tests.benchmarks.ablation $(ARGS)
 
 fuelcell: venv ## figures of the fuel cell, docs/theory/fuel-cell.md: half a minute
 	@$(BIN)/python -m tests.benchmarks.fuel_cell
 
-learning: venv ## what the learning law and each of its parts are worth, simulated
+learning: venv ## ablation of the learning law, simulated
 	@$(BIN)/python -m tests.benchmarks.learning_law
 
 fuzz: venv ## edited inputs to all readers of foreign bytes, e.g. make fuzz INPUTS=1000 ARGS="-k jbd": half an hour
@@ -114,10 +114,10 @@ audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 
 	@$(AUDIT)/bin/pip install --quiet --disable-pip-version-check pip-audit==2.10.1
 	@$(AUDIT)/bin/python .ci/audit.py
 
-page: apt venv ## what the live page costs a real Chromium at 10 Hz, e.g. make page ARGS=60: minutes
+page: apt venv ## cost of the live page in a real Chromium at 10 Hz, e.g. make page ARGS=60: minutes
 	@$(BIN)/python -m tests.benchmarks.page $(ARGS)
 
-fleet-page: venv ## what the page of a fleet of 100,000 packs costs its process, e.g. make fleet-page ARGS="--packs 10000": four minutes
+fleet-page: venv ## cost of the page of a fleet of 100,000 packs, e.g. make fleet-page ARGS="--packs 10000": four minutes
 	@$(BIN)/python -m tests.benchmarks.fleet_page $(ARGS)
 
 screenshots: apt venv ## the pictures of the live page and of the page of a fleet in docs
@@ -127,11 +127,11 @@ screenshots: apt venv ## the pictures of the live page and of the page of a flee
 simulate: venv ## the whole service simulated: make simulate SEED=5, or many, e.g. make simulate ARGS="--seeds 1000": minutes
 	@$(BIN)/python -m tests.world $(if $(SEED),--seed $(SEED)) $(ARGS)
 
-firmware: ## the board's firmware and its simulator, where the compilers are installed
+firmware: ## the board's firmware and its simulator, if the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
 	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
 
-integrations: apt venv ## what the real Node-RED, AsyncAPI's parser, InfluxDB and promtool make of us; installs the first two in .node
+integrations: apt venv ## tests with the real Node-RED, AsyncAPI parser, InfluxDB and promtool; installs the first two in .node
 	@[ -d $(NODE)/node_modules/node-red ] || npm install --prefix $(NODE) --no-audit --no-fund --ignore-scripts node-red@4.1.15 @asyncapi/parser@3.6.3
 	$(BIN)/python -m pytest tests/deploy/test_node_red.py tests/deploy/test_asyncapi.py tests/deploy/test_grafana.py \
 		tests/deploy/test_telegraf.py tests/sinks/exports/test_influx.py tests/sinks/exports/test_prometheus.py $(ARGS)
@@ -139,11 +139,11 @@ integrations: apt venv ## what the real Node-RED, AsyncAPI's parser, InfluxDB an
 docs: venv ## the documentation as a site in build/site, with checked links
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-payloads: venv ## remember what is published now; refuses what readers would miss in the same version
+payloads: venv ## record the published payloads; rejects an incompatible change within a version
 	@$(BIN)/python -m tests.sinks.mqtt.payload_record
 
 kernels: venv
 	$(BIN)/python -c 'from bms_estimator.service.kernel_warm_up import load_kernels; load_kernels()'
 
-lock: ## write requirements.lock anew after a change of dependencies (needs uv)
+lock: ## update requirements.lock after a change of dependencies (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --universal pyproject.toml -o requirements.lock

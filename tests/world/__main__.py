@@ -22,14 +22,14 @@ HOUR_S = 3600.0
 
 
 def run(seed: int, seconds: float) -> Result:
-    """One world."""
+    """Run one world."""
     result = World(seed, seconds).run()
     gc.collect()
     return result
 
 
 def main() -> int:
-    """As the module says. Returns 1 where something did not hold."""
+    """Run the requested worlds; return 1 if an invariant was violated."""
     parser = argparse.ArgumentParser(prog="make simulate", description="The whole service, simulated from one seed.")
     parser.add_argument("--seed", type=int, default=None, help="one world")
     parser.add_argument("--seeds", type=int, default=20, help="so many worlds")
@@ -38,15 +38,15 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=os.cpu_count(), help="worlds at the same time")
     options = parser.parse_args()
     load_kernels()
-    gc.disable()  # nothing is collected in the middle of a world
-    gc.freeze()  # nor is what all worlds share looked at after each
+    gc.disable()  # no collection during a world
+    gc.freeze()  # shared objects are not scanned after each world
     if options.seed is not None:
         return _show(run(options.seed, options.hours * HOUR_S), log=True)
     return _many(options)
 
 
 def _show(result: Result, *, log: bool = False) -> int:
-    """A line of a world, and its last lines where it failed."""
+    """Print the result of a world, with its last log lines if it failed."""
     if log:
         _say("\n".join(result.log))
     band = result.band
@@ -67,7 +67,7 @@ def _say(line: str) -> None:
 def _many(options: argparse.Namespace) -> int:
     begun_s, failed, bands = time.monotonic(), [], []
     seeds = range(options.first, options.first + options.seeds)
-    context = multiprocessing.get_context("fork")  # with what is compiled
+    context = multiprocessing.get_context("fork")  # inherits the compiled kernels
     with ProcessPoolExecutor(options.processes, context) as pool:
         for result in pool.map(partial(run, seconds=options.hours * HOUR_S), seeds):
             bands.append(result.band)

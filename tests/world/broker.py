@@ -19,11 +19,11 @@ from paho.mqtt.reasoncodes import ReasonCode
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 
 LATE_S = 0.03
-"""So long a packet may be on its way."""
+"""Maximum delay of a packet [s]."""
 CONNECT_TIMEOUT_S = 5.0
-"""Paho gives up to reach a host that does not answer."""
-LOOK_S = 2.0
-"""So often is looked whether somebody is silent for too long."""
+"""Timeout of paho for a host that does not respond [s]."""
+KEEPALIVE_CHECK_S = 2.0
+"""Interval between two keepalive checks [s]."""
 REFUSED_VERSION = ReasonCode(PacketTypes.CONNACK, identifier=132)
 ACCEPTED = ReasonCode(PacketTypes.CONNACK, identifier=0)
 TAKEN = ReasonCode(PacketTypes.PUBACK, identifier=0)
@@ -36,7 +36,7 @@ GRANTED = ReasonCode(PacketTypes.SUBACK, identifier=0)
 
 
 class LateError(Exception):
-    """A call that fails after so long."""
+    """Error that a call raises after some time."""
 
     def __init__(self, seconds: float, error: OSError) -> None:
         super().__init__(seconds, error)
@@ -45,7 +45,7 @@ class LateError(Exception):
 
 @dataclass(frozen=True)
 class Packet:
-    """A message on its way to the broker."""
+    """Message from a client to the broker."""
 
     topic: str
     payload: bytes
@@ -56,7 +56,7 @@ class Packet:
 
 @dataclass
 class Connection:
-    """One TCP connection, from whose packets neither side can tell that it is half open."""
+    """TCP connection, possibly half open without either side noticing."""
 
     client: "VirtualPaho"
     loop: ProcessLoop
@@ -72,7 +72,7 @@ class Connection:
     pinged_s: float | None = None
     wanted: list[str] = field(default_factory=list)
     acknowledged: dict[int, float] = field(default_factory=dict)
-    """Of its messages of QoS 1 those whose acknowledgement the client has, and since when."""
+    """QoS 1 messages whose acknowledgment the client has received, with the time [s]."""
 
     @property
     def usable(self) -> bool:
@@ -106,12 +106,12 @@ class Broker:
         self.retained: dict[str, bytes] = {}
         self.connections: list[Connection] = []
         self.loop: ProcessLoop | None = None
-        """Of the process that makes connections now."""
+        """Loop of the process that connects now."""
 
-    # what befalls it
+    # faults
 
     def stop(self, *, forgets: bool) -> None:
-        """It ends; all its clients see so."""
+        """Stop the broker; all clients notice."""
         self.up = False
         for connection in list(self.connections):
             self._end(connection, says_will=False)
@@ -120,23 +120,23 @@ class Broker:
             self.retained.clear()
 
     def start(self) -> None:
-        """It is there again."""
+        """Start the broker again."""
         self.up = True
         self.frozen_until_s = 0.0
 
     def drop(self) -> None:
-        """All connections are cut, both ends see it."""
+        """Cut all connections; both ends notice."""
         for connection in list(self.connections):
             self._end(connection, says_will=True)
             self._hang_up(connection)
 
     def half_open(self) -> None:
-        """All connections lose what they carry, and nobody is told."""
+        """Make all connections half open: packets are lost, and neither end notices."""
         for connection in self.connections:
             connection.half_open = True
 
     def process_ended(self, loop: ProcessLoop, *, silently: bool) -> None:
-        """A process has gone: its system closes the connections, unless it has gone, too."""
+        """End the connections of a process; ``silently``: without closing them, because the machine has ended too."""
         for connection in list(self.connections):
             if connection.loop is loop:
                 connection.client_open = False
@@ -146,11 +146,11 @@ class Broker:
                     self._send_to_broker(connection, lambda c=connection: self._end(c, says_will=True))
 
     def say(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
-        """Somebody else publishes."""
+        """Publish as another client."""
         if self.up:
             self._take(Packet(topic, payload, 0, retain, 0), None)
 
-    # what clients do
+    # requests of clients
 
     def connect(self, client: "VirtualPaho") -> Connection:
         """A client opens a connection.
@@ -167,23 +167,23 @@ class Broker:
         connection.heard_by_broker_s = connection.heard_by_client_s = self._timeline.now_s
         self.connections.append(connection)
         self._send_to_broker(connection, lambda: self._greet(connection))
-        self._timeline.after(LOOK_S, lambda: self._look(connection))
+        self._timeline.after(KEEPALIVE_CHECK_S, lambda: self._look(connection))
         return connection
 
     def publish(self, connection: Connection, packet: Packet) -> None:
-        """A client publishes."""
+        """Send a client's message to the broker."""
         self._send_to_broker(connection, lambda: self._take_from(connection, packet))
 
     def subscribe(self, connection: Connection, topics: list[str], mid: int) -> None:
-        """A client wants to hear."""
+        """Send a client's subscription to the broker."""
         self._send_to_broker(connection, lambda: self._subscribe(connection, topics, mid))
 
     def disconnect(self, connection: Connection) -> None:
-        """A client parts in good order."""
+        """Disconnect a client cleanly."""
         self._send_to_broker(connection, lambda: self._end(connection, says_will=False))
         connection.client_open = False
 
-    # what it does
+    # behavior
 
     def _greet(self, connection: Connection) -> None:
         client = connection.client
@@ -234,7 +234,7 @@ class Broker:
         self._send_to_client(connection, lambda: client.on_message(client, None, message))
 
     def _end(self, connection: Connection, *, says_will: bool) -> None:
-        """For the broker the connection is over."""
+        """End a connection at the broker."""
         if not connection.broker_open:
             return
         connection.broker_open = False
@@ -244,11 +244,11 @@ class Broker:
             self._take(will, None)
 
     def _hang_up(self, connection: Connection) -> None:
-        """The client sees that it is over."""
+        """End a connection at the client."""
         self._send_to_client(connection, lambda: connection.client.lost(LOST))
 
     def _look(self, connection: Connection) -> None:
-        """Whether either side has been silent for too long."""
+        """Check the keepalive of both sides."""
         now_s, keepalive_s = self._timeline.now_s, connection.client.keepalive_s
         if (
             connection.broker_open
@@ -266,7 +266,7 @@ class Broker:
                 connection.pinged_s = now_s
                 self._send_to_broker(connection, lambda: self._send_to_client(connection, lambda: None))
         if connection.broker_open or (connection.client_open and connection.loop.alive):
-            self._timeline.after(LOOK_S, lambda: self._look(connection))
+            self._timeline.after(KEEPALIVE_CHECK_S, lambda: self._look(connection))
 
     def _send_to_broker(self, connection: Connection, packet: Callable[[], None]) -> None:
         connection.said_by_client_s = now_s = self._timeline.now_s
@@ -274,7 +274,7 @@ class Broker:
         self._timeline.at(connection.to_broker_s, lambda: self._arrive(connection, packet))
 
     def _arrive(self, connection: Connection, packet: Callable[[], None]) -> None:
-        """A packet has come to the broker."""
+        """Deliver a packet to the broker."""
         if connection.half_open or not connection.broker_open:
             return
         if self._timeline.now_s < self.frozen_until_s:
@@ -297,7 +297,7 @@ class Broker:
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
-        """Have aiomqtt find this broker, whatever address it asks for."""
+        """Replace paho in aiomqtt, so that any address leads to this broker."""
         kept = paho.Client
         paho.Client = partial(VirtualPaho, self)
         try:
@@ -307,7 +307,7 @@ class Broker:
 
 
 class VirtualPaho:
-    """Paho's client, as far as aiomqtt asks of it."""
+    """Paho's client as far as aiomqtt uses it."""
 
     def __init__(self, broker: Broker, **arguments: Any) -> None:
         self._broker = broker
@@ -354,7 +354,7 @@ class VirtualPaho:
         if connection is None or not connection.usable:
             return SimpleNamespace(rc=paho.MQTT_ERR_NO_CONN, mid=mid, is_published=lambda: False)
         self._broker.publish(connection, Packet(topic, payload, qos, retain, mid))
-        if not qos:  # the system has taken it
+        if not qos:  # the operating system has buffered it
             connection.loop.call_soon(self.on_publish, self, None, mid, TAKEN, None)
         return SimpleNamespace(rc=paho.MQTT_ERR_SUCCESS, mid=mid, is_published=lambda: False)
 
@@ -379,7 +379,7 @@ def _ignored(*_: Any, **__: Any) -> None:
 
 
 def matches(topic: str, wanted: str) -> bool:
-    """Whether a topic is one of those that a filter without # names."""
+    """Return True if a topic matches a filter without #."""
     if "+" not in wanted:
         return topic == wanted
     left, right = topic.split("/"), wanted.split("/")

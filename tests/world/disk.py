@@ -18,22 +18,21 @@ from pathlib import Path
 from typing import Any
 
 SYNC_S = 31.0
-"""What a database has committed for so long is on the platter: ``store.database`` sees to it with its next transaction, the
-system's own writing back without one."""
+"""Time after which a committed transaction is synced [s], by the next transaction of ``store.database`` or by the operating system."""
 
 
 class PowerCutError(BaseException):
-    """The machine has no power any more."""
+    """Power cut of the machine."""
 
 
 @dataclass
 class Arm:
-    """What happens at the disk before long."""
+    """Armed fault of the disk."""
 
     after: int
-    """Operations until then."""
+    """Number of operations until it occurs."""
     end: type[BaseException]
-    """How the process ends there."""
+    """Exception that ends the process."""
 
 
 class Disk:
@@ -60,24 +59,24 @@ class Disk:
         self.arm: Arm | None = None
         self.operations = 0
         self._synced: dict[int, bytes] = {}
-        """Inode -> its bytes on the platter."""
+        """Synced bytes by inode."""
         self._names: dict[str, int] = {}
-        """Names on the platter."""
+        """Synced names."""
         self._pending: list[tuple[str, str, int]] = []
-        """Names changed since the folder's fsync: operation, name, inode."""
+        """Name changes since the folder's last fsync: operation, name, inode."""
         self._folders: set[int] = set()
         self.connections: list[sqlite3.Connection] = []
-        """To databases, of the present process."""
+        """Database connections of the present process."""
         self._logs: dict[str, deque[tuple[float, int]]] = {}
 
     @property
     def bad(self) -> bool:
-        """Whether it is at fault."""
+        """True if the disk is full, broken or hung."""
         return self.full or self.broken or self.hung
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Have all of this process's calls for files pass here."""
+        """Replace the file functions of this process."""
         kept = {name: getattr(os, name) for name in ("open", "fsync", "replace", "rename", "unlink", "remove")}
         try:
             os.open, os.fsync = self._open(kept["open"]), self._fsync(kept["fsync"])
@@ -89,7 +88,7 @@ class Disk:
                 setattr(os, name, function)
 
     def end_process(self) -> None:
-        """Whoever had a database open is gone, and has closed nothing."""
+        """Drop the database connections of an ended process without closing them."""
         found = {path: path.read_bytes() for path in self._databases()}
         for connection in self.connections:
             connection.close()
@@ -113,7 +112,7 @@ class Disk:
         return value
 
     def _note_databases(self, now_s: float) -> None:
-        """Take note of how long the logs of the databases are: what is older than ``SYNC_S`` is on the platter."""
+        """Record the sizes of the databases' logs: parts older than ``SYNC_S`` are synced."""
         for path in self._databases():
             if path.name.endswith("-wal"):
                 sizes = self._logs.setdefault(path.name, deque())
@@ -126,8 +125,8 @@ class Disk:
         return [self.folder / name for name in sorted(os.listdir(self.folder)) if ".sqlite" in name]  # noqa: PTH208 - quicker
 
     def cut(self, now_s: float) -> None:
-        """The power is cut: leave what is on the platter, and of the rest what chance leaves."""
-        self.arm = None  # what was to befall the next write has none to befall
+        """Cut the power: keep synced data, and a random part of the rest."""
+        self.arm = None  # an armed fault needs a next write
         databases = {path: path.read_bytes() for path in self._databases()}
         self._cut_files()
         for path, content in databases.items():
@@ -137,7 +136,7 @@ class Disk:
                 least = min(least, len(content))
                 left = self._dice.randint(least, len(content))
                 path.write_bytes(content[:left])
-                self._logs[path.name] = deque([(-math.inf, left)])  # what is there after a power cut is on the platter
+                self._logs[path.name] = deque([(-math.inf, left)])  # all surviving bytes are synced
             else:
                 path.write_bytes(content)
 
@@ -147,7 +146,7 @@ class Disk:
         volatile = {inodes[name]: content[name] for name in content}
         names = dict(self._names)
         kept = self._pending[: self._dice.randint(0, len(self._pending))]
-        for operation, name, inode in kept:  # a journal is in order
+        for operation, name, inode in kept:  # the journal replays changes in order
             if operation == "unlink":
                 names.pop(name, None)
             else:
@@ -166,12 +165,12 @@ class Disk:
             self._names[name], self._synced[number] = number, left[inode]
 
     def connect(self, *arguments: Any, **named: Any) -> sqlite3.Connection:
-        """As ``sqlite3.connect``."""
+        """Replacement of ``sqlite3.connect``."""
         self.connections.append(sqlite3.connect(*arguments, **named))
         return self.connections[-1]
 
     def _left(self, inode: int, volatile: bytes) -> bytes:
-        """What is left of a file."""
+        """Return the bytes of a file that survive a power cut."""
         synced = self._synced.get(inode)
         if synced is not None and (not volatile or volatile == synced):
             return synced
@@ -186,7 +185,7 @@ class Disk:
                 return bytes(len(volatile))
 
     def _ours(self, path: Any) -> str | None:
-        """Name of a file of this disk."""
+        """Return the name of a file on this disk; None for another file."""
         text = os.fspath(path) if not isinstance(path, int) else ""
         return (
             text.removeprefix(self._prefix)
@@ -195,7 +194,7 @@ class Disk:
         )
 
     def _operation(self) -> None:
-        """Something is about to change."""
+        """Count an operation, and raise an armed fault."""
         self.operations += 1
         if self.arm is not None:
             self.arm.after -= 1
@@ -242,7 +241,7 @@ class Disk:
                 real(descriptor)
                 return
             self._operation()
-            if self.full or self.broken:  # what was written so far is torn
+            if self.full or self.broken:  # the data written so far are torn
                 os.truncate(path, self._dice.randint(0, os.fstat(descriptor).st_size))
                 self._refuse()
             found = os.fstat(descriptor)

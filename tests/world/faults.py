@@ -1,4 +1,4 @@
-"""What may befall the world, and when."""
+"""Faults of a world and their times."""
 
 import math
 import random
@@ -17,28 +17,28 @@ if TYPE_CHECKING:
 MIN_PAUSE_S, MAX_PAUSE_S = 5.0, 300.0
 FIRST_S = 20.0
 STOP_S = 90.0
-"""Systemd kills what has not ended by then [s]."""
+"""Stop timeout after which systemd kills the service [s]."""
 
 
 MIN_JUMP_S, MAX_JUMP_S = 3.0, 3600.0
-"""Of the board's clock: the service believes a sample that is less than 2 s early."""
+"""Range of steps of the board's clock [s]: the service accepts a sample that is less than 2 s early."""
 MAX_RANDOM_S = 5.0
-"""So long the board's clock may run at random."""
+"""Maximum duration of random timestamps of the board [s]."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that befalls the world at a time."""
+    """Fault of the world at a time."""
 
     at_s: float
     kind: str
     seconds: float
-    """How long it lasts, or until the service is started again."""
+    """Duration, or time until the service is started again [s]."""
     share: float
-    """0..1, how bad it is."""
+    """Severity, 0..1."""
 
-    def befall(self, world: "World") -> None:
-        """Let it."""
+    def apply(self, world: "World") -> None:
+        """Apply the fault to a world."""
         KINDS[self.kind](world, self)
 
     def __str__(self) -> str:
@@ -46,7 +46,7 @@ class Fault:
 
 
 def usual(*, auto: bool, text: bool) -> list[str]:
-    """Kinds that may befall each world."""
+    """Return the kinds of faults that may occur in a world."""
     return [
         kind
         for kind in KINDS
@@ -55,7 +55,7 @@ def usual(*, auto: bool, text: bool) -> list[str]:
 
 
 def schedule(dice: random.Random, until_s: float, kinds: Sequence[str]) -> list[Fault]:
-    """What befalls a world, drawn from some kinds."""
+    """Draw faults of some kinds, with their times."""
     likely = dice.sample(kinds, k=dice.randint(2, len(kinds)))
     faults = []
     at_s = FIRST_S * dice.random()
@@ -68,11 +68,11 @@ def schedule(dice: random.Random, until_s: float, kinds: Sequence[str]) -> list[
 
 
 def _noisy(noise: Callable[[float], Noise]) -> Callable[["World", Fault], None]:
-    def befall(world: "World", fault: Fault) -> None:
+    def apply(world: "World", fault: Fault) -> None:
         world.cable.noise = noise(fault.share)
         world.timeline.after(fault.seconds, lambda: setattr(world.cable, "noise", Noise()))
 
-    return befall
+    return apply
 
 
 def _unplug(world: "World", fault: Fault) -> None:
@@ -111,7 +111,7 @@ def _reset_board(world: "World", fault: Fault) -> None:
 
 
 def _jump_s(fault: Fault) -> float:
-    """Of a clock: seconds to an hour, ahead or back."""
+    """Return a clock step of seconds to an hour, ahead or back [s]."""
     size = abs(2.0 * fault.share - 1.0)
     return math.copysign(MIN_JUMP_S * (MAX_JUMP_S / MIN_JUMP_S) ** size, fault.share - 0.5)
 
@@ -132,7 +132,9 @@ def _clock_at_random(world: "World", fault: Fault) -> None:
 
 def _broker_down(world: "World", fault: Fault) -> None:
     if world.broker.up:
-        world.will_certain &= world.process is not None or not world.broker.connections  # a will goes with its broker
+        world.will_certain &= (
+            world.process is not None or not world.broker.connections
+        )  # the broker loses the will when it stops
         world.broker.stop(forgets=fault.share < 0.3)
         world.timeline.after(fault.seconds, world.broker.start)
 
@@ -162,11 +164,11 @@ def _wall_step(world: "World", fault: Fault) -> None:
 
 
 def _disk(attribute: str) -> Callable[["World", Fault], None]:
-    def befall(world: "World", fault: Fault) -> None:
+    def apply(world: "World", fault: Fault) -> None:
         setattr(world.disk, attribute, True)
         world.timeline.after(fault.seconds, lambda: setattr(world.disk, attribute, False))
 
-    return befall
+    return apply
 
 
 def _kill(world: "World", fault: Fault) -> None:
@@ -264,4 +266,4 @@ KINDS: dict[str, Callable[["World", Fault], None]] = {
     "board's clock at random": _clock_at_random,
 }
 CLOCK = ("board's clock stepped", "one stamp wrong", "board's clock at random")
-"""Lines of text carry no clock. They are drawn for themselves: what else befalls a seed is as it was before there were any."""
+"""Faults of the board's clock, only with the binary protocol. They are drawn separately, so that older seeds keep their other faults."""

@@ -1,4 +1,4 @@
-"""What must hold, whatever happens. Each number that bounds something stands here."""
+"""Invariants of a world, and their limits."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -12,9 +12,9 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from tests.world.broker import Connection, Packet
 
 MAX_STDS = 4.0
-"""The true SOC is never further from the estimate than so many of its standard deviations, and ``SOC_FLOOR``."""
+"""Maximum SOC error [standard deviations], in addition to ``SOC_FLOOR``."""
 SOC_FLOOR = 0.004
-"""What a published SOC may be off whatever its std says: the sample that it belongs to may be the one before."""
+"""Permitted SOC error in addition to ``MAX_STDS``: the published SOC may belong to the previous sample."""
 USUAL_STDS = 2.0
 MAX_TASKS = 40
 MAX_READS = 64
@@ -22,18 +22,18 @@ MAX_READY = 2000
 
 
 class InvariantError(Exception):
-    """Something that must hold does not."""
+    """Violated invariant."""
 
 
 class Reference:
-    """The valid samples in the bytes that a process was given, by the codec that decodes one message at a time."""
+    """Reference count of the valid samples delivered to a process, by a decoder of single messages."""
 
     def __init__(self) -> None:
         self._rest = b""
         self.samples = 0
 
     def feed(self, data: bytes) -> bool:
-        """Returns whether samples have come."""
+        """Decode bytes; return True if they completed a sample."""
         before = self.samples
         *frames, self._rest = (self._rest + data).split(DELIMITER)
         for frame in frames:
@@ -46,55 +46,55 @@ class Reference:
 
 
 class State(NamedTuple):
-    """One that the service has given away."""
+    """State that the service has published."""
 
     process: int
     said_s: float
     disk_failed: bool
-    """It may never have been on disk, where older ones still wait."""
+    """True if the state may not be on disk, while older ones wait there."""
 
 
 class End(NamedTuple):
-    """How a process has ended."""
+    """End of a process."""
 
     at_s: float
-    """When it last ran: a process that is frozen saves nothing."""
+    """Time at which it last ran [s]: a frozen process saves nothing."""
     forgotten_s: float
-    """What it had said or heard for longer outlives it."""
+    """Age beyond which its sent and received messages survive [s]."""
 
 
 IN_FLIGHT_S = 15.0
-"""What was said last may still be on its way [s]."""
+"""Time for which a message may be in flight [s]."""
 
 
 @dataclass
-class Said:
-    """States that the service has given away, and what the broker has of them."""
+class PublishedStates:
+    """Published states, and those that the broker has received."""
 
     payloads: dict[bytes, int] = field(default_factory=dict)
-    """Payload -> its number."""
+    """Number of a state by payload."""
     states: list[State] = field(default_factory=list)
     last: int = -1
-    """The newest that the broker has."""
+    """Number of the newest state at the broker."""
     received: dict[int, list[tuple[Connection, int]]] = field(default_factory=dict)
-    """Number -> on which connections it came, and under which packet identifier."""
+    """Deliveries of each state: connection and packet identifier."""
     ends: dict[int, End] = field(default_factory=dict)
-    """Of processes."""
+    """Ends of processes."""
     doubled: int = 0
     forgotten: int = 0
-    """States that a kill or a power cut has cost."""
+    """Number of states lost by a kill or a power cut."""
 
     def say(self, payload: bytes, process: int, now_s: float, *, disk_failed: bool) -> None:
-        """The service gives one away."""
+        """Record a published state."""
         self.payloads[payload] = len(self.states)
         self.states.append(State(process, now_s, disk_failed))
 
     def end(self, process: int, now_s: float, forgotten_s: float) -> None:
-        """A process has ended."""
+        """Record the end of a process."""
         self.ends[process] = End(now_s, forgotten_s)
 
     def take(self, packet: Packet, connection: Connection | None, *, in_order: bool) -> str:
-        """The broker has received a state; ``in_order``: not before one that came already. Returns what is wrong with that."""
+        """Check a state that the broker has received; ``in_order``: it must be newer than earlier ones. Return the violation, or an empty text."""
         number = self.payloads.get(packet.payload)
         if number is None:
             return "a state that nobody said"
@@ -117,7 +117,7 @@ class Said:
         return ""
 
     def _known(self, other: Connection, mid: int, connection: Connection, process: int) -> bool:
-        """Whether who sends on ``connection`` knows that the broker has acknowledged what came on ``other``."""
+        """Return True if the sender on ``connection`` knows that the broker acknowledged the message on ``other``."""
         heard_s = other.acknowledged.get(mid)
         if heard_s is None:
             return False
@@ -127,7 +127,7 @@ class Said:
         return not any(heard_s > end.at_s - end.forgotten_s for end in ends)
 
     def lost(self, now_s: float) -> list[int]:
-        """What the broker never got though nothing explains it."""
+        """Return the states that were lost without an explanation."""
         missing = [n for n in range(len(self.states)) if n not in self.received]
         ends = self.ends.items()
         lost = []
@@ -144,7 +144,7 @@ class Said:
 
 @dataclass
 class Band:
-    """How the SOC did."""
+    """Statistics of the SOC error."""
 
     states: int = 0
     inside: int = 0
@@ -152,7 +152,7 @@ class Band:
     worst_error: float = 0.0
 
     def take(self, snapshot: Snapshot, true_soc: float) -> str:
-        """A snapshot with its truth. Returns what is wrong with that."""
+        """Check a snapshot against the true SOC. Return the violation, or an empty text."""
         e = snapshot.estimate
         if e is None or e.soc is None or e.soc_std is None:
             return ""
@@ -169,13 +169,13 @@ class Band:
 
 @dataclass
 class Flowed:
-    """Charge and energy that the service has told, over all its processes."""
+    """Published totals of charge and energy over all processes."""
 
     kept: ChargeEnergy = field(default_factory=ChargeEnergy)
-    """What it told that was on disk."""
+    """Last published totals that were on disk."""
 
     def take(self, estimate: Estimate, *, kept: bool) -> str:
-        """A state; ``kept``: the disk has taken what it tells. Returns what is wrong with that."""
+        """Check the totals of a state; ``kept``: they are on disk. Return the violation, or an empty text."""
         flow = ChargeEnergy(*(getattr(estimate, name) for name in ChargeEnergy._fields))
         wrong = f"{flow} after {self.kept}" if any(a < b for a, b in zip(flow, self.kept, strict=True)) else ""
         if kept:
@@ -185,17 +185,17 @@ class Flowed:
 
 @dataclass
 class Truth:
-    """Something that others are told of: since when it holds, and whether they know."""
+    """Availability: true value, and delay until the retained message agrees."""
 
     within_s: float
-    """So long after it has come to hold they must know."""
+    """Maximum delay [s]."""
     now: str | None = None
     wrong_since_s: float | None = None
     longest_s: float = 0.0
-    """It took them at most."""
+    """Largest delay so far [s]."""
 
     def check(self, truth: str | None, told: str | None, now_s: float) -> str:
-        """Compare; ``truth`` is None while nobody can be told. Returns what is wrong."""
+        """Compare true and retained value; ``truth`` is None while the broker cannot know it. Return the violation, or an empty text."""
         right = truth is None or told == truth or (truth == "offline" and told is None)
         if right or truth != self.now:
             self.wrong_since_s = None if right else now_s
@@ -208,13 +208,13 @@ class Truth:
 
 
 def text(payload: bytes | None) -> str | None:
-    """A payload for people."""
+    """Return a payload as text."""
     return None if payload is None else payload.decode(errors="replace")
 
 
 @lru_cache(maxsize=64)
 def is_json(payload: bytes) -> bool:
-    """Whether a payload is strict JSON: no NaN, no infinity. The longest come again with each connection."""
+    """Return True if a payload is strict JSON without NaN and infinity. Cached, because large payloads repeat at each connection."""
     try:
         from_json(payload, allow_inf_nan=False, cache_strings="none")
     except ValueError:

@@ -41,9 +41,9 @@ from tests.world.loop import Timeline
 
 BANDGAP_READINGS = 256
 NOISE_STEPS = 0.5
-"""Of one conversion; a window has thousands, and their mean is known better."""
+"""Noise of one conversion [steps]. A window has thousands, so that their mean is more accurate."""
 LATE_S = 0.004
-"""So long a read may be late on USB."""
+"""Maximum delay of a read on USB [s]."""
 ARDUINO = 0x2341, 0x0043
 
 
@@ -65,12 +65,12 @@ class Board:
         self._first_rate_hz = first_rate_hz
         self._inbox = b""
         self.stamps_off_us = deque[int]()
-        """By so much the stamps of the next samples are wrong."""
+        """Errors of the timestamps of the next samples [s]."""
         self._boot_id = dice.randrange(1 << 16)
         self.reset(ResetCause.POWER_ON)
 
     def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> bytes:
-        """It begins anew. Returns its hello."""
+        """Reset the board; return its hello."""
         self._boot_id = (self._boot_id + 1) % (1 << 16)
         self._cause, self._sequence, self._ns, self._ntc_next, self._inbox = cause, 0, 0, False, b""
         self.stamps_off_us.clear()
@@ -80,24 +80,24 @@ class Board:
 
     @property
     def period_s(self) -> float:
-        """Between two samples."""
+        """Sample period [s]."""
         return self._period_ns * 1e-9
 
     def begin_window(self) -> None:
-        """At a beat, which neither a reset nor another rate shifts."""
+        """Begin a window, at times that neither a reset nor a change of rate shifts."""
         self._window_ns = self._period_ns
 
     @property
     def has_measured(self) -> bool:
-        """Whether a window has ended at this beat: it was not reset meanwhile."""
+        """True if a window has ended, without a reset meanwhile."""
         return self._window_ns > 0
 
     def step_clock(self, step_s: float) -> None:
-        """From now on its clock is ahead by so much, or behind; until it is reset."""
+        """Step the board's clock by ``step_s``, until the next reset."""
         self._ns += round(step_s * 1e9)
 
     def sample(self, reading: Reading) -> bytes:
-        """What it sends of a window with ``reading`` at its sensors."""
+        """Return the bytes of a sample with ``reading`` at the sensors."""
         self._ns += self._window_ns
         parts, count = self._parts, self._count
         voltage = self._sum(reading.voltage_v / parts.divider / parts.supply_v, count)
@@ -117,7 +117,7 @@ class Board:
         return message.encode()
 
     def hear(self, data: bytes) -> bytes:
-        """Bytes of the host. Returns the answer."""
+        """Process bytes of the host; return the response."""
         *frames, self._inbox = (self._inbox + data).split(DELIMITER)
         answers = b""
         for frame in frames:
@@ -148,7 +148,7 @@ class Board:
         self._aux_count = aux_readings_of(rate_hz)
 
     def _sum(self, part: float, count: int) -> int:
-        """Of ``count`` conversions of a part of the reference."""
+        """Return the sum of ``count`` conversions of a fraction of the reference."""
         steps = part * FULL_SCALE * count + self._dice.gauss(0.0, NOISE_STEPS * math.sqrt(count))
         return min(max(round(steps), 0), (FULL_SCALE - 1) * count)
 
@@ -186,24 +186,24 @@ class Board:
 
 
 DECLARED_DIVIDER = 1.0
-"""What each board says of its divider; another pack's board has another in truth."""
+"""Divider that each board reports; the other pack's board has a different one."""
 
 
 @dataclass
 class Noise:
-    """What the cable does."""
+    """Noise of the cable."""
 
     flip: float = 0.0
-    """Probability that a byte is another one."""
+    """Probability that a byte is corrupted."""
     lose: float = 0.0
     """Probability that a byte is lost."""
     mute: bool = False
-    """Nothing passes."""
+    """True if no byte passes."""
 
 
 @dataclass
 class Opening:
-    """A port as the service has opened it, and what it was given."""
+    """Port opened by the service, and the delivered bytes."""
 
     near: socket.socket
     far: socket.socket
@@ -228,18 +228,18 @@ class Cable:
         self.port: Path | None = None
         self.opening: Opening | None = None
         self.openings: list[Opening] = []
-        """Of the present process."""
+        """Open port of the present process."""
         self.resets_when_opened = True
         self.delivered: Callable[[bytes], None] = lambda _: None
-        """Told of what the service has been given."""
+        """Called with the bytes delivered to the service."""
 
     def plug(self, board: Board, name: str) -> None:
-        """A board comes to be there, under a name."""
+        """Plug a board in under a port name."""
         self.board, self.port = board, self.folder / name
         self.port.touch()
 
     def unplug(self) -> Board | None:
-        """It is gone."""
+        """Unplug the board."""
         board, self.board = self.board, None
         if self.port is not None:
             self.port.unlink(missing_ok=True)
@@ -248,21 +248,21 @@ class Cable:
         return board
 
     def hang_up(self) -> None:
-        """The port dies under whoever has it open."""
+        """Close the port at its device end."""
         if self.opening is not None:
             opening, self.opening = self.opening, None
             opening.far.close()
             self._readable_soon(opening.near)
 
     def forget(self) -> None:
-        """The process that had it open has ended."""
+        """Drop the port of an ended process."""
         for opening in self.openings:
             opening.near.close()
             opening.far.close()
         self.openings, self.opening = [], None
 
     def send(self, data: bytes) -> None:
-        """The board sends; what the cable leaves of it comes a little later."""
+        """Send bytes of the board; they arrive a little later, with the cable's noise."""
         opening = self.opening
         if opening is None or not data or self.noise.mute:
             return
@@ -297,7 +297,7 @@ class Cable:
         return VirtualPort(self, self.opening)
 
     def ports(self, *_: Any) -> list[ListPortInfo]:
-        """As pyserial's ``comports``."""
+        """Replacement of pyserial's ``comports``."""
         if self.port is None:
             return []
         info = ListPortInfo(str(self.port), skip_link_detection=True)
@@ -307,7 +307,7 @@ class Cable:
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
-        """Have pyserial open these ports."""
+        """Replace pyserial's ports."""
         kept = serial.Serial, list_ports.comports
         serial.Serial, list_ports.comports = self.open, self.ports
         try:
@@ -316,11 +316,11 @@ class Cable:
             serial.Serial, list_ports.comports = kept
 
     def hear_soon(self, opening: Opening) -> None:
-        """The service is about to send."""
+        """Schedule reading the bytes that the service sends."""
         self._timeline.after(self._dice.uniform(0.001, LATE_S), lambda: self._hear(opening))
 
     def close(self, opening: Opening) -> None:
-        """The service closes it."""
+        """Close the port at the service's end."""
         opening.near.close()
         if self.opening is opening:
             opening.far.close()
@@ -356,13 +356,13 @@ class Cable:
 
 
 class VirtualPort:
-    """What the service holds of an open port."""
+    """Open port as pyserial presents it to the service."""
 
     def __init__(self, cable: Cable, opening: Opening) -> None:
         self._cable, self._opening = cable, opening
 
     def fileno(self) -> int:
-        self._cable.hear_soon(self._opening)  # it is asked for before each write
+        self._cable.hear_soon(self._opening)  # called before each write
         return self._opening.near.fileno()
 
     def close(self) -> None:

@@ -15,11 +15,11 @@ from concurrent.futures import Executor
 from typing import Any
 
 MAX_CLOSINGS = 20
-"""A coroutine that is thrown away may go on to so many further awaits."""
+"""Maximum number of awaits of a coroutine that is being closed."""
 
 
 class KilledError(BaseException):
-    """The process that called has ended."""
+    """End of the calling process."""
 
 
 class Timeline:
@@ -38,16 +38,16 @@ class Timeline:
         return len(self._events)
 
     def at(self, when_s: float, event: Callable[[], None]) -> None:
-        """Have ``event`` happen; at once where ``when_s`` has passed."""
+        """Schedule an event; at once if ``when_s`` has passed."""
         self._count += 1
         heapq.heappush(self._events, (max(when_s, self.now_s), self._dice.random(), self._count, event))
 
     def after(self, delay_s: float, event: Callable[[], None]) -> None:
-        """The same, ``delay_s`` from now."""
+        """Schedule an event ``delay_s`` from now."""
         self.at(self.now_s + delay_s, event)
 
     def step(self) -> None:
-        """On to the next event."""
+        """Advance to the next event and run it."""
         self.now_s, _, _, event = heapq.heappop(self._events)
         event()
 
@@ -88,13 +88,13 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         self.alive = True
         self.frozen_until_s = self._frozen_s = 0.0
         self.handles = 0
-        """So many have run."""
+        """Number of handles that have run."""
         self.faults: list[str] = []
-        """What nobody caught."""
+        """Uncaught exceptions."""
         self.threads: Executor = Executor()
-        """Where calls run for which nobody names an executor."""
+        """Default executor."""
 
-    # what a process asks of its loop
+    # interface of asyncio
 
     def time(self) -> float:
         return self._timeline.now_s
@@ -167,25 +167,25 @@ class ProcessLoop(asyncio.AbstractEventLoop):
     async def shutdown_asyncgens(self) -> None:
         pass
 
-    # what the world does with it
+    # interface for the world
 
     @property
     def busy(self) -> bool:
-        """Whether it has something to do now."""
+        """True if a handle is ready."""
         return bool(self._ready) and self.alive and self._timeline.now_s >= self.frozen_until_s
 
     @property
     def ran_until_s(self) -> float:
-        """When it last had a processor: now, or when it was frozen [s]."""
+        """Time at which the process last ran: now, or the beginning of a freeze [s]."""
         return self._frozen_s if self._timeline.now_s < self.frozen_until_s else self._timeline.now_s
 
     @property
     def waiting(self) -> int:
-        """Handles that are ready."""
+        """Number of ready handles."""
         return len(self._ready)
 
     def readable(self, fd: int) -> None:
-        """A descriptor has bytes."""
+        """Schedule the reader of a descriptor."""
         reader = self._readers.get(fd)
         if reader is not None and self.alive:
             self._ready.append(reader)
@@ -207,12 +207,12 @@ class ProcessLoop(asyncio.AbstractEventLoop):
             asyncio._set_running_loop(None)
 
     def freeze(self, until_s: float) -> None:
-        """The process gets no processor for a while."""
+        """Freeze the process until ``until_s``."""
         self._frozen_s, self.frozen_until_s = self.ran_until_s, until_s
         self._timeline.at(until_s, lambda: None)
 
     def kill(self) -> None:
-        """The process is gone: what it holds is given back to the system, and no line of it runs to any effect."""
+        """Kill the process: release its resources; none of its code has any further effect."""
         if not self.alive:
             return
         self.alive = False
@@ -231,7 +231,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
             sys.unraisablehook = kept
 
     def start(self, main: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
-        """The first task."""
+        """Start the main task."""
         with self._running():
             return self.create_task(main, name="main")
 
@@ -249,12 +249,12 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
 
 def _close(coroutine: Any) -> None:
-    """Throw a coroutine away, whatever it still wants to wait for."""
+    """Close a coroutine, even if it awaits while closing."""
     for _ in range(MAX_CLOSINGS):
         try:
             coroutine.close()
-        except RuntimeError:  # it awaits while it is thrown away: as often as it has such places
+        except RuntimeError:  # the coroutine awaits while it is closed
             continue
-        except BaseException:  # noqa: BLE001 - nobody is there to hear it
+        except BaseException:  # noqa: BLE001 - the process has ended
             pass
         return

@@ -1,4 +1,4 @@
-"""The service with a fault built in: what a simulation that finds nothing must still find."""
+"""Mutants of the service, each with a fault that the simulation must find."""
 
 import contextlib
 import math
@@ -17,7 +17,7 @@ from bms_estimator.store.outbox_queue import Queue
 
 @contextlib.contextmanager
 def no_rewind() -> Iterator[None]:
-    """What was on its way when a connection broke is not sent again."""
+    """Do not resend messages that were in flight when a connection broke."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Queue, "rewind", lambda _: None)
         yield
@@ -25,7 +25,7 @@ def no_rewind() -> Iterator[None]:
 
 @contextlib.contextmanager
 def no_fsync() -> Iterator[None]:
-    """A checkpoint takes its name before its bytes are on the disk."""
+    """Rename a checkpoint before its bytes are synced."""
     written = CheckpointFile._write
 
     def write(self: CheckpointFile, *arguments: Any) -> None:
@@ -42,7 +42,7 @@ def no_fsync() -> Iterator[None]:
 
 @contextlib.contextmanager
 def no_sensor_availability() -> Iterator[None]:
-    """That the sensor has gone silent is not said."""
+    """Do not publish that the sensor is silent."""
     said = MessageBuilder._sensor
 
     def sensor(self: MessageBuilder, health: Any) -> Any:
@@ -55,7 +55,7 @@ def no_sensor_availability() -> Iterator[None]:
 
 @contextlib.contextmanager
 def no_second_try() -> Iterator[None]:
-    """A disk that did not take the board once is not asked again."""
+    """Do not retry saving the board after a disk error."""
     asked = BoardCheck._remember
 
     def remember(self: BoardCheck, now_s: float) -> None:
@@ -69,11 +69,11 @@ def no_second_try() -> Iterator[None]:
 
 @contextlib.contextmanager
 def board_clock_believed() -> Iterator[None]:
-    """A board's clock that runs ahead of the arrivals is right."""
+    """Accept a board's clock that runs ahead of the arrivals."""
     decoded = FrameDecoder._decode
 
     def decode(self: FrameDecoder, *arguments: Any) -> Any:
-        self._state["least_late_s"], self._state["period_us"] = -math.inf, 1e12  # no sample is ever early, or in haste
+        self._state["least_late_s"], self._state["period_us"] = -math.inf, 1e12  # no sample counts as early
         return decoded(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""The pack: the cell of Chen and Mora under a load of pulses, rests and charging; it lives on whatever becomes of us."""
+"""Pack: the cell of Chen and Mora under a load of pulses, rests and charging, independent of the service."""
 
 import random
 from collections.abc import Iterator
@@ -10,18 +10,18 @@ CELL = load_cell("chen_mora")
 CAPACITY_AH = CELL.cell.capacity_ah
 MIN_S, MAX_S = 20, 400
 RATES_C = (0.0, 0.0, 0.2, 0.5, 1.0, 2.0, 3.0, -0.3, -1.0)
-"""Steps of the load, of its greatest."""
-GREATEST = (0.1, 0.1, 0.2, 1.0)
-"""A checkpoint is written with each 0.2 % of charge: most packs are under a small load."""
+"""Load levels [C-rate], to be multiplied by the world's factor."""
+LOAD_FACTORS = (0.1, 0.1, 0.2, 1.0)
+"""Factors of the load of a world. Most are small, because a checkpoint is written after each 0.2 % of charge."""
 
 
 def steps(dice: random.Random) -> Iterator[tuple[float, float]]:
-    """Seconds and current [A], positive on discharge; whole seconds, for a board's window knows no more."""
-    greatest = dice.choice(GREATEST)
+    """Yield duration [s] and current [A], positive on discharge. Durations are whole seconds, as a board's windows."""
+    greatest = dice.choice(LOAD_FACTORS)
     while True:
         yield float(dice.randint(MIN_S, MAX_S)), CAPACITY_AH * greatest * dice.choice(RATES_C)
 
 
 def new_pack(dice: random.Random) -> SimulatedPack:
-    """A pack somewhere between a fifth and full, at rest."""
+    """Return a pack at rest with a random SOC above a fifth."""
     return SimulatedPack(CELL, steps(dice), soc=dice.uniform(0.2, 0.95))

@@ -1,7 +1,7 @@
-"""Where the package asks the machine for time, chance or a moment it asks the world instead.
+"""Replacement of the package's clocks and random numbers by those of the world.
 
-Nothing of the package is written for that: whatever it has bound of the standard library's clocks and dice, as a
-module, a function or a default argument, is bound anew while the world lasts, in all its modules.
+The package contains no code for this. All references of its modules to the standard library's clocks and random functions (module,
+function or default argument) are replaced while the world lasts.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ PACKAGE = "bms_estimator"
 
 
 class Clocks:
-    """The world's clocks: one that may be stepped, two that may not, and which start of the machine it is."""
+    """Clocks of the world: a wall clock that may be stepped, two steady clocks, and the boot id."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
@@ -52,8 +52,8 @@ class Clocks:
         return moment.BootTimestamp(self.wall(), self.synchronised, self.since_boot(), self.boot)
 
 
-class _Instead:
-    """A module of which some functions are other ones."""
+class _PatchedModule:
+    """Module with some replaced functions."""
 
     def __init__(self, module: ModuleType, **functions: Any) -> None:
         self._module = module
@@ -63,20 +63,20 @@ class _Instead:
         return getattr(self._module, name)
 
 
-SLOWER = (("service.live_loop", "LAG_STEP_S", 2.0), ("sources.serial.serial_source", "SEND_INTERVAL_S", 0.5))
-"""What looks around all the time does so less often: module, name, seconds. It is what an idle hour would cost most."""
-REMEMBERED = (("estimator.settings_records", "decay_table"),)
-"""Pure functions whose values are worth keeping from start to start."""
+LONGER_INTERVALS = (("service.live_loop", "LAG_STEP_S", 2.0), ("sources.serial.serial_source", "SEND_INTERVAL_S", 0.5))
+"""Poll intervals that are lengthened, because they would take most of the time of an idle hour: module, name, interval [s]."""
+CACHED_FUNCTIONS = (("estimator.settings_records", "decay_table"),)
+"""Pure functions whose results are cached between starts."""
 
 
 @functools.cache
-def _remembered(function: Callable[..., Any]) -> Callable[..., Any]:
+def _cached(function: Callable[..., Any]) -> Callable[..., Any]:
     return functools.cache(function)
 
 
 @contextlib.contextmanager
 def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], disk: Disk) -> Iterator[None]:
-    """Have the package ask ``clocks`` and ``dice``, and ``threads`` and ``disk`` for what runs beside the loop."""
+    """Replace clocks, random numbers, threads and disk of the package."""
     instead: dict[int, Any] = {
         id(time.time): clocks.wall,
         id(time.monotonic): clocks.monotonic,
@@ -88,14 +88,14 @@ def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], d
         id(ThreadPoolExecutor): lambda *args, **named: threads().executor(*args, **named),
         id(DiskThread): lambda name: threads().executor(thread_name_prefix=name),
         id(Thread): lambda **named: threads().thread(**named),
-        id(sqlite3): _Instead(sqlite3, connect=disk.connect),
+        id(sqlite3): _PatchedModule(sqlite3, connect=disk.connect),
         id(secrets.token_hex): lambda count: dice.randbytes(count).hex(),
-        id(time): _Instead(
+        id(time): _PatchedModule(
             time, time=clocks.wall, monotonic=clocks.monotonic, perf_counter=clocks.monotonic,
             clock_gettime=lambda _: clocks.since_boot(),
         ),
-        id(random): _Instead(random, uniform=dice.uniform, random=dice.random),
-        id(secrets): _Instead(secrets, token_hex=lambda count: dice.randbytes(count).hex()),
+        id(random): _PatchedModule(random, uniform=dice.uniform, random=dice.random),
+        id(secrets): _PatchedModule(secrets, token_hex=lambda count: dice.randbytes(count).hex()),
     }  # fmt: skip
     undo: list[Callable[[], None]] = []
     for module in [module for name, module in sys.modules.items() if name.split(".")[0] == PACKAGE]:
@@ -105,18 +105,18 @@ def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], d
                 setattr(module, name, instead[id(bound)])
             for function in _functions(bound, module.__name__):
                 _bind_defaults(function, instead, undo)
-    for name, constant, seconds in SLOWER:
+    for name, constant, seconds in LONGER_INTERVALS:
         module = sys.modules[f"{PACKAGE}.{name}"]
         undo.append(functools.partial(setattr, module, constant, getattr(module, constant)))
         setattr(module, constant, seconds)
     undo.append(functools.partial(setattr, health, "resident_mib", health.resident_mib))
-    health.resident_mib = lambda: None  # it is this process's, and never the same
+    health.resident_mib = lambda: None  # differs between runs
     undo.append(functools.partial(setattr, os, "statvfs", os.statvfs))
-    os.statvfs = lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096)  # so is the room on this machine's disk
-    for name, function in REMEMBERED:
+    os.statvfs = lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096)  # differs between machines
+    for name, function in CACHED_FUNCTIONS:
         module = sys.modules[f"{PACKAGE}.{name}"]
         undo.append(functools.partial(setattr, module, function, getattr(module, function)))
-        setattr(module, function, _remembered(getattr(module, function)))
+        setattr(module, function, _cached(getattr(module, function)))
     try:
         yield
     finally:
@@ -125,7 +125,7 @@ def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], d
 
 
 def _functions(bound: Any, module: str) -> Iterator[FunctionType]:
-    """The functions that something of a module consists of."""
+    """Yield the functions of an object of a module."""
     if isinstance(bound, FunctionType) and bound.__module__ == module:
         yield bound
     elif isinstance(bound, type) and bound.__module__ == module:
@@ -135,7 +135,7 @@ def _functions(bound: Any, module: str) -> Iterator[FunctionType]:
 
 
 def _bind_defaults(function: FunctionType, instead: dict[int, Any], undo: list[Callable[[], None]]) -> None:
-    """Default arguments, too."""
+    """Replace default arguments of a function."""
     defaults, named = function.__defaults__, function.__kwdefaults__
     if defaults and any(id(value) in instead for value in defaults):
         undo.append(lambda: setattr(function, "__defaults__", defaults))

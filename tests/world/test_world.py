@@ -1,4 +1,4 @@
-"""The whole service from a seed: short worlds, twice the same, and faults built in that must be found."""
+"""Simulation of the whole service: short worlds, reproducibility, and mutants that must be found."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -11,18 +11,18 @@ from tests.world.world import World
 
 SEEDS = range(3)
 WORLD_S = 1000.0
-"""The last seven minutes of them are calm."""
+"""Duration of a world [s]; the last seven minutes are without faults."""
 SILENCE_S = 21.0
-"""So long silence is borne, as docs/reference/mqtt.md has it."""
+"""Maximum time until a silent connection is closed [s] (docs/reference/mqtt.md)."""
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_all_holds_in_a_world(seed: int) -> None:
+def test_all_invariants_hold(seed: int) -> None:
     result = World(seed, WORLD_S).run()
     assert not result.wrong, "\n".join([*result.log, f"make simulate SEED={seed}: {result.wrong}"])
 
 
-def test_a_seed_gives_the_same_bits_each_time() -> None:
+def test_seed_is_reproducible() -> None:
     first, second = World(7, 600.0).run(), World(7, 600.0).run()
     assert first.digest == second.digest
     assert first.figures == second.figures
@@ -35,25 +35,23 @@ def test_a_seed_gives_the_same_bits_each_time() -> None:
         (no_fsync, [Fault(60.0 + 7.0 * n, "power cut", 2.0, 0.5) for n in range(1, 40)], "the checkpoint is refused"),
         (no_sensor_availability, [Fault(60.0, "port gone", 120.0, 0.5)], "sensor availability"),
         (no_second_try, [Fault(0.05, "disk full", 60.0, 0.5)], "is not remembered"),
-        (board_clock_believed, [Fault(60.0, "board's clock stepped", 0.0, 0.9)], "s are counted that were none"),
+        (board_clock_believed, [Fault(60.0, "board's clock stepped", 0.0, 0.9)], "s too much are counted"),
     ],
 )
-def test_a_fault_that_is_built_in_is_found(
-    mutant: Callable[[], AbstractContextManager[None]], faults: list[Fault], found: str
-) -> None:
+def test_mutant_is_found(mutant: Callable[[], AbstractContextManager[None]], faults: list[Fault], found: str) -> None:
     with mutant():
         result = World(2, 600.0, faults).run()
     assert found in result.wrong
 
 
-def test_a_broker_that_does_not_answer_a_connection_in_time_leaves_no_fault_in_the_loop() -> None:
+def test_late_broker_causes_no_uncaught_exception() -> None:
     result = World(1, 600.0, [Fault(60.0, "broker frozen", 60.0, 0.5)]).run()
     assert not result.wrong
     assert any("no answer within" in line for line in result.log)
 
 
 @pytest.mark.parametrize("kind", ["connections half open", "broker frozen"])
-def test_a_line_or_a_broker_that_falls_silent_is_given_up_in_time(kind: str) -> None:
+def test_silent_connection_is_closed_in_time(kind: str) -> None:
     begin_s = 60.0
     result = World(1, 600.0, [Fault(begin_s, kind, 100.0, 0.5)]).run()
     lost_s = next(float(line.split()[0]) for line in result.log if "broker lost" in line)

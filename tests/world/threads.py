@@ -1,4 +1,4 @@
-"""Threads: a call in one takes a while, and happens all at once when the while has passed."""
+"""Simulated threads: a call runs at once, after a random delay."""
 
 import random
 from collections import deque
@@ -11,20 +11,20 @@ from tests.world.disk import Disk, PowerCutError
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 
 MIN_S, MAX_S = 0.0005, 0.05
-"""So long a call takes."""
-LOOK_S = 1.0
-"""So often is looked whether a hung disk answers."""
+"""Range of the duration of a call [s]."""
+POLL_S = 1.0
+"""Poll interval for a hung disk [s]."""
 
 
 class Threads:
     """The threads of one process.
 
     Args:
-        timeline: The world's.
-        dice: How long calls take.
-        loop: Of the process.
-        disk: The calls of executors and threads that the process makes for itself are for the disk, and hang with it.
-        ended: Told that a call has ended the process, and how.
+        timeline: Timeline of the world.
+        dice: Random durations of calls.
+        loop: Loop of the process.
+        disk: Disk that the process's own executors and threads use, and hang with.
+        ended: Called with the exception class if a call has ended the process.
     """
 
     def __init__(
@@ -39,11 +39,11 @@ class Threads:
         loop.threads = _Pool(self)
 
     def executor(self, *_: Any, thread_name_prefix: str = "", **__: Any) -> Executor:
-        """In place of ``ThreadPoolExecutor``, with one thread."""
+        """Replacement of ``ThreadPoolExecutor`` with one thread."""
         return _Single(self, thread_name_prefix)
 
     def thread(self, *, target: Callable[..., Any], args: tuple[Any, ...] = (), **_: Any) -> Any:
-        """In place of ``Thread``."""
+        """Replacement of ``Thread``."""
         single = _Single(self, "")
         single.start = lambda: single.submit(target, *args)  # type: ignore[attr-defined]
         return single
@@ -51,7 +51,7 @@ class Threads:
     def later(
         self, call: Callable[[], Any], future: Future[Any], then: Callable[[], None], database: bool | None
     ) -> None:
-        """Have ``call`` happen; ``database``: it is one, None: it has nothing to do with the disk."""
+        """Schedule a call; ``database``: whether it uses a database, None: it does not use the disk."""
         delay_s = self._dice.uniform(MIN_S, MAX_S)
         self._timeline.after(delay_s, lambda: self._work(call, future, then, database))
 
@@ -61,7 +61,7 @@ class Threads:
         if not self.loop.alive:
             return
         if database is not None and self._disk.hung:
-            self._timeline.after(LOOK_S, lambda: self._work(call, future, then, database))
+            self._timeline.after(POLL_S, lambda: self._work(call, future, then, database))
             return
         try:
             value = self._disk.transaction(call, self._timeline.now_s) if database else call()
@@ -71,7 +71,7 @@ class Threads:
         except (KilledError, PowerCutError) as end:
             self._ended(type(end))
             return
-        except Exception as error:  # noqa: BLE001 - whatever it is, who waits gets it
+        except Exception as error:  # noqa: BLE001 - passed to the caller
             _end(future, None, error)
         else:
             _end(future, value, None)
@@ -79,7 +79,7 @@ class Threads:
 
 
 class _Pool(Executor):
-    """As many threads as there are calls."""
+    """Pool with a thread for each call."""
 
     def __init__(self, threads: Threads) -> None:
         self._threads = threads
@@ -91,7 +91,7 @@ class _Pool(Executor):
 
 
 class _Single(Executor):
-    """One thread, for the disk."""
+    """Single thread for the disk."""
 
     def __init__(self, threads: Threads, name: str) -> None:
         self._threads, self._is_database = threads, name == "database"

@@ -1,4 +1,4 @@
-"""One world from one seed: pack, board, cable, machine, disk, broker, the service in it, and what befalls them."""
+"""World of a simulation, determined by a seed: pack, board, cable, machine, disk, broker, the service, and faults."""
 
 import asyncio
 import contextlib
@@ -30,7 +30,7 @@ from tests.world import invariants
 from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError
 from tests.world.faults import CLOCK, Fault, schedule, usual
-from tests.world.invariants import Band, Flowed, InvariantError, Reference, Said, Truth
+from tests.world.invariants import Band, Flowed, InvariantError, PublishedStates, Reference, Truth
 from tests.world.line import Board, Cable
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 from tests.world.pack import CELL, new_pack
@@ -41,38 +41,38 @@ NAME = "pack"
 ROOT = f"bms/{NAME}"
 PUBLISH_HZ = 0.1
 RESOLUTION_V, NOISE_V = 5.0 / 1024, 0.001
-"""Of a board whose converter sees the cell without a divider."""
-CALM_S = 420.0
-"""At the end nothing happens, and all must be as it should [s]."""
-KNOWN, KNOWN_STD = 0.5, (0.005, 0.02)
-"""So many worlds begin with a SOC that is known, with a standard deviation between these: their bands are narrow."""
-WRONG_CLOCK = 0.5
-"""In so many worlds with a board that has a clock it jumps."""
+"""Resolution and noise of a board that measures the cell without a divider [V]."""
+FAULT_FREE_S = 420.0
+"""Duration at the end without faults, after which all invariants must hold [s]."""
+KNOWN_SOC_FRACTION, KNOWN_SOC_STD = 0.5, (0.005, 0.02)
+"""Fraction of worlds with a known initial SOC, and range of its standard deviation. Their SOC intervals are narrow."""
+CLOCK_FAULT_FRACTION = 0.5
+"""Fraction of worlds with the binary protocol in which the board's clock has faults."""
 SHARED = Path("/dev/shm")
 LAST_LINES = 60
 FORGOTTEN_BY_AIOMQTT = "Future exception was never retrieved: MqttCodeError('Unexpected disconnection')"
-"""Of a connection that came and was lost while the process stood still it drops the reason, unread; the loop says so."""
+"""Reported by the loop if a connection was made and lost while the process was frozen: aiomqtt drops the exception unread."""
 BOOT_S = 5.0
-LOOK_S = 5.0
-"""What costs more to look at is looked at so often [s]."""
+EXPENSIVE_CHECK_S = 5.0
+"""Interval of the expensive checks [s]."""
 
 
 @dataclass
 class Result:
-    """What became of a seed."""
+    """Result of a world."""
 
     seed: int
     seconds: float
     wrong: str = ""
     digest: str = ""
-    """Of all that was published, and when: the same bits give the same."""
+    """Digest of all published messages and their times."""
     log: list[str] = field(default_factory=list)
     band: Band = field(default_factory=Band)
     figures: dict[str, float] = field(default_factory=dict)
 
 
 class Probe:
-    """A further sink of the service: sees each snapshot as all sinks do."""
+    """Sink that passes each snapshot of the service to the world."""
 
     def __init__(self, take: Callable[[Snapshot], None]) -> None:
         self.publish = take
@@ -98,25 +98,25 @@ class Process:
     delivered_s: float = 0.0
     delivered_bytes: int = 0
     heard_s: float = 0.0
-    """When the last valid sample was sent that it was given."""
+    """Time at which the last delivered valid sample was sent [s]."""
     withheld: int = 0
     first_ahead_s: float | None = None
-    """By so much the samples' time was ahead of the true one first, it begins anywhere; after ..."""
+    """First lead of the samples' clock over the true time since ``thawed_s`` [s]; None: not measured yet."""
     thawed_s: float = 0.0
-    """... it was frozen the last time: what came meanwhile came late."""
+    """End of the last freeze [s]. Data that arrived meanwhile are late."""
     foreign: bool = False
-    """It was given bytes of another board."""
+    """True if it has received bytes of another board."""
     disk_failed: bool = False
-    """What it told of charge and energy may be on no disk."""
+    """True if its published charge and energy may not be on disk."""
 
 
 class World:
-    """All of it.
+    """Simulated world.
 
     Args:
-        seed: From which all follows.
-        seconds: How long it lasts.
-        faults: What befalls it; None: as the seed has it.
+        seed: Seed of all random values.
+        seconds: Duration [s].
+        faults: Faults; None: drawn from the seed.
     """
 
     def __init__(self, seed: int, seconds: float, faults: list[Fault] | None = None) -> None:
@@ -157,21 +157,21 @@ class World:
         self.kill_after: int | None = None
         self.threads: Threads | None = None
         self.disk_good_s = 0.0
-        self.said, self.band, self.flowed = Said(), Band(), Flowed()
+        self.said, self.band, self.flowed = PublishedStates(), Band(), Flowed()
         self.online = Truth(ONLINE_S)
         self.sensor_online = Truth(SENSOR_ONLINE_S)
         self.will_certain = True
         self._digest = hashlib.sha256()
         self.log: deque[str] = deque(maxlen=LAST_LINES)
         self.figures: dict[str, float] = {"handles": 0, "runs": 0, "states": 0}
-        self.faults = self._draw_faults(seconds - CALM_S, text=text) if faults is None else faults
+        self.faults = self._draw_faults(seconds - FAULT_FREE_S, text=text) if faults is None else faults
         self.say_lines = False
 
     def _draw_faults(self, until_s: float, *, text: bool) -> list[Fault]:
-        """What befalls it; in a part of the worlds the board's clock, too."""
+        """Draw the faults of the world, in some worlds also of the board's clock."""
         drawn = schedule(self.dice["drawn"], until_s, usual(auto=self.auto, text=text))
         clock = random.Random(f"{self.seed} clock")
-        wrong = not text and clock.random() < WRONG_CLOCK
+        wrong = not text and clock.random() < CLOCK_FAULT_FRACTION
         return drawn + schedule(clock, until_s, CLOCK) if wrong else drawn
 
     def _draw_settings(self, dice: random.Random) -> Settings:
@@ -180,8 +180,8 @@ class World:
         self.auto = dice.random() < 0.5
         pack, identifier = PackSettings(name=NAME, cell="chen_mora"), IdentifierSettings()
         known = random.Random(f"{self.seed} known")
-        if known.random() < KNOWN:
-            std = known.uniform(*KNOWN_STD)
+        if known.random() < KNOWN_SOC_FRACTION:
+            std = known.uniform(*KNOWN_SOC_STD)
             told = min(max(known.gauss(self.pack.soc, std), 0.0), 1.0)
             pack, identifier = pack.model_copy(update={"initial_soc": told}), IdentifierSettings(soc_std=std)
         return Settings(
@@ -199,7 +199,7 @@ class World:
     # the run
 
     def run(self) -> Result:
-        """Until the end, or until something does not hold that must."""
+        """Run to the end or to the first violated invariant."""
         if not self.auto:
             port = str(self.cable.folder / self.port_name)
             sensor = self.settings.sensor.model_copy(update={"port": port})
@@ -219,7 +219,7 @@ class World:
                 self._live()
             except InvariantError as error:
                 wrong = f"at {self.timeline.now_s:.3f} s: {error}"
-            except (Exception, KilledError, PowerCutError) as error:  # noqa: BLE001 - one line to run again, too
+            except (Exception, KilledError, PowerCutError) as error:  # noqa: BLE001 - any error is a result of the seed
                 wrong = f"at {self.timeline.now_s:.3f} s: the simulation: {error!r}"
         return self._result(wrong)
 
@@ -240,8 +240,8 @@ class World:
         self._look()
         self.start_process()
         for fault in self.faults:
-            self.timeline.at(fault.at_s, lambda fault=fault: self._befall(fault))
-        self.timeline.at(self.seconds - CALM_S, self._calm)
+            self.timeline.at(fault.at_s, lambda fault=fault: self._apply_fault(fault))
+        self.timeline.at(self.seconds - FAULT_FREE_S, self._calm)
         while self.timeline.now_s < self.seconds:
             process = self.process
             if process is not None and process.loop.busy:
@@ -251,11 +251,11 @@ class World:
         self._check_end()
 
     def _calm(self) -> None:
-        """What waits to befall the next write or handle does not any more."""
+        """Disarm faults that wait for the next write or handle."""
         self.disk.arm = self.kill_after = None
 
     def _step(self, process: Process) -> None:
-        """One handle of the service, unless it is killed before."""
+        """Run one handle of the service, or kill it if that is due."""
         if self.kill_after is not None:
             self.kill_after -= 1
             if self.kill_after < 0:
@@ -265,12 +265,12 @@ class World:
                 return
         process.loop.step()
         if process.loop.faults and (faults := [one for one in process.loop.faults if one != FORGOTTEN_BY_AIOMQTT]):
-            self.fail(f"nobody caught: {faults[0]}")
+            self.fail(f"uncaught exception: {faults[0]}")
         if process.main is not None and process.main.done():
             self._ended(process)
 
     def _ended(self, process: Process) -> None:
-        """The service has ended by itself."""
+        """Handle the end of the service: fail if it ended with an error."""
         error = None if process.main is None or process.main.cancelled() else process.main.exception()
         if isinstance(error, InvariantError):
             raise error
@@ -280,13 +280,13 @@ class World:
         self.end_process(silently=False)
 
     def _forgotten_s(self, *, clean: bool, silently: bool) -> float:
-        """What the service had heard or said for longer outlives its end [s]."""
+        """Return the age beyond which sent and received messages survive the end of the process [s]."""
         if self.disk.bad or self.timeline.now_s < self.disk_good_s + (POWER_S if silently else 0.0):
             return math.inf
         return POWER_S if silently else 0.0 if clean else KILL_S
 
     def _ended_in_thread(self, how: type[BaseException]) -> None:
-        """A write has ended the process, or more."""
+        """Handle a kill or a power cut during a write."""
         self.note(f"{how.__name__} at a write")
         if how is PowerCutError:
             self.cut_power(self.dice["faults"].uniform(1.0, 300.0))
@@ -299,7 +299,7 @@ class World:
         return self.threads
 
     def start_process(self) -> None:
-        """The service is started, if there is power and it does not run."""
+        """Start the service if there is power and it does not run."""
         if not self.powered or self.process is not None or self.timeline.now_s >= self.seconds:
             return
         self.runs += 1
@@ -320,7 +320,7 @@ class World:
         )
 
     def end_process(self, *, silently: bool) -> None:
-        """The process is no more; ``silently``: nor is the machine."""
+        """End the process; ``silently``: without closing its connections, because the machine ends too."""
         process, self.process = self.process, None
         if process is None:
             return
@@ -339,7 +339,7 @@ class World:
         self.timeline.after(min(self.dice["faults"].expovariate(1.0 / 20.0) + 0.2, 300.0), self.start_process)
 
     def cut_power(self, off_s: float) -> None:
-        """The machine is without power, and back after a time; the board, too, is fed by it."""
+        """Cut the power of the machine and its board, and restore it after ``off_s``."""
         self.note("power cut")
         self.powered = False
         self.end_process(silently=True)
@@ -358,7 +358,7 @@ class World:
     # the board
 
     def _tick_board(self) -> None:
-        """A sample."""
+        """Let the board measure and send a sample, and schedule the next one."""
         board = self.cable.board or self.board
         now_s = self.timeline.now_s
         reading = self.pack(now_s)
@@ -380,17 +380,17 @@ class World:
             board = self.process.board
             no_room = (
                 board is not None and len(board._board_check._pending) == MAX_PENDING_READS
-            )  # samples that find none are not counted
+            )  # samples beyond this limit are not counted
             self.process.foreign |= no_room or self.cable.board is self.foreigner
             if not self.board.text and self.process.reference.feed(data):
                 self.process.heard_s = self.sampled_s
             self.process.delivered_s = self.timeline.now_s
             self.process.delivered_bytes += len(data)
 
-    # what the service says
+    # messages of the service
 
     def _published(self, process: Process, snapshot: Snapshot) -> None:
-        """A snapshot, as each sink gets it."""
+        """Check a snapshot of the service."""
         process.snapshot = snapshot
         if snapshot.estimate is None:
             return
@@ -400,13 +400,13 @@ class World:
         process.disk_failed |= self._disk_fails
         if wrong := self.flowed.take(snapshot.estimate, kept=not process.disk_failed):
             self.fail(wrong)
-        behind = self._reads(process) > 0  # it was frozen: the state is of a sample before those that wait
+        behind = self._reads(process) > 0  # after a freeze the state is older than the waiting samples
         if not behind and (wrong := self.band.take(snapshot, self.seen_soc)):
             self.fail(wrong)
         self._check_time(process, snapshot.estimate.board_time_s)
 
     def _received(self, packet: Packet, connection: Connection | None) -> None:
-        """The broker has a message."""
+        """Check a message that reached the broker."""
         self._digest.update(f"{self.timeline.now_s:.9f} {packet.topic}".encode())
         self._digest.update(packet.payload.replace(self._path, b"."))
         if self.say_lines:
@@ -421,17 +421,17 @@ class World:
 
     @property
     def _disk_fails(self) -> bool:
-        """Or has done so a moment ago."""
+        """True if the disk is faulty, or was until recently."""
         return self.disk.bad or self.timeline.now_s < self.disk_good_s
 
-    # what must hold
+    # invariants
 
     def _look(self) -> None:
-        """Once a second."""
+        """Check the invariants; called once a second."""
         now_s = self.timeline.now_s
         process = self.process
         idle = process is not None and not process.loop.busy and now_s >= process.loop.frozen_until_s
-        if process is not None and idle and now_s % LOOK_S < 1.0:
+        if process is not None and idle and now_s % EXPENSIVE_CHECK_S < 1.0:
             self._check_counts(process)
             self._check_memory(process)
             self._check_board(process)
@@ -441,7 +441,7 @@ class World:
         self.timeline.after(1.0, self._look)
 
     def _check_counts(self, process: Process) -> None:
-        """Each byte that came was given to the decoder or is counted; each valid sample was taken, or dropped and counted."""
+        """Check that each byte was decoded or counted, and each valid sample used, or dropped and counted."""
         if process.board is None:
             return
         door, counters = process.board._board_check, process.board.counters
@@ -457,7 +457,7 @@ class World:
                 self.fail(f"{process.reference.samples} samples came, {taken} are counted: {counters}")
 
     def _reopened(self, process: Process, door: BoardCheck, opened: Callable[[], None]) -> None:
-        """A port that was lost before its board was known: what it said is nobody's."""
+        """Discount the samples of a port that was lost before its board was identified."""
         if door.pending_protocol is not None:
             nobodys = Reference()
             nobodys.feed(b"".join(data for _, data in door._pending))
@@ -465,7 +465,7 @@ class World:
         opened()
 
     def _check_board(self, process: Process) -> None:
-        """The samples that are taken are the pack's own board's."""
+        """Check that the used samples are from the pack's own board."""
         if process.board is None:
             return
         taken = process.board.board.get("serial")
@@ -473,7 +473,7 @@ class World:
             self.fail(f"board {taken} is taken for the pack's")
 
     def _check_time(self, process: Process, time_s: float) -> None:
-        """No time is counted that was none. Not where the last samples were withheld: the state is of an older one."""
+        """Check that the samples' clock does not run ahead. Skipped while samples are withheld, because the state is then older."""
         before, process.withheld = process.withheld, process.board.counters.get("before_hello", 0)
         if process.withheld != before:
             return
@@ -484,13 +484,13 @@ class World:
         if process.first_ahead_s is None or process.thawed_s != thawed_s:
             process.first_ahead_s, process.thawed_s = ahead_s, thawed_s
         if ahead_s > process.first_ahead_s + AHEAD_S:
-            self.fail(f"{ahead_s - process.first_ahead_s:.1f} s are counted that were none")
+            self.fail(f"{ahead_s - process.first_ahead_s:.1f} s too much are counted")
 
     def _reads(self, process: Process) -> int:
         return int(process.board._port._chunks.qsize())
 
     def _check_memory(self, process: Process) -> None:
-        """Nothing grows."""
+        """Check the limits of tasks, handles and reads."""
         tasks = sum(not task.done() for task in process.loop._tasks)
         if tasks > invariants.MAX_TASKS:
             self.fail(f"{tasks} tasks")
@@ -500,7 +500,7 @@ class World:
             self.fail(f"{self._reads(process)} reads wait")
 
     def _check_availability(self, now_s: float) -> None:
-        """What the broker retains of us is true."""
+        """Check the retained availability messages."""
         broker, process = self.broker, self.process
         can_tell = broker.up and broker.reachable and now_s >= broker.frozen_until_s
         truth = None
@@ -522,7 +522,7 @@ class World:
             self.fail(f"sensor availability: {wrong}")
 
     def _check_end(self) -> None:
-        """After a time without faults all is as it should be."""
+        """Check the end state after the time without faults."""
         process = self.process
         if process is None:
             self.fail("the service does not run")
@@ -534,28 +534,28 @@ class World:
             self.fail(f"the broker never got the states {lost}")
 
     def fail(self, wrong: str) -> None:
-        """Something does not hold.
+        """Report a violated invariant.
 
         Raises:
-            InvariantError: Always; where the service catches it, it is raised again when that has ended.
+            InvariantError: Always. If the service catches it, it is raised again when the service has ended.
         """
         raise InvariantError(wrong)
 
-    # what befalls it
+    # faults
 
-    def _befall(self, fault: Fault) -> None:
+    def _apply_fault(self, fault: Fault) -> None:
         self.note(f"fault: {fault}")
-        fault.befall(self)
+        fault.apply(self)
 
     # the rest
 
     def note(self, line: str) -> None:
-        """For who looks into a seed."""
+        """Add a line to the log of the world."""
         self.log.append(f"{self.timeline.now_s:10.3f} {line}")
 
     @contextlib.contextmanager
     def _log_kept(self) -> Iterator[None]:
-        """The service's log lines come between our own."""
+        """Add the service's log lines to the log of the world."""
         kept = structlog.get_config()
 
         def keep(_: Any, level: str, event: dict[str, Any]) -> str:
@@ -571,7 +571,7 @@ class World:
 
     @contextlib.contextmanager
     def _checkpoint_seen(self) -> Iterator[None]:
-        """What the service finds on the disk when it starts is whole."""
+        """Check that no checkpoint is rejected at a start."""
         load = CheckpointFile.load
 
         def loaded(file: CheckpointFile) -> CheckpointContent:
@@ -588,7 +588,7 @@ class World:
 
     @contextlib.contextmanager
     def _board_seen(self) -> Iterator[None]:
-        """The counters of the service's source are read."""
+        """Give the world access to the service's source and its counters."""
         made = service.SerialSource
 
         def make(*arguments: Any, **named: Any) -> Any:
@@ -608,18 +608,17 @@ class World:
 
 
 KILL_S = 6.0
-"""A kill may cost what was said or acknowledged so long before: what waits is written each second, and of a broker that
-seems to be there only after three."""
+"""Messages of this time before a kill may be lost or repeated [s]: the queue is written each second, but only after 3 s without an
+acknowledgment while the broker is connected."""
 POWER_S = 37.0
-"""The same of a power cut: a commit reaches the platter within half a minute."""
+"""Messages of this time before a power cut may be lost or repeated [s]: the database is synced within half a minute."""
 AHEAD_S = 3.0
-"""So much at most the samples' time gets ahead between two states: a jump of the board's clock by less than 2 s is believed."""
+"""Maximum lead that the samples' clock may gain [s]: the service accepts a jump of the board's clock by less than 2 s."""
 THAW_S = 15.0
-"""So long after a process was frozen its states may be old, and a reset of the board meanwhile has come too late to be told from
-an outage."""
+"""Time after a freeze in which states may be old [s]. A board reset during the freeze cannot be distinguished from an outage."""
 RETRY_S = 25.0
-"""So long after a disk has been at fault it is used again: a hung call is given 10 s, and 10 s pass until the next."""
+"""Maximum time from the end of a disk fault until the disk is used again [s]: 10 s timeout of a hung call, 10 s until the next."""
 ONLINE_S = 45.0
-"""So long after the broker can be told the retained availability is right."""
+"""Maximum time until the retained availability is correct [s], once the broker can receive it."""
 SENSOR_ONLINE_S = 50.0
-"""The same of the sensor's; samples count as gone after three publish periods of 10 s."""
+"""Maximum time until the sensor's retained availability is correct [s]: samples count as missing after three publish periods of 10 s."""
