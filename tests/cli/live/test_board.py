@@ -42,7 +42,7 @@ def virtual(**options):
 def patient(monkeypatch):
     """For boards that answer."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
-    monkeypatch.setattr(device_detection, "REFERENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "REFERENCE_TIMEOUT_S", LONG_S)
 
 
 @pytest.fixture
