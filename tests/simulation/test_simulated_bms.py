@@ -1,4 +1,4 @@
-"""Simulated BMS on a pseudo-terminal before the real reader of serial lines: values, cells, faults, silence, replay."""
+"""Simulated BMS on a pseudo-terminal read by the real serial source: values, cells, faults, silence, replay."""
 
 import asyncio
 import contextlib
@@ -32,7 +32,7 @@ COUNTED = {
 FASTER = {
     "protocols.base.polled_protocol.POLL_CYCLE_S": 0.1,
     "protocols.base.polled_protocol.QUERY_INTERVAL_S": 0.01,
-    "sources.serial.serial_source.TALK_S": 0.02,
+    "sources.serial.serial_source.SEND_INTERVAL_S": 0.02,
 }
 """Than a BMS is asked, to spare time."""
 

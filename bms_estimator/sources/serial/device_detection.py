@@ -199,7 +199,7 @@ class BoardClient:
         """Wait for a response.
 
         Raises:
-            UserError: There is none in time, the port is lost, or the device prints text.
+            UserError: No response arrives in time, the port is lost, or the device prints text.
         """
 
         def answer_or_text() -> Answer | None:

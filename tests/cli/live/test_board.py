@@ -42,7 +42,7 @@ def virtual(**options):
 def patient(monkeypatch):
     """Set long timeouts, for boards that respond."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
-    monkeypatch.setattr(device_detection, "REFERENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "REFERENCE_TIMEOUT_S", LONG_S)
 
 
 @pytest.fixture

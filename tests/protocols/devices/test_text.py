@@ -35,7 +35,7 @@ def fed(data: bytes, cuts: list[int]) -> tuple[TextProtocol, SampleBlock, list[l
 
 @settings(max_examples=300)
 @given(streams, cuttings)
-def test_no_bytes_make_it_raise_and_cutting_them_changes_no_value(data: bytes, cuts: list[int]) -> None:
+def test_no_bytes_raise_and_the_division_into_reads_changes_no_value(data: bytes, cuts: list[int]) -> None:
     decoder, whole, cells = fed(data, [])
     cut_decoder, cut, cut_cells = fed(data, cuts)
     for name in ("voltage_v", "current_a", "temperature_c"):
@@ -60,7 +60,7 @@ def test_the_end_of_a_line_that_is_too_long_is_no_line_of_its_own() -> None:
         (200 * b"x" + b"\n", f"the first: '{60 * 'x'}'..."),
     ],
 )
-def test_the_first_line_that_says_nothing_is_shown_as_it_came(sent: bytes, shown: str) -> None:
+def test_first_invalid_line_is_reported_verbatim(sent: bytes, shown: str) -> None:
     decoder, _, _ = fed(b"half\n" + sent, [])
     assert decoder.fault is not None
     assert shown in decoder.fault
@@ -69,12 +69,12 @@ def test_the_first_line_that_says_nothing_is_shown_as_it_came(sent: bytes, shown
     assert decoder.fault is None
 
 
-def test_bytes_that_are_no_text_are_called_a_wrong_baud_rate() -> None:
+def test_binary_bytes_are_reported_as_wrong_baud_rate() -> None:
     decoder, _, _ = fed(bytes(range(128, 256)) * (MAX_LINE_BYTES // 100), [])
     assert "wrong baud rate" in (decoder.fault or "")
 
 
-def test_cells_stand_beside_their_samples() -> None:
+def test_cells_are_attached_to_their_samples() -> None:
     decoder = TextProtocol()
     block = decoder.feed(1.0, b"V=6.6 I=2 cells=3.31,3.29\n6.6,2\nV=6.6 I=2 cells=3.3\n")
     assert block.size == 3
@@ -84,7 +84,7 @@ def test_cells_stand_beside_their_samples() -> None:
     assert decoder.cells is NO_CELLS
 
 
-def test_many_reads_at_once_are_the_same_samples_and_cells() -> None:
+def test_batch_of_reads_gives_the_same_samples_and_cells() -> None:
     reads = [b"6.6,2,25\nV=6.6 I=2 T=25 ce", b"lls=3.31,3.29\n", b"6.7,2,25\n"]
     one, many = TextProtocol(), TextProtocol()
     blocks = [one.feed(float(i), read) for i, read in enumerate(reads)]
