@@ -85,10 +85,10 @@ def random_steps(duration_s: float, rate_hz: float, *, seed: int, highest_a: flo
 def model_itself(a: Floats, duration_s: float, *, seed: int = 0, noise_v: float = NOISE_V) -> Record:
     """100 Hz of the model with the parameters ``a``, shape (16,), for comparison; steps of the current lie between samples."""
     time_s, current_a = random_steps(duration_s, 500.0, seed=seed)
-    nobody = np.full(time_s.size, np.nan)
-    voltage_v, _ = open_loop(a, np.zeros(8), time_s, current_a, nobody)
+    missing = np.full(time_s.size, np.nan)
+    voltage_v, _ = open_loop(a, np.zeros(8), time_s, current_a, missing)
     voltage_v += np.random.default_rng(seed).normal(0.0, noise_v, time_s.size)
-    return Record(time_s, current_a, voltage_v, nobody, nobody).every(5)
+    return Record(time_s, current_a, voltage_v, missing, missing).every(5)
 
 
 @njit

@@ -89,7 +89,7 @@ class FirmwareBoard:
         self.path = self._process.stdout.readline().decode().strip()
         if not self.path:
             self.__exit__(None, None, None)
-            raise UserError(f"{self._command[0]} does not start; build it anew: make firmware")
+            raise UserError(f"{self._command[0]} does not start; rebuild it: make firmware")
         return self
 
     def __exit__(self, *_: object) -> None:

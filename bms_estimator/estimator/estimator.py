@@ -151,7 +151,7 @@ class Estimator:
             self.record["filter"]["smallest_a"] = 0.0  # the resolution is measured again
 
 
-def estimator_of(settings: Settings, cell: PackModel) -> Estimator:
+def make_estimator(settings: Settings, cell: PackModel) -> Estimator:
     """Create the estimator of a pack.
 
     Args:
@@ -171,8 +171,8 @@ def estimator_of(settings: Settings, cell: PackModel) -> Estimator:
 
 def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
     """Create the estimator of a pack after loading its kernels, so that nothing compiles once samples arrive."""
-    estimator_of(settings, cell).run(np.zeros(1, dtype=SAMPLE))
-    return estimator_of(settings, cell)
+    make_estimator(settings, cell).run(np.zeros(1, dtype=SAMPLE))
+    return make_estimator(settings, cell)
 
 
 def estimate(

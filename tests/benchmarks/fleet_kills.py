@@ -26,7 +26,7 @@ from nats.errors import Error as NatsError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
-from bms_estimator.estimator.estimator import Estimator, estimator_of
+from bms_estimator.estimator.estimator import Estimator, make_estimator
 from bms_estimator.fleet.heartbeat import DEAD_S, Heartbeat
 from bms_estimator.fleet.nats.stored_messages import stored
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
@@ -299,7 +299,7 @@ async def _judge(nc: Client, fleet: SimulatedFleet, plan: Plan, outcome: Outcome
         if state is None or found is None:
             outcome.wrong.append(f"{pack}: in no checkpoint")
             continue
-        estimator = _replayed(fleet, i, len(numbers[pack]), estimator_of(*found))
+        estimator = _replayed(fleet, i, len(numbers[pack]), make_estimator(*found))
         outcome.wrong += _differences(pack, numbers[pack], state[0], estimator)
 
 

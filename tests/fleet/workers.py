@@ -17,7 +17,7 @@ from nats.errors import Error as NatsError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
@@ -172,6 +172,6 @@ def estimated(registry: PackRegistry, pack: str, blocks: int) -> bytes:
     settings, cell = registry(pack) or (None, None)
     assert settings
     assert cell
-    estimator = estimator_of(settings, cell)
+    estimator = make_estimator(settings, cell)
     estimator.run(np.concatenate([samples(pack, number) for number in range(1, blocks + 1)]))
     return estimator.record.tobytes()

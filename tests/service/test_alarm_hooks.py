@@ -345,7 +345,7 @@ async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_p
 
 
 def test_a_relay_hook_sends_the_level_for_a_silent_service() -> None:
-    """Without ``when_silent`` the pin takes the level of an alarm, and `config check` says so."""
+    """Without ``when_silent`` the pin takes the level of an alarm, and `config check` warns about it."""
     settings = Settings.model_validate({"sensor": {"port": "/dev/none"}, "alarms": {"hook": [{"relay": "low"}]}})
     (line,) = hook_warnings(settings)
     assert line.startswith(

@@ -74,7 +74,7 @@ class Service:
 
 @asynccontextmanager
 async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -> AsyncIterator[Service]:
-    """A running service with a board that has said hello."""
+    """A running service with a board that has sent its hello message."""
     line.plug()
     settings = Settings(
         pack=PackSettings(initial_soc=0.5),
@@ -135,9 +135,9 @@ async def test_a_frame_with_a_wrong_checksum_is_counted_and_dropped(line: Line) 
 async def test_a_board_with_a_newer_protocol_is_reported(line: Line) -> None:
     async with service(line, hello=HELLO.encode(version=2)) as live:
         live.line.write(sample(0).encode(version=2))
-        said = await live.until(lambda s: "another version of the protocol" in (s.health.sensor_message or ""))
+        snapshot = await live.until(lambda s: "another version of the protocol" in (s.health.sensor_message or ""))
         _, health = await live.end()
-    assert said.estimate is None
+    assert snapshot.estimate is None
     assert health.line["version_errors"] == 2
 
 
@@ -205,16 +205,16 @@ async def test_saturated_and_implausible_voltages_are_dropped_and_the_sensor_cou
 
 async def test_a_wrong_baud_rate_reaches_the_published_health(line: Line) -> None:
     async with service(line, baud=9600) as live:
-        said = asyncio.create_task(live.until(lambda s: "wrong baud rate" in (s.health.sensor_message or "")))
+        snapshot = asyncio.create_task(live.until(lambda s: "wrong baud rate" in (s.health.sensor_message or "")))
         for n in itertools.count():
             live.line.write(bytes((17 * n + k) % 255 + 1 for k in range(64)))
-            if (await asyncio.wait({said}, timeout=0.02))[0]:
+            if (await asyncio.wait({snapshot}, timeout=0.02))[0]:
                 break
-    assert "9600 baud" in (said.result().health.sensor_message or "")
+    assert "9600 baud" in (snapshot.result().health.sensor_message or "")
 
 
 @pytest.mark.parametrize(
-    ("sent", "told"),
+    ("sent", "expected"),
     [
         (b"3800,0.1\n", "the last of them 3800 V, 0.1 A, where 1.5..4.5 V and up to 5 A are possible: are these millivolts?"),
         (b"V=3.8 I=250\n", "are these milliamperes?"),
@@ -222,18 +222,20 @@ async def test_a_wrong_baud_rate_reaches_the_published_health(line: Line) -> Non
         (b"1e9,0.1\n", "the last of them 1e+09 V, 0.1 A, where 1.5..4.5 V and up to 5 A are possible"),
     ],
 )  # fmt: skip
-async def test_values_out_of_range_are_reported_with_the_range_and_a_hint(line: Line, sent: bytes, told: str) -> None:
+async def test_values_out_of_range_are_reported_with_the_range_and_a_hint(
+    line: Line, sent: bytes, expected: str
+) -> None:
     async with service(line, hello=b"\n", protocol="text") as live:
         live.line.write(sent)
-        said = await live.until(lambda s: "outside the cell's range" in (s.health.sensor_message or ""))
-    assert (said.health.sensor_message or "").endswith(told)
+        snapshot = await live.until(lambda s: "outside the cell's range" in (s.health.sensor_message or ""))
+    assert (snapshot.health.sensor_message or "").endswith(expected)
 
 
 async def test_unexpected_text_of_a_board_is_quoted(line: Line) -> None:
     async with service(line, hello=b"\n", protocol="text") as live:
         live.line.write(b"Vbat=13.3V only\r\nmore\r\n")
-        said = await live.until(lambda s: "the first: 'Vbat=13.3V only'" in (s.health.sensor_message or ""))
-    assert "baud rate" not in (said.health.sensor_message or "")
+        snapshot = await live.until(lambda s: "the first: 'Vbat=13.3V only'" in (s.health.sensor_message or ""))
+    assert "baud rate" not in (snapshot.health.sensor_message or "")
 
 
 async def test_the_state_names_the_lowest_and_highest_cell(line: Line) -> None:
@@ -241,11 +243,11 @@ async def test_the_state_names_the_lowest_and_highest_cell(line: Line) -> None:
         live.line.write(b"V=3.8 I=0.1\n")
         without = await live.until(lambda s: s.estimate is not None)
         live.line.write(b"V=3.8 I=0.1 cells=3.81,3.79,3.80\n")
-        told = await live.until(lambda s: s.estimate is not None and s.estimate.cell_lowest_v is not None)
+        snapshot = await live.until(lambda s: s.estimate is not None and s.estimate.cell_lowest_v is not None)
     assert without.estimate
     assert (without.estimate.cell_lowest_v, without.estimate.cell_highest_v) == (None, None)
-    assert told.estimate
-    assert (told.estimate.cell_lowest_v, told.estimate.cell_highest_v) == (3.79, 3.81)
+    assert snapshot.estimate
+    assert (snapshot.estimate.cell_lowest_v, snapshot.estimate.cell_highest_v) == (3.79, 3.81)
 
 
 async def test_a_former_reason_is_no_longer_reported(line: Line) -> None:
@@ -254,17 +256,17 @@ async def test_a_former_reason_is_no_longer_reported(line: Line) -> None:
         live.line.write(frames(0, 5, voltage_sum=16_000_000))
         await live.until(lambda s: "where 1.5..4.5 V" in (s.health.sensor_message or ""))
         live.line.write(replace(HELLO, boot_id=8, current_uv_per_a=0).encode() + frames(0, 5))
-        said = await live.until(lambda s: s.health.samples["dropped_not_finite"] == 5)
-    message = said.health.sensor_message or ""
-    assert message.endswith("; the last of them tells no current: is the sensor connected?")
+        snapshot = await live.until(lambda s: s.health.samples["dropped_not_finite"] == 5)
+    message = snapshot.health.sensor_message or ""
+    assert message.endswith("; the last of them has no current: is the sensor connected?")
 
 
 async def test_implausible_temperatures_and_cell_voltages_are_not_published(line: Line) -> None:
     async with service(line, hello=b"\n", protocol="text") as live:
         live.line.write(b"V=3.8 I=0.1 T=1e308 cells=3.8,1e308\n")
-        told = await live.until(lambda s: s.estimate is not None)
+        snapshot = await live.until(lambda s: s.estimate is not None)
         _, health = await live.end()
-    assert told.estimate is not None
-    assert told.estimate.temperature_c is None
-    assert (told.estimate.cell_lowest_v, told.estimate.cell_highest_v) == (3.8, 3.8)
+    assert snapshot.estimate is not None
+    assert snapshot.estimate.temperature_c is None
+    assert (snapshot.estimate.cell_lowest_v, snapshot.estimate.cell_highest_v) == (3.8, 3.8)
     assert health.line["implausible"] == 2

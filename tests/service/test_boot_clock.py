@@ -1,4 +1,4 @@
-"""How long nobody measured: across restarts of the service and of the machine."""
+"""Time without samples across restarts of the service and of the machine."""
 
 import ctypes
 import math
@@ -45,7 +45,7 @@ def test_after_a_reboot_the_age_is_unknown_if_the_wall_clock_was_wrong() -> None
 
 
 def test_the_wall_clock_is_trusted_if_the_kernel_reports_synchronisation() -> None:
-    """The C library's ntp_gettime tells the same, without the settings."""
+    """Compare with ntp_gettime of the C library."""
     assert synchronised() == (ctypes.CDLL(None).ntp_gettime(ctypes.create_string_buffer(128)) != 5)
 
 

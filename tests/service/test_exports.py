@@ -48,7 +48,7 @@ async def test_samples_of_a_board_reach_influxdb_and_prometheus(line: Line, tmp_
 
 
 def scraped(listen: str) -> str:
-    """Empty until somebody listens."""
+    """Return an empty text until the server listens."""
     try:
         with urllib.request.urlopen(f"http://{listen}/metrics", timeout=LONG_S) as response:
             return response.read().decode()

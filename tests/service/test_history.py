@@ -73,14 +73,14 @@ async def test_charge_and_energy_survive_restarts(tmp_path: Path) -> None:
     _, charged = await run_at(2.0, tmp_path, *((s, -1.0, v) for s, _, v in hour))
     async with run_with_frequent_saves(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(4.0))) as (source, sink, _):
         source.give(hour[0])
-        told = (await sink.until(lambda s: s.estimate is not None)).estimate
+        estimate = (await sink.until(lambda s: s.estimate is not None)).estimate
     assert ChargeEnergy.of(discharged.health.total) == pytest.approx((2.0, 0.0, 7.6e-3, 0.0))
     assert ChargeEnergy.of(charged.health.total) == pytest.approx((2.0, 1.0, 7.6e-3, 3.8e-3))
-    assert told
-    assert ChargeEnergy(*(getattr(told, name) for name in ChargeEnergy._fields)) == ChargeEnergy.of(
+    assert estimate
+    assert ChargeEnergy(*(getattr(estimate, name) for name in ChargeEnergy._fields)) == ChargeEnergy.of(
         charged.health.total
     )
-    assert told.equivalent_cycles == pytest.approx(2.0 / CELL.cell.capacity_ah)
+    assert estimate.equivalent_cycles == pytest.approx(2.0 / CELL.cell.capacity_ah)
 
 
 async def test_charge_and_energy_are_published_once_saved_so_that_a_kill_does_not_decrease_them(tmp_path: Path) -> None:
@@ -95,11 +95,11 @@ async def test_charge_and_energy_are_published_once_saved_so_that_a_kill_does_no
     async with run_with_frequent_saves(file) as (source, sink, _):
         source.give(*((float(s), 2.0, 3.8) for s in range(1801)))
         last = await sink.until(lambda s: s.health.total.charge_out_ah > 0.9)
-        told = [s.estimate.charge_out_ah for s in sink.snapshots if s.estimate]
-        kept = CheckpointFile(tmp_path, SETTINGS, CELL).load().counters.total.charge_out_ah
+        published = [s.estimate.charge_out_ah for s in sink.snapshots if s.estimate]
+        saved = CheckpointFile(tmp_path, SETTINGS, CELL).load().counters.total.charge_out_ah
         release.set()
     assert last.health.samples["samples"] == 1801
-    assert set(told) == {kept} == {0.0}
+    assert set(published) == {saved} == {0.0}
     assert file.load().counters.total.charge_out_ah == pytest.approx(1.0)
 
 
@@ -164,7 +164,7 @@ async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Pat
 async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_continue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A version is tried, and left again, more often than files are kept; the first are those that have learned most."""
+    """A later version is tried and left more often than files are preserved; the first files have learned most."""
     file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     for attempt in range(MAX_LATER_FILES + 1):
@@ -172,8 +172,8 @@ async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_co
         save_as(FORMAT + 1, file, learned_estimator(), monkeypatch, counted)
         inodes.append(file.path.stat().st_ino)
         health = (await run_samples(tmp_path, samples=1)).health
-        kept = min(attempt + 1, MAX_LATER_FILES)
-        assert f"reads {FORMAT}; set aside as pack.later-{kept}.npz; once the version" in health.checkpoint
+        files = min(attempt + 1, MAX_LATER_FILES)
+        assert f"reads {FORMAT}; set aside as pack.later-{files}.npz; once the version" in health.checkpoint
         assert (health.restarts, health.total.crashes, health.total.unseen_s) == (7 + attempt, 2, 30.0)
     kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, MAX_LATER_FILES + 1)]
     assert kept_inodes == [*inodes[: MAX_LATER_FILES - 1], inodes[MAX_LATER_FILES]]
@@ -187,9 +187,9 @@ async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after
     folder.mkdir()
     save_as(FORMAT + 1, CheckpointFile(folder, SETTINGS, CELL), learned, monkeypatch)
     with capture_logs() as lines:
-        said = (await run_samples(folder, samples=1)).health.checkpoint
-    assert [line["log_level"] for line in lines if line.get("outcome") == said] == ["warning"]
-    before, command, _ = said.split("`")
+        outcome = (await run_samples(folder, samples=1)).health.checkpoint
+    assert [line["log_level"] for line in lines if line.get("outcome") == outcome] == ["warning"]
+    before, command, _ = outcome.split("`")
     assert before.endswith("is installed again, stop the service and ")
     subprocess.run(command, shell=True, check=True)  # noqa: ASYNC221 - as a person would
     monkeypatch.setattr("bms_estimator.checkpoint.checkpoint_file.FORMAT", FORMAT + 1)
@@ -230,7 +230,7 @@ async def test_a_deleted_state_folder_is_recreated_with_access_for_the_owner_onl
             await sink.until(
                 lambda s, n=second + 1: s.health.samples["samples"] == n and s.health.checkpoint == "saved", skip=seen
             )
-            while not folder.exists():  # noqa: ASYNC110 - the disk tells nobody
+            while not folder.exists():  # noqa: ASYNC110 - a file has no event
                 await asyncio.sleep(0.01)
             assert folder.stat().st_mode & 0o777 == 0o700
             shutil.rmtree(folder, ignore_errors=True)
@@ -266,17 +266,17 @@ async def stopped_by_nothing(hung: CheckpointFile) -> None:
 
 
 async def test_after_a_long_gap_the_soc_follows_from_the_voltage(tmp_path: Path) -> None:
-    """The service was off for a week, in which somebody has charged the pack."""
+    """The pack was charged while the service was off for a week."""
     estimator = new_estimator(SETTINGS, CELL)
     for second in range(600):
         estimator.step(float(second), 0.0, 3.75)
     CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(estimator.record, NEW)
-    told, _ = await run_at(24.0 * 7.0, tmp_path, *((float(i), 0.0, 3.95) for i in range(60)))
+    restored, _ = await run_at(24.0 * 7.0, tmp_path, *((float(i), 0.0, 3.95) for i in range(60)))
     fresh = new_estimator(Settings(), CELL)  # its SOC is that of its first voltage
     fresh.step(0.0, 0.0, 3.95)
     assert fresh.state["soc"][0] > estimator.state["soc"][0] + 0.3
-    assert told.state["soc"][0] == pytest.approx(fresh.state["soc"][0], abs=0.03)
-    assert abs(told.state["soc"][0] - fresh.state["soc"][0]) < 2.0 * told.record["filter"]["soc_std"][0]
+    assert restored.state["soc"][0] == pytest.approx(fresh.state["soc"][0], abs=0.03)
+    assert abs(restored.state["soc"][0] - fresh.state["soc"][0]) < 2.0 * restored.record["filter"]["soc_std"][0]
 
 
 def test_gap_lengths_agree_with_the_kernel() -> None:

@@ -140,8 +140,8 @@ async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> Non
         assert "no usable sample" in (silent.health.sensor_message or "")
         seen = len(run.sink.snapshots)
         run.source.give((1.0, 0.1, 380.0))
-        told = await run.sink.until(lambda s: "dropped" in (s.health.sensor_message or ""), skip=seen)
-        assert "dropped since: 1 outside the cell's range" in (told.health.sensor_message or "")
+        snapshot = await run.sink.until(lambda s: "dropped" in (s.health.sensor_message or ""), skip=seen)
+        assert "dropped since: 1 outside the cell's range" in (snapshot.health.sensor_message or "")
         run.source.give((2.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.health.sensor_online, skip=seen)
         later = await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
@@ -185,8 +185,8 @@ async def test_the_drift_of_the_board_s_clock_is_published_once_it_is_measured()
 async def test_the_reason_for_missing_samples_is_published() -> None:
     async with running() as run:
         run.source.message = "waiting for /dev/ttyUSB0: it does not exist"
-        said = await run.sink.until(lambda s: s.health.sensor_message == run.source.message)
-    assert said.estimate is None
+        snapshot = await run.sink.until(lambda s: s.health.sensor_message == run.source.message)
+    assert snapshot.estimate is None
 
 
 async def test_a_step_of_the_wall_clock_changes_time_stamps_only() -> None:
@@ -229,7 +229,7 @@ async def test_health_counts_dropped_messages_and_requests() -> None:
         await run.sink.until(lambda _: True)
         run.delivery.drops = 7
         run.delivery.refused_topics = ["bms/pack/request/+"]
-        run.source.give((0.0, 0.1, 3.8))  # health is made anew when the sensor comes
+        run.source.give((0.0, 0.1, 3.8))  # health is published again when samples arrive
         published = await run.sink.until(lambda s: s.health.sensor_online)
         assert published.health.publish_drops == 7
         assert published.health.refused_topics == ["bms/pack/request/+"]
@@ -345,18 +345,18 @@ async def test_systemd_is_notified_of_ready_watchdog_and_stopping(tmp_path: Path
         systemd.bind(str(tmp_path / "notify"))
         systemd.setblocking(False)
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
-        heard: list[str] = []
+        received: list[str] = []
 
         async def hear(wanted: str, times: int) -> None:
-            while heard.count(wanted) < times:
-                heard.append((await asyncio.get_running_loop().sock_recv(systemd, 4096)).decode())
+            while received.count(wanted) < times:
+                received.append((await asyncio.get_running_loop().sock_recv(systemd, 4096)).decode())
 
         async with asyncio.timeout(LONG_S):
             async with running(notifier=SystemdNotifier([SETTINGS.pack.name], environment)) as run:
                 await hear("WATCHDOG=1", times=3)
                 await run.end()
             await hear("STOPPING=1", times=1)
-    assert heard[0].startswith("READY=1\nSTATUS=")
+    assert received[0].startswith("READY=1\nSTATUS=")
 
 
 async def test_a_source_that_never_waits_does_not_starve_the_sinks() -> None:

@@ -39,7 +39,7 @@ def settings(broker: Broker, **source: object) -> Settings:
 
 
 async def publish(broker: Broker, voltage: str, current: str) -> None:
-    """What the node says of each value: retained, as ESPHome does by default."""
+    """Publish each value as a retained message, the default of ESPHome."""
     values = {"cell_voltage_1": "3.301", "temperature_sensor_1": "21.5", "total_voltage": voltage, "current": current}
     async with aiomqtt.Client("127.0.0.1", broker.port) as client:
         for name, value in values.items():
@@ -64,9 +64,9 @@ async def publishing(broker: Broker, voltage: str, current: str) -> AsyncIterato
 
 
 @contextlib.asynccontextmanager
-async def serving(told: Settings, tap: CaptureRecorder | None = None) -> AsyncIterator[None]:
+async def serving(settings_: Settings, tap: CaptureRecorder | None = None) -> AsyncIterator[None]:
     stop = asyncio.Event()
-    service = asyncio.create_task(run_pack_service(told, load_cell("lfp", 100.0).pack(16, 1), stop=stop, tap=tap))
+    service = asyncio.create_task(run_pack_service(settings_, load_cell("lfp", 100.0).pack(16, 1), stop=stop, tap=tap))
     try:
         yield
     finally:
@@ -78,9 +78,9 @@ async def test_readings_over_mqtt_are_estimated_through_disconnections_and_resta
     broker: Broker, tmp_path: Path
 ) -> None:
     await publish(broker, "40.00", "99.0")  # of yesterday: the broker keeps it
-    told, path = settings(broker), tmp_path / "heard.raw"
-    with CaptureRecorder(path, header_of(told.sensor, told.source)) as recording:
-        async with serving(told, recording):
+    settings_, path = settings(broker), tmp_path / "heard.raw"
+    with CaptureRecorder(path, header_of(settings_.sensor, settings_.source)) as recording:
+        async with serving(settings_, recording):
             async with Listener(broker, "bms/#") as listener:
                 await estimated(broker, listener)
                 await silent(listener)
@@ -95,7 +95,7 @@ async def test_readings_over_mqtt_are_estimated_through_disconnections_and_resta
 
 
 async def estimated(broker: Broker, listener: Listener) -> None:
-    """What comes is told, what the broker had kept is not."""
+    """Live messages are used, retained ones are not."""
     await listener.wait_json(HEALTH, lambda h: h["line"]["retained"] == 4)
     async with publishing(broker, "53.00", "-12.5"):
         state = await listener.wait_json(STATE)
@@ -113,7 +113,7 @@ async def silent(listener: Listener) -> None:
 
 
 async def garbled(broker: Broker, listener: Listener) -> None:
-    """Payloads that tell no number are counted, and the reason is said."""
+    """Payloads without a number are counted, and the reason is reported."""
     skip = len(listener.messages)
     await publish(broker, "unavailable", "nan")
     reason = f"esphome-jk jk-bms by MQTT, {broker.url}: voltage: jk-bms/sensor/jk-bms_total_voltage/state: no number: "
@@ -123,10 +123,10 @@ async def garbled(broker: Broker, listener: Listener) -> None:
 
 
 async def test_a_publisher_that_needs_requests_is_polled(broker: Broker) -> None:
-    told = settings(broker, profile="venus", prefix="c0619ab", instance="1", ask_s=0.1)
+    settings_ = settings(broker, profile="venus", prefix="c0619ab", instance="1", ask_s=0.1)
 
     async def answer() -> None:
-        """As the device does: what is asked for is published, and nothing else."""
+        """Answer requests only, as the device does."""
         async with aiomqtt.Client("127.0.0.1", broker.port) as client:
             await client.subscribe("R/c0619ab/#")
             async for message in client.messages:
@@ -135,7 +135,7 @@ async def test_a_publisher_that_needs_requests_is_polled(broker: Broker) -> None
                         payload = '{"value":%s}' % ("null" if value is None else value)
                         await client.publish(f"N/c0619ab/battery/1/{name}", payload)
 
-    async with Listener(broker) as listener, serving(told):
+    async with Listener(broker) as listener, serving(settings_):
         device = asyncio.create_task(answer())
         try:
             state = await listener.wait_json(STATE)
@@ -162,9 +162,11 @@ async def test_the_next_broker_is_tried_and_the_unreachable_one_is_named(broker:
 
 
 async def test_a_second_publisher_raises_sensor_fault(broker: Broker) -> None:
-    """The true node says 5 A; then another one, which answers each of its messages at once, says -80 A."""
-    told = settings(broker, profile=None, prefix=None, topic="home/pack", voltage="u", current="i", interval_s=2.0)
-    told = told.model_copy(update={"alarms": AlarmSettings.model_validate({"sensor_fault": {"delay_s": 0.5}})})
+    """The real node publishes 5 A. A second one answers each of its messages with -80 A."""
+    settings_ = settings(broker, profile=None, prefix=None, topic="home/pack", voltage="u", current="i", interval_s=2.0)
+    settings_ = settings_.model_copy(
+        update={"alarms": AlarmSettings.model_validate({"sensor_fault": {"delay_s": 0.5}})}
+    )
     attacked = asyncio.Event()
 
     async def nodes() -> None:
@@ -175,7 +177,7 @@ async def test_a_second_publisher_raises_sensor_fault(broker: Broker) -> None:
                     await client.publish("home/pack", b'{"u": 53.0, "i": -80.0}')
                 await asyncio.sleep(0.05)
 
-    async with Listener(broker, "bms/#") as listener, serving(told):
+    async with Listener(broker, "bms/#") as listener, serving(settings_):
         publishers = asyncio.create_task(nodes())
         try:
             await listener.wait_json(STATE, lambda s: s["frames_received"] > 20)

@@ -1,4 +1,4 @@
-"""``run_pack_service``: what its log says before the first sample, and where the state goes."""
+"""``run_pack_service``: log lines before the first sample, and the state folder."""
 
 import asyncio
 import re
@@ -23,14 +23,14 @@ async def test_implausible_settings_are_logged():
     stop.set()
     with capture_logs() as lines:
         await run_pack_service(settings, load_cell("ncr18650").pack(14, 1), stop=stop)
-    said = [line["reason"] for line in lines if line["event"] == "implausible setting"]
-    assert len(said) == 2
-    assert "14 in series of 3 Ah" in said[0]
-    assert "the board's range ends at 25.0 V" in said[1]
+    text = [line["reason"] for line in lines if line["event"] == "implausible setting"]
+    assert len(text) == 2
+    assert "14 in series of 3 Ah" in text[0]
+    assert "the board's range ends at 25.0 V" in text[1]
 
 
 @pytest.mark.parametrize(
-    ("names", "ports", "mqtt", "said"),
+    ("names", "ports", "mqtt", "text"),
     [
         (("a", "a"), ("/dev/one", "/dev/two"), {}, "pack.name = a: 2 of the packs have it; give each its own"),
         (("a", "b"), ("/dev/one", "/dev/one"), {}, "sensor.port = /dev/one: 2 of the packs have it; give each its own"),
@@ -43,13 +43,13 @@ async def test_implausible_settings_are_logged():
     ],
 )
 async def test_the_error_names_the_pack_that_cannot_be_served(
-    names: tuple[str, str], ports: tuple[str, str], mqtt: dict[str, str], said: str, state_home: Path
+    names: tuple[str, str], ports: tuple[str, str], mqtt: dict[str, str], text: str, state_home: Path
 ) -> None:
     cell, packs = load_cell("chen_mora"), []
     for name, port in zip(names, ports, strict=True):
         tables = {"pack": {"name": name}, "sensor": {"port": port}} | ({"mqtt": mqtt} if mqtt and name == "b" else {})
         packs.append((Settings.model_validate(tables), cell))
-    with pytest.raises(UserError, match=f"^{re.escape(said)}"):
+    with pytest.raises(UserError, match=f"^{re.escape(text)}"):
         await asyncio.wait_for(run_pack_services(packs), LONG_S)
 
 

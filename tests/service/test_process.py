@@ -1,4 +1,4 @@
-"""The real program: signals, a kill, the broker's view of both, what it says when it cannot start."""
+"""The real program: signals, kills, their effect at the broker, and errors at the start."""
 
 import asyncio
 import contextlib
@@ -111,9 +111,9 @@ async def ended(process: Process) -> list[Any]:
 
 
 async def feed(line: Line) -> None:
-    """A board that prints text at 50 Hz, whether somebody reads it or not."""
-    with contextlib.suppress(OSError):  # nobody has opened it yet
-        line.received()  # leaves its end such that a full line holds nobody up
+    """Print text as a board at 50 Hz, whether it is read or not."""
+    with contextlib.suppress(OSError):  # not opened yet
+        line.received()  # the board continues while the line is full
     while True:
         with contextlib.suppress(BlockingIOError):
             line.write(b"3.80,0.10,25.0\r\n")
@@ -139,9 +139,9 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
             lines = await ended(process)
         await live.wait("bms/pack/availability", lambda p: p == b"offline", skip=before)
     board.cancel()
-    (kept,) = checkpoints(state_home)  # nobody has named a folder
-    assert {path.stat().st_mode & 0o077 for path in (kept.parent, *kept.parent.iterdir())} == {0}
-    assert str(kept) in {line.get("file") for line in lines}
+    (checkpoint,) = checkpoints(state_home)  # no folder is configured
+    assert {path.stat().st_mode & 0o077 for path in (checkpoint.parent, *checkpoint.parent.iterdir())} == {0}
+    assert str(checkpoint) in {line.get("file") for line in lines}
 
 
 async def test_a_full_disk_does_not_end_the_service(
@@ -154,11 +154,11 @@ async def test_a_full_disk_does_not_end_the_service(
     async with Listener(broker) as live:
         with (full_disk / "log").open("w") as log:
             async with service(pack, stderr=log) as process:
-                said = "cannot be saved: [Errno 28] No space left on device"
-                await live.wait_json("bms/pack/health", lambda h: h["checkpoint"] == said)
+                output = "cannot be saved: [Errno 28] No space left on device"
+                await live.wait_json("bms/pack/health", lambda h: h["checkpoint"] == output)
                 before = len(live.messages)
-                told = await live.wait_json("bms/pack/state", skip=before)
-                frames = told["frames_received"] + 20
+                state = await live.wait_json("bms/pack/state", skip=before)
+                frames = state["frames_received"] + 20
                 await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > frames, skip=before)
                 process.send_signal(signal.SIGTERM)
                 assert await asyncio.wait_for(process.wait(), LONG_S) == 0
@@ -167,7 +167,7 @@ async def test_a_full_disk_does_not_end_the_service(
 
 @contextlib.contextmanager
 def unread_pipe() -> Iterator[int]:
-    """The end to write to of a pipe that is full, and that nobody reads."""
+    """Yield the write end of a full pipe that is not read."""
     read, write = os.pipe()
     os.set_blocking(write, False)
     with contextlib.suppress(BlockingIOError):
@@ -187,17 +187,17 @@ async def test_a_stopping_service_saves_first_although_its_broker_hangs(
     line.plug()
     board = asyncio.create_task(feed(line))
     async with Listener(broker) as live, service(pack_file(tmp_path, line, broker)) as process:
-        told = await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 50)
+        state = await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 50)
         broker.freeze()
         await ended(process)
-        heard = len(live.messages)
+        seen = len(live.messages)
         broker.thaw()
-        await live.wait("bms/pack/availability", lambda said: said == b"offline", skip=heard)
+        await live.wait("bms/pack/availability", lambda payload: payload == b"offline", skip=seen)
     board.cancel()
-    (kept,) = checkpoints(state_home)
-    with np.load(kept) as saved:
+    (checkpoint,) = checkpoints(state_home)
+    with np.load(checkpoint) as saved:
         assert saved["clean"]
-        assert saved["state"]["observer"]["samples"][0] >= told["frames_received"]
+        assert saved["state"]["observer"]["samples"][0] >= state["frames_received"]
 
 
 async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shutdown(
@@ -246,9 +246,9 @@ async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_r
     folder = disk_without_files / "state"
     async with service(pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{folder}"')) as process:
         assert process.stderr
-        said = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
+        output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
         assert await process.wait() == 1  # 2 is never restarted
-    assert said == f"error: state.folder = {folder}: No space left on device\n"
+    assert output == f"error: state.folder = {folder}: No space left on device\n"
 
 
 async def test_two_packs_in_one_process_have_their_own_board_topics_log_and_checkpoint(

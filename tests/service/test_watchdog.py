@@ -1,4 +1,4 @@
-"""What systemd and health hear of a loop that turns, of a source that hangs, and of what waits."""
+"""What systemd and health wait_for of a loop that turns, of a source that hangs, and of what waits."""
 
 import asyncio
 import contextlib
@@ -33,7 +33,7 @@ class Systemd:
         self._socket.setblocking(False)
         self.notifier = SystemdNotifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "30000"})
 
-    async def hear(self, wanted: str) -> str:
+    async def wait_for(self, wanted: str) -> str:
         """Wait for a state that begins so."""
         async with asyncio.timeout(LONG_S):
             while True:
@@ -41,7 +41,7 @@ class Systemd:
                 if state.startswith(wanted):
                     return state
 
-    def heard(self) -> list[str]:
+    def received(self) -> list[str]:
         """What has come since."""
         states = []
         with contextlib.suppress(BlockingIOError):
@@ -65,16 +65,16 @@ async def test_a_hanging_source_stops_the_watchdog_notifications(systemd: System
     source, sink = ScriptedSource(), Collector()
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
     task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges, source_health=lambda: health))
-    await systemd.hear("WATCHDOG=1")  # nothing comes, but somebody tries
+    await systemd.wait_for("WATCHDOG=1")  # no sample arrives, but the source still tries
     health = SourceHealth(publisher.SOURCE_HUNG_S + 1.0, 0.0, 0)
     for _ in range(3):
         await sink.until(lambda _: True, skip=len(sink.snapshots))
-    systemd.heard()
+    systemd.received()
     for _ in range(3):
         await sink.until(lambda _: True, skip=len(sink.snapshots))
-    assert "WATCHDOG=1" not in systemd.heard()
-    source.give((0.0, 0.1, 3.8))  # what flows needs nobody to look after it
-    await systemd.hear("WATCHDOG=1")
+    assert "WATCHDOG=1" not in systemd.received()
+    source.give((0.0, 0.1, 3.8))  # while samples arrive, the state of the task does not matter
+    await systemd.wait_for("WATCHDOG=1")
     source.finish()
     await asyncio.wait_for(task, LONG_S)
 
@@ -94,7 +94,7 @@ async def test_the_idle_time_of_a_source_s_task_grows_while_it_hangs(
         for _ in range(3):
             now_s += 10.0
             async with asyncio.timeout(LONG_S):
-                while board.pulse().task_idle_s > 0.0:  # noqa: ASYNC110 - the board tells nobody
+                while board.pulse().task_idle_s > 0.0:  # noqa: ASYNC110 - the idle time has no event
                     await asyncio.sleep(0.001)
     monkeypatch.setattr(SerialPort, "open", hang)
     async with SerialSource(sensor, monotonic=lambda: now_s) as board:
@@ -107,11 +107,11 @@ async def test_systemctl_status_shows_the_soc_or_the_reason_for_missing_samples(
     source, sink = ScriptedSource(), Collector()
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
     task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges))
-    assert await systemd.hear("READY=1") == "READY=1\nSTATUS=estimating pack"
+    assert await systemd.wait_for("READY=1") == "READY=1\nSTATUS=estimating pack"
     source.message = "waiting for /dev/none: it does not exist"
-    await systemd.hear("STATUS=estimating pack: no samples: ")
+    await systemd.wait_for("STATUS=estimating pack: no samples: ")
     source.give((0.0, 0.1, 3.8))
-    assert (await systemd.hear("STATUS=estimating pack: SOC 0.")).removeprefix("STATUS=estimating pack: SOC ")[
+    assert (await systemd.wait_for("STATUS=estimating pack: SOC 0.")).removeprefix("STATUS=estimating pack: SOC ")[
         :3
     ] == "0.5"
     source.finish()
@@ -131,8 +131,8 @@ async def test_health_contains_latency_and_waiting_reads() -> None:
     source.give((0.0, 0.1, 3.8))
     source.finish()
     await asyncio.wait_for(task, LONG_S)
-    told = {s.health.loop.latency_max_s: s.health.loop for s in sink.snapshots}[0.3]
-    assert (told.latency_p50_s, told.latency_p99_s) == (0.3, 0.3)
+    loop_health = {s.health.loop.latency_max_s: s.health.loop for s in sink.snapshots}[0.3]
+    assert (loop_health.latency_p50_s, loop_health.latency_p99_s) == (0.3, 0.3)
 
 
 def test_latency_percentiles_are_accurate_to_a_fifth() -> None:

@@ -24,7 +24,7 @@ PACK = load_cell("nmc", 10.0).pack(2, 1)
 
 
 class Line(NamedTuple):
-    """What the board says for so many seconds."""
+    """Readings that the board prints for a number of seconds."""
 
     seconds: float
     voltage_v: float = 7.4

@@ -250,21 +250,21 @@ async def test_a_saturated_current_exceeds_any_limit() -> None:
 
 def test_a_second_silence_renews_the_cause_of_a_latched_link_lost() -> None:
     alarms = AlarmEvaluator(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
-    kept = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
-    alarms.restore(json.dumps({"link_lost": kept}))
+    saved = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
+    alarms.restore(json.dumps({"link_lost": saved}))
     alarms.on_silence(1.0, WALL_S, "")
     assert json.loads(alarms.saved_state)["link_lost"]["gone"]
     alarms.on_silence(1000.0, WALL_S, "")
-    assert json.loads(alarms.saved_state)["link_lost"] == kept | {"gone": False}
+    assert json.loads(alarms.saved_state)["link_lost"] == saved | {"gone": False}
     assert alarms.acknowledge(None) == ["link_lost"]
     assert alarms.active == ("link_lost",), "the cause is still there"
 
 
 def test_a_saved_alarm_with_an_invalid_value_is_rejected() -> None:
     alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
-    kept = {"since_s": WALL_S, "value": math.inf, "gone": False, "acknowledged": False}
+    saved = {"since_s": WALL_S, "value": math.inf, "gone": False, "acknowledged": False}
     with pytest.raises(ValueError, match="pack_over_voltage: value = inf"):
-        alarms.restore(json.dumps({"pack_over_voltage": kept}))
+        alarms.restore(json.dumps({"pack_over_voltage": saved}))
 
 
 @pytest.mark.parametrize(

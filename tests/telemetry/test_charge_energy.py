@@ -51,7 +51,7 @@ def test_over_a_gap_and_a_clock_that_was_set_back_nothing_is_counted(until_s: fl
 
 
 def test_slow_samples_are_no_gaps() -> None:
-    """One in a minute: the first step cannot be told from a gap."""
+    """One sample a minute: the first step is indistinguishable from a gap."""
     times_s = 60.0 * np.arange(11.0)
     assert after(trace(times_s, 1.0)).charge_out_ah == pytest.approx(9 / 60)
     one_by_one = after(*(trace(times_s[i : i + 1], 1.0) for i in range(11)))

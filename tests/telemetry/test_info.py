@@ -1,4 +1,4 @@
-"""Topic ``info``: which law the observer is said to have."""
+"""Topic ``info``: name of the observer's law."""
 
 import pytest
 
@@ -9,9 +9,9 @@ from bms_estimator.telemetry.state import make_info_payload
 
 
 @pytest.mark.parametrize(
-    ("law", "said"), [("learning", "learning"), ("improved", "improved, k2-cos"), ("scheme-1", "scheme-1, k2-cos")]
+    ("law", "observer"), [("learning", "learning"), ("improved", "improved, k2-cos"), ("scheme-1", "scheme-1, k2-cos")]
 )
-def test_a_law_without_a_nussbaum_function_names_none(law: str, said: str) -> None:
+def test_a_law_without_a_nussbaum_function_names_none(law: str, observer: str) -> None:
     observer = ObserverSettings.model_validate({"law": law, "nussbaum": "k2-cos"})
     info = make_info_payload(Settings(observer=observer), load_cell("chen_mora"), {}, 0.0, temperature_sensor=False)
-    assert info.observer == said
+    assert info.observer == observer

@@ -133,7 +133,7 @@ def test_nothing_is_identified_before_a_load_has_told_of_it() -> None:
 
 
 def test_the_curve_is_published_with_what_was_learned() -> None:
-    """Generic cells of another make: from rest at SOC 0.9 the true curve's 20 mV are found, and said to be known there."""
+    """Generic cells of another make: at rest at SOC 0.9, the difference of 20 mV is found with a small std there."""
     estimator = Estimator(load_cell("nmc", 3.0), initial_soc=0.9, identifier=IdentifierSettings(soc_std=0.005))
     p = estimator.settings_record[0]["filter"]
     truth_v = chen_mora.ocv(0.9, p["ocv_v"], p["ocv_slope_v"]) + 0.020
@@ -177,16 +177,16 @@ def test_what_is_not_to_be_learned_is_taken_as_declared() -> None:
 
 
 @pytest.mark.parametrize(
-    ("temperature_c", "said"), [(25.0, ""), (-8.0, "no data at -8 C, the cell file knows 15 to 35 C")]
+    ("temperature_c", "expected"), [(25.0, ""), (-8.0, "no data at -8 C, the cell file knows 15 to 35 C")]
 )
-def test_a_temperature_that_the_cell_file_does_not_know_is_named(temperature_c: float, said: str) -> None:
+def test_a_temperature_outside_the_cell_file_s_range_is_reported(temperature_c: float, expected: str) -> None:
     estimator = Estimator(CELL, initial_soc=1.0)
     block = pulses(0.2, 0.1)
     block["temperature_c"] = temperature_c
     estimator.run(block)
     texts = suspicions(estimator.record[0], estimator.settings_record[0])
-    assert (" ".join(texts) if texts else "").startswith(said)
-    assert bool(texts) == bool(said)
+    assert (" ".join(texts) if texts else "").startswith(expected)
+    assert bool(texts) == bool(expected)
 
 
 def test_a_current_of_the_wrong_sign_is_named() -> None:

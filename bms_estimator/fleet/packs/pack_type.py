@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import pack_identity
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import PackSettings, Settings
@@ -119,7 +119,7 @@ def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
 
 @lru_cache(maxsize=MAX_TYPES)
 def _estimator(recipe: _Recipe) -> Estimator:
-    return estimator_of(recipe.settings, recipe.cell)
+    return make_estimator(recipe.settings, recipe.cell)
 
 
 def _digest(sha256: bytes) -> Digest:

@@ -13,7 +13,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
-from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES, make_streams, pack_blocks
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.server.jwt_claims import Role
@@ -198,7 +198,7 @@ async def test_flood_of_blocks_delays_only_its_own_pack(fleet: Tenant) -> None:
         "attacker"
     )
     assert state is not None
-    estimator = estimator_of(*(registry("attacker") or ()))
+    estimator = make_estimator(*(registry("attacker") or ()))
     for _ in range(FLOOD):
         estimator.run(decode(heavy).samples)
     assert state["estimator"].tobytes() == estimator.record.tobytes()

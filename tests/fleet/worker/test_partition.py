@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.estimator.estimator import estimator_of, new_estimator
+from bms_estimator.estimator.estimator import make_estimator, new_estimator
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.worker import partition as partition_module
 from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, MAX_EARLY_REPEATS, REQUEST_EVERY
@@ -39,7 +39,7 @@ def stream():
 
 
 def record_of_one_run(samples):
-    estimator = estimator_of(SETTINGS, CELL)
+    estimator = make_estimator(SETTINGS, CELL)
     estimator.run(samples)
     return estimator.record
 
@@ -161,7 +161,7 @@ class TestNewStore:
         second["time_s"] -= second["time_s"][0] - 3.0
         deliver(stream, "a", blocks_of(first))
         deliver(stream, "a", blocks_of(second, STORE + HOUR_NS))
-        estimator = estimator_of(SETTINGS, CELL)
+        estimator = make_estimator(SETTINGS, CELL)
         estimator.run(first)
         estimator.resume(3600.0 + 3.0 - 599.0)
         estimator.run(second)
@@ -170,7 +170,7 @@ class TestNewStore:
     def test_store_created_before_the_last_sample_is_a_gap_of_unknown_length(self, stream, samples) -> None:
         deliver(stream, "a", blocks_of(samples[:600]))
         deliver(stream, "a", blocks_of(samples[:60], STORE + 10**9))
-        estimator = estimator_of(SETTINGS, CELL)
+        estimator = make_estimator(SETTINGS, CELL)
         estimator.run(samples[:600])
         estimator.resume(np.inf)
         estimator.run(samples[:60])
@@ -182,7 +182,7 @@ class TestNewStore:
         assert stream.send("a", later[3]).reply.resend
         stream.take_over()
         deliver(stream, "a", later)
-        estimator = estimator_of(SETTINGS, CELL)
+        estimator = make_estimator(SETTINGS, CELL)
         estimator.run(samples[:600])
         estimator.resume(3600.0 - 599.0)
         estimator.run(samples[:200])
@@ -195,7 +195,7 @@ def test_blocks_that_the_edge_no_longer_has_count_as_lost(stream, samples) -> No
     rest = blocks_of(samples[200:400], oldest=11)
     assert stream.send("a", rest[3]).reply.number == 11
     deliver(stream, "a", rest, first=11)
-    estimator = estimator_of(SETTINGS, CELL)
+    estimator = make_estimator(SETTINGS, CELL)
     estimator.run(samples[:100])
     estimator.run(samples[200:400])
     assert_state_equals(stream, "a", estimator.record)
@@ -216,7 +216,7 @@ def test_block_that_is_repeatedly_rejected_counts_as_lost(stream, samples, refus
         stream.take_over()
     assert stream.send("a", blocks[6]).state
     deliver(stream, "a", blocks[7:], first=8)
-    estimator = estimator_of(SETTINGS, CELL)
+    estimator = make_estimator(SETTINGS, CELL)
     estimator.run(samples[:100])
     estimator.run(samples[120:400])
     assert_state_equals(stream, "a", estimator.record)
@@ -232,7 +232,7 @@ def test_several_blocks_that_never_arrive_count_as_lost(stream, samples) -> None
     assert stream.send("a", blocks[7]).state
     assert stream.partition.counters["lost_blocks"] == 2
     deliver(stream, "a", blocks[8:], first=9)
-    estimator = estimator_of(SETTINGS, CELL)
+    estimator = make_estimator(SETTINGS, CELL)
     estimator.run(samples[:100])
     estimator.run(samples[140:400])
     assert_state_equals(stream, "a", estimator.record)
@@ -244,7 +244,7 @@ class TestPublishedMessages:
         deliver(stream, "a", blocks_of(samples[:580]))
         result = stream.send("a", one_block(samples[580:600], 30))
         state = Estimate.model_validate_json(result.state)
-        last = estimator_of(SETTINGS, CELL).run(samples[:600])[-1]
+        last = make_estimator(SETTINGS, CELL).run(samples[:600])[-1]
         assert (state.soc, state.soc_std, state.stability_margin) == (
             last["soc"],
             last["soc_std"],
@@ -266,7 +266,7 @@ class TestPublishedMessages:
         assert [name for name, _ in rows] == ["a.480000", "a.480001"]
         hours = [Hour.model_validate_json(row) for _, row in rows]
         assert [(row.pack, row.samples, row.seen_s) for row in hours] == [("a", 3600, 3599.0), ("a", 3600, 3600.0)]
-        assert hours[0].soc == estimator_of(SETTINGS, CELL).run(samples[:3600])["soc"][-1]
+        assert hours[0].soc == make_estimator(SETTINGS, CELL).run(samples[:3600])["soc"][-1]
 
     def test_nothing_for_unusable_samples(self, stream, samples) -> None:
         rows = samples[:20].copy()
@@ -285,7 +285,7 @@ class TestPublishedMessages:
         for name, rows in {"stack": stack, "plain": samples[:600]}.items():
             result = [stream.send(name, data) for data in blocks_of(rows)]
             stream.take_over()
-            estimator = estimator_of(*packs[name])
+            estimator = make_estimator(*packs[name])
             estimator.run(rows)
             assert_state_equals(stream, name, estimator.record)
             Estimate.model_validate_json(result[-1].state)
@@ -381,7 +381,7 @@ class TestChangedSettings:
         packs["a"] = SETTINGS, other
         stream.partition.settings_changed("a")
         self.take(stream, samples, 20, 30)
-        estimator = estimator_of(SETTINGS, other)
+        estimator = make_estimator(SETTINGS, other)
         estimator.run(samples[400:600])
         assert_state_equals(stream, "a", estimator.record)
         assert stream.partition.counters["begun_anew"] == 1
@@ -434,7 +434,7 @@ class TestInvalidBlocks:
         rows["time_s"][190:230] = time_s
         deliver(stream, "a", blocks_of(rows))
         good = np.delete(samples[:600], np.s_[190:230])
-        estimator = estimator_of(SETTINGS, CELL)
+        estimator = make_estimator(SETTINGS, CELL)
         estimator.run(good)
         assert stream.partition.counters["no_time"] == 40
         assert stream.partition.state("a")["estimator"]["observer"]["soc"] == estimator.state["soc"]
@@ -461,7 +461,7 @@ class TestInvalidBlocks:
         )  # without samples of the skipped blocks
         deliver(stream, "a", blocks[10:], first=11)
         deliver(stream, "new", blocks[1:], first=2)
-        estimator = estimator_of(SETTINGS, CELL)
+        estimator = make_estimator(SETTINGS, CELL)
         estimator.run(samples[:180])
         estimator.run(samples[200:400])
         assert_state_equals(stream, "a", estimator.record)
@@ -532,6 +532,6 @@ def test_packs_of_different_types_are_independent(samples) -> None:
         for name in packs:
             stream.send(name, data)
     for name, of_pack in packs.items():
-        estimator = estimator_of(*of_pack)
+        estimator = make_estimator(*of_pack)
         estimator.run(samples[:200])
         assert_state_equals(stream, name, estimator.record)
