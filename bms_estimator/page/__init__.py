@@ -1,5 +1,5 @@
-"""The live page: what packs publish, in a browser.
+"""Live page of packs in a browser.
 
-``PackTopics`` holds the newest payload of each topic, ``server`` hands them on as server-sent events. The hub is
-filled by one of two feeds: the sink of a service (``sink``), or a subscriber of a broker (``feed``).
+``PackTopics`` stores the newest payload of each topic, and ``web_server`` sends them as server-sent events. Payloads come
+from the snapshots of a service (``page_sink``) or from a subscription at a broker (``broker_page``).
 """

@@ -1,7 +1,7 @@
-"""Access control of the page by host name and token. Pure.
+"""Access control of the page by host name and token, without I/O.
 
-Another page in the same browser may send requests here under its own host name (DNS rebinding), so only this server's
-names are accepted.
+A foreign page in the same browser may send requests to this server under its own host name (DNS rebinding). Therefore only
+the names of this server are accepted.
 """
 
 import hashlib
@@ -15,8 +15,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import credential
 from bms_estimator.settings.page import PageSettings
 
-MIN_TOKEN = 16
-"""Letters of a token, at least: `openssl rand -hex 16` makes 32."""
+MIN_TOKEN_CHARACTERS = 16
+"""Minimum length of a token [characters]; `openssl rand -hex 16` generates 32."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
@@ -30,11 +30,11 @@ HEADERS = {
 
 
 class AccessControl:
-    """Decides on requests.
+    """Check of requests for host name and token.
 
     Args:
         hosts: Host names of this server, in addition to addresses, ``localhost`` and the machine's name.
-        token: Required token; None: nothing.
+        token: Required token; None: no token is required.
     """
 
     def __init__(self, hosts: Iterable[str] = (), token: str | None = None) -> None:
@@ -47,7 +47,7 @@ class AccessControl:
         """Return the cookie that replaces the token in a browser."""
         return hashlib.sha256(b"bms-estimator page " + (self._token or b"")).hexdigest()
 
-    def knows_host(self, header: str) -> bool:
+    def is_own_host(self, header: str) -> bool:
         """Return True if a ``Host`` header names this server; an address always does, because DNS cannot redirect it."""
         try:
             host = urlsplit(f"//{header}").hostname or ""
@@ -55,12 +55,12 @@ class AccessControl:
             return False
         return host in self._hosts or _is_address(host)
 
-    def knows_token(self, token: str) -> bool:
-        """Return True for the right token, or if none is required; takes equally long for any wrong one."""
+    def is_valid_token(self, token: str) -> bool:
+        """Return True for the right token, or if none is required. The time of the comparison does not depend on the token."""
         return self._token is None or hmac.compare_digest(_bytes(token), self._token)
 
-    def knows_cookie(self, cookie: str) -> bool:
-        """Return True for the cookie that was given for the token."""
+    def is_valid_cookie(self, cookie: str) -> bool:
+        """Return True for the cookie of the token, or if none is required."""
         return self._token is None or hmac.compare_digest(_bytes(cookie), self.cookie.encode())
 
 
@@ -81,19 +81,19 @@ def _token(settings: PageSettings) -> str | None:
         token = credential(name).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise UserError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:  # whose text contains the bytes
+    except UnicodeDecodeError:  # its text would show the bytes
         raise UserError(f"page.token_file = {name}: cannot be read: not UTF-8 text") from None
-    if len(token) < MIN_TOKEN:
+    if len(token) < MIN_TOKEN_CHARACTERS:
         raise UserError(
-            f"page.token_file = {name}: the token has {len(token)} letters, must have {MIN_TOKEN} or more; "
+            f"page.token_file = {name}: the token has {len(token)} letters, must have {MIN_TOKEN_CHARACTERS} or more; "
             f"`openssl rand -hex 16 > {name}` makes one"
         )
     return token
 
 
-def _bytes(shown: str) -> bytes:
+def _bytes(header: str) -> bytes:
     """Return a header as received: aiohttp passes invalid UTF-8 as surrogates."""
-    return shown.encode(errors="surrogateescape")
+    return header.encode(errors="surrogateescape")
 
 
 def _is_address(host: str) -> bool:

@@ -1,4 +1,4 @@
-"""The page of a broker: all packs that publish there, whoever serves them."""
+"""Page of all packs that publish at a broker."""
 
 import contextlib
 from collections.abc import AsyncIterator
@@ -15,7 +15,7 @@ from bms_estimator.settings.page import PageSettings
 
 @contextlib.asynccontextmanager
 async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) -> AsyncIterator[str]:
-    """Serve while the context lasts.
+    """Serve the page while the context lasts.
 
     Args:
         broker: Settings of the broker.
@@ -28,25 +28,25 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
     Raises:
         UserError: A setting cannot be used, or the address is taken.
     """
-    hub, past = PackTopics(), HistoryQuery()
+    hub, history = PackTopics(), HistoryQuery()
     hub.set_link_state(f"{', '.join(broker.urls)}: not reached yet")
 
-    def heard(message: DeviceMessage) -> None:
+    def on_message(message: DeviceMessage) -> None:
         if message.device not in hub.packs:
-            past.add(message.device, folder / f"{message.device}.sqlite")
+            history.add(message.device, folder / f"{message.device}.sqlite")
         hub.put(*message)
         hub.hide(subscriber.hidden)
 
     def left_out(device: str) -> None:
         hub.drop(device)
-        past.drop(device)
+        history.drop(device)
         hub.hide(subscriber.hidden)
 
-    def linked() -> None:
+    def on_link_change() -> None:
         lost = subscriber.lost_since is not None
         hub.set_link_state(subscriber.trouble or "the broker is lost" if lost else None)
 
-    async with PageServer(settings, hub, past, patient=False) as server:
-        subscriber = Subscriber(broker, heard, linked, left_out=left_out)
+    async with PageServer(settings, hub, history, patient=False) as server:
+        subscriber = Subscriber(broker, on_message, on_link_change, left_out=left_out)
         async with subscriber:
             yield server.url

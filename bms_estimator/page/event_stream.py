@@ -1,6 +1,6 @@
-"""The newest text of each key, and its readers. No connection, no clock of its own.
+"""Newest text of each key, and queues of its readers. No I/O.
 
-A slow reader is sent only the newest text of each key.
+A slow reader receives only the newest text of each key.
 """
 
 import asyncio
@@ -8,14 +8,14 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-MESSAGE_BYTES = 256 * 1024
-"""Size of a message to a reader. A reader that never reads keeps one message in memory."""
+MAX_MESSAGE_BYTES = 256 * 1024
+"""Maximum size of a message to a reader [bytes]. A client that does not read occupies the memory of one message."""
 LINK = "link"
 """Key of the connection state."""
 
 
 class LatestValues:
-    """Latest values: JSON text in one line, by key."""
+    """Latest values as JSON text in one line, by key."""
 
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}
@@ -35,7 +35,7 @@ class LatestValues:
         return self._texts.get(key)
 
     def set_value(self, key: str, text: str) -> None:
-        """Keep a text, and hand it on where it is another one."""
+        """Store a text; send it to all readers if it differs from the stored one."""
         if text != self._texts.get(key):
             self._texts[key] = text
             self.broadcast(key)
@@ -51,7 +51,7 @@ class LatestValues:
 
     @contextmanager
     def reading(self) -> Iterator["Reader"]:
-        """Return a new reader, which first gets all present values."""
+        """Yield a new reader, which first receives all present values."""
         reader = Reader(self)
         self._readers.add(reader)
         try:
@@ -60,13 +60,13 @@ class LatestValues:
             self._readers.discard(reader)
 
     def close(self) -> None:
-        """Let all readers end."""
+        """End the streams of all readers."""
         for reader in self._readers:
             reader.close()
 
 
 class Reader:
-    """Keys whose newest text has not been sent to one reader. The texts are shared by all readers.
+    """Queue of the keys whose newest text has not been sent to one reader. All readers share the texts.
 
     Args:
         newest: Source of the keys and texts.
@@ -89,13 +89,13 @@ class Reader:
         self.closed = True
         self._due.set()
 
-    async def next(self, longest_s: float) -> str:
-        """Return what waits as one JSON object of at most ``MESSAGE_BYTES``, or one text if that is longer.
+    async def next(self, timeout_s: float) -> str:
+        """Return the waiting texts as one JSON object of at most ``MAX_MESSAGE_BYTES``, or of one text if that is longer.
 
-        The rest waits for the next call. The result is empty after ``longest_s`` without a change, or at the end.
+        The rest waits for the next call. The result is empty after ``timeout_s`` without a change, or at the end.
         """
         try:
-            async with asyncio.timeout(longest_s):
+            async with asyncio.timeout(timeout_s):
                 await self._due.wait()
         except TimeoutError:
             return ""
@@ -111,7 +111,7 @@ class Reader:
             text = self._newest.text(key)
             if text is not None:
                 size += len(key) + len(text)
-                if parts and size > MESSAGE_BYTES:
+                if parts and size > MAX_MESSAGE_BYTES:
                     break
                 parts.append(f"{json.dumps(key)}:{text}")
             del self._waiting[key]

@@ -1,4 +1,4 @@
-"""A pack's history for the curves of the page: at most some hundred points, read off the event loop."""
+"""Query of a pack's history for the curves of the page: a few hundred points, read in a thread."""
 
 import json
 import time
@@ -36,11 +36,11 @@ class Span(NamedTuple):
 
 
 SPANS = {"hour": Span(3600, MINUTE_S), "day": Span(86_400, 5 * MINUTE_S), "month": Span(30 * 86_400, 120 * MINUTE_S)}
-"""60, 288 and 360 points."""
+"""Spans by name in the query, with 60, 288 and 360 points."""
 
 
 class HistoryQuery:
-    """Reads histories, one at a time; what several ask for within a minute is read once.
+    """Reader of histories, with a cache: a span is read at most every half minute.
 
     Args:
         clock: Seconds since 1970.
@@ -53,7 +53,7 @@ class HistoryQuery:
         self.thread = DiskThread("page")
 
     def add(self, pack: str, path: Path) -> None:
-        """Register the location of a pack's history."""
+        """Register the file of a pack's history."""
         self._files[pack] = path
 
     def drop(self, pack: str) -> None:
@@ -73,7 +73,7 @@ class HistoryQuery:
             UserError: The file is missing or cannot be read.
         """
         if pack not in self._files:
-            raise UserError(f"{pack}: no history is kept here")
+            raise UserError(f"{pack}: there is no history here")
         now_s = self._clock()
         read_s, text = self._read.get((pack, name), (0.0, b""))
         if not 0.0 <= now_s - read_s < MINUTE_S / 2:
@@ -87,5 +87,5 @@ def _columns(file: HistoryFile, span: Span, now_s: float) -> bytes:
     rows = file.rows(since_s, until_s, span.step_s)
     events = file.events(since_s, until_s)[-MAX_EVENTS:]
     columns = {field: [getattr(row, field) for row in rows] for field in FIELDS}
-    shown = {"step_s": span.step_s, **columns, "events": [event._asdict() for event in events]}
-    return json.dumps(shown, separators=(",", ":")).encode()
+    payload = {"step_s": span.step_s, **columns, "events": [event._asdict() for event in events]}
+    return json.dumps(payload, separators=(",", ":")).encode()

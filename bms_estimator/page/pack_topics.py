@@ -1,4 +1,4 @@
-"""The newest payload of each topic of each pack. No connection, no clock of its own."""
+"""Newest payload of each topic of each pack. No I/O."""
 
 import json
 import time
@@ -13,27 +13,25 @@ from bms_estimator.store.minute import epoch_s
 PACKS = "packs"
 """Key of the names of all packs and of the number of packs that are not shown."""
 STATE, PARAMETERS, RECENT, ELEMENTS = "state", "parameters", "recent", "elements"
-"""Topics of the estimate and of the parameters, and what there is here beside the topics of MQTT."""
+"""Topics of state and parameters, and two keys that exist only here: recent states, and elements over SOC."""
 SHOWN = frozenset({STATE, PARAMETERS, "health", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY})
 ALARM = "alarm/"
 ELEMENTS_OVER_SOC = frozenset({"r_s_ohm", "r_ts_ohm", "c_ts_farad", "r_tl_ohm", "c_tl_farad"})
 RECENT_STATES = 600
 RECENT_STEP_S = 1.0
-"""Interval of the states that are stored for the curves of later visitors [s]."""
+"""Minimum interval of the states that are stored for the curves of a new reader [s]."""
 MAX_AHEAD_S = 86_400.0
-"""Maximum lead of a state's time over the wall clock [s]."""
+"""Maximum lead of a state's time over the wall clock [s]. A state with a larger lead is ignored."""
 SET_BACK_S = 60.0
-"""A state leads by a wrong clock if it leads the wall clock and the next state by more than this [s]."""
+"""Lead over the wall clock and over the next state beyond which a stored state is removed [s]: its clock was wrong."""
 RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
 
 _Row = tuple[float, tuple[float | None, ...]]
-"""Seconds since 1970, and what ``RECENT_FIELDS`` were."""
+"""Time [s since 1970] and values of ``RECENT_FIELDS``."""
 
 
 class PackTopics(LatestValues):
-    """Values of all packs.
-
-    Keys are ``<pack>/<topic>``, values JSON as text in one line.
+    """Latest payloads of all packs, as JSON text in one line, by ``<pack>/<topic>``.
 
     Args:
         wall: Wall clock, seconds since 1970.
@@ -44,7 +42,7 @@ class PackTopics(LatestValues):
         self._wall, self._hidden = wall, 0
         self._topics: dict[str, dict[str, str]] = {}
         self._recent: dict[str, deque[_Row]] = {}
-        self._learned: dict[str, dict[str, dict[int, tuple[float, float]]]] = {}
+        self._elements: dict[str, dict[str, dict[int, tuple[float, float]]]] = {}
 
     @property
     def packs(self) -> list[str]:
@@ -52,27 +50,27 @@ class PackTopics(LatestValues):
         return list(self._topics)
 
     def put(self, pack: str, topic: str, value: Any) -> None:
-        """Take what a pack publishes, of the topics that are shown.
+        """Store a payload, unless the page does not show its topic.
 
         Args:
             pack: Name of the pack.
-            topic: Below the pack's.
-            value: The payload as JSON has it, or text; None: the topic was emptied.
+            topic: Topic relative to that of the pack.
+            value: Parsed JSON payload, or text; None: the topic was cleared.
         """
         if topic not in SHOWN and not topic.startswith(ALARM):
             return
         try:
             text = _json(value)
-        except RecursionError:  # another publisher's: deeper than it could be written
+        except RecursionError:  # nested too deeply, from another publisher
             return
         if value is None:
-            self._forget(pack, topic)
+            self._remove_topic(pack, topic)
         else:
             self._add(pack)[topic] = text
         if topic == STATE and isinstance(value, dict):
-            self._remember(pack, value)
+            self._store_state(pack, value)
         if topic == PARAMETERS and isinstance(value, dict):
-            self._learn(pack, value)
+            self._store_elements(pack, value)
         self.broadcast(f"{pack}/{topic}")
 
     def drop(self, pack: str) -> None:
@@ -80,7 +78,7 @@ class PackTopics(LatestValues):
         if self._topics.pop(pack, None) is None:
             return
         self._recent.pop(pack, None)
-        self._learned.pop(pack, None)
+        self._elements.pop(pack, None)
         self._publish_packs()
 
     def hide(self, count: int) -> None:
@@ -106,7 +104,7 @@ class PackTopics(LatestValues):
         if topic == RECENT:
             return _json(_columns(self._recent.get(pack, ())))
         if topic == ELEMENTS:
-            return _json(self._learned.get(pack, {}))
+            return _json(self._elements.get(pack, {}))
         return self._topics[pack].get(topic, "null")
 
     def _add(self, pack: str) -> dict[str, str]:
@@ -116,7 +114,7 @@ class PackTopics(LatestValues):
             self._publish_packs()
         return self._topics[pack]
 
-    def _forget(self, pack: str, topic: str) -> None:
+    def _remove_topic(self, pack: str, topic: str) -> None:
         """Remove a topic, and the pack with its last one."""
         topics = self._topics.get(pack, {})
         topics.pop(topic, None)
@@ -126,13 +124,13 @@ class PackTopics(LatestValues):
     def _publish_packs(self) -> None:
         self.set_value(PACKS, _json({"names": self.packs, "hidden": self._hidden}))
 
-    def _remember(self, pack: str, state: Mapping[str, Any]) -> None:
-        """Keep what the curves show, once a second; a late state, or one dated far in the future, is omitted."""
+    def _store_state(self, pack: str, state: Mapping[str, Any]) -> None:
+        """Store a state for the curves, at most once a second. A late state, or one far in the future, is ignored."""
         try:
             row = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
-        except (TypeError, ValueError, KeyError):  # another publisher's
+        except (TypeError, ValueError, KeyError):  # invalid, from another publisher
             return
-        if row[0] > self._wall() + MAX_AHEAD_S:  # all later states would be ignored
+        if row[0] > self._wall() + MAX_AHEAD_S:  # it would hide all later states
             return
         rows = self._recent.setdefault(pack, deque(maxlen=RECENT_STATES))
         while rows and rows[-1][0] > max(row[0], self._wall()) + SET_BACK_S:
@@ -140,16 +138,16 @@ class PackTopics(LatestValues):
         if not rows or row[0] >= rows[-1][0] + RECENT_STEP_S:
             rows.append(row)
 
-    def _learn(self, pack: str, report: Mapping[str, Any]) -> None:
-        """Keep what an element was, with its standard deviation, at each percent of SOC."""
+    def _store_elements(self, pack: str, report: Mapping[str, Any]) -> None:
+        """Store the last value and standard deviation of each element, by percent of SOC."""
         soc, elements = _number(report.get("soc")), report.get("elements")
         if soc is None or not 0.0 <= soc <= 1.0 or not isinstance(elements, dict):
             return
         for name in ELEMENTS_OVER_SOC & elements.keys():
-            of = elements[name] if isinstance(elements[name], dict) else {}
-            value, std = _number(of.get("value")), _number(of.get("std"))
-            if of.get("valid") is True and value is not None and std is not None:
-                self._learned.setdefault(pack, {}).setdefault(name, {})[round(100.0 * soc)] = value, std
+            element = elements[name] if isinstance(elements[name], dict) else {}
+            value, std = _number(element.get("value")), _number(element.get("std"))
+            if element.get("valid") is True and value is not None and std is not None:
+                self._elements.setdefault(pack, {}).setdefault(name, {})[round(100.0 * soc)] = value, std
 
 
 def _columns(rows: Iterable[_Row]) -> dict[str, list[float | None]]:

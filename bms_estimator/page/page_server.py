@@ -1,4 +1,4 @@
-"""The server of the live page of packs: a hub, and the history."""
+"""Server of the live page of packs: event stream and history."""
 
 import asyncio
 from collections.abc import Callable
@@ -12,8 +12,8 @@ from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.settings.page import PageSettings
 
-HISTORY_S = 10.0
-"""A disk that has not answered by then hangs [s]."""
+HISTORY_TIMEOUT_S = 10.0
+"""Timeout of a history query [s]; after it the disk counts as hung."""
 
 STATIC = Path(__file__).with_name("static")
 FILES = {
@@ -26,18 +26,18 @@ FILES = {
     "/uplot.js": File(STATIC / "uplot.js", "text/javascript"),
     "/icon.svg": File(STATIC / "icon.svg", "image/svg+xml"),
 }
-"""All that is served, by its path."""
+"""Static files by URL path."""
 
 
 class PageServer(WebServer):
-    """Serves a hub while the context lasts.
+    """Server of a hub while the context lasts.
 
     Args:
         settings: Address and access of the page.
         hub: Present state of the packs.
         past: History of the packs.
         opened: Called with its address once it is served.
-        patient: An address that is taken, or not there yet, is tried again; else it is an error.
+        patient: True: retry an address that is in use or does not exist yet; False: raise an error.
 
     Raises:
         UserError: The token cannot be read.
@@ -62,7 +62,7 @@ class PageServer(WebServer):
             raise web.HTTPBadRequest(text=f"span: must be one of {', '.join(SPANS)}\n")
         loop = asyncio.get_running_loop()
         try:
-            async with asyncio.timeout(HISTORY_S), self._histories:
+            async with asyncio.timeout(HISTORY_TIMEOUT_S), self._histories:
                 body = await loop.run_in_executor(self._past.thread, self._past.read, pack, span)
         except UserError as error:
             raise web.HTTPNotFound(text=f"{error}\n") from None

@@ -1,4 +1,4 @@
-"""The feed of a service: its packs' snapshots as the payloads that MQTT gets, and one server for those that share an address."""
+"""Sink that shows a service's packs on the page, as the payloads of MQTT. Packs with one address share a server."""
 
 import asyncio
 import contextlib
@@ -18,13 +18,13 @@ from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 
 
 class PageSink:
-    """Shows one pack's snapshots.
+    """Sink that shows one pack's snapshots.
 
     Args:
         pages: The servers of this process.
         settings: Settings of the page.
         pack: Name of the pack.
-        history: Location of its history; None: nowhere.
+        history: File of its history; None: no history.
     """
 
     def __init__(self, pages: "Pages", settings: PageSettings, pack: str, history: Path | None = None) -> None:
@@ -36,7 +36,7 @@ class PageSink:
         self._stack = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> Self:
-        """Serve."""
+        """Start to serve the page."""
         self._hub = await self._stack.enter_async_context(
             self._pages.serving(self._settings, self._pack, self._history)
         )
@@ -49,7 +49,7 @@ class PageSink:
         await self._stack.aclose()
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Take a snapshot; returns at once."""
+        """Store a snapshot for the page, without blocking."""
         now_s = asyncio.get_running_loop().time()
         messages, self._sent = self._messages.live_messages(self._sent, snapshot, now_s)
         self._put(self._messages.must_deliver(self._before, snapshot) + messages)
@@ -63,10 +63,10 @@ class PageSink:
 
 
 class Pages:
-    """The servers of a process, one for each address that its packs name.
+    """Page servers of a process, one for each configured address.
 
     Args:
-        opened: Called with the address of each once it is served.
+        opened: Called with the address of each server once it listens.
     """
 
     def __init__(self, opened: Callable[[str], object] = str) -> None:
@@ -75,10 +75,10 @@ class Pages:
 
     @contextlib.asynccontextmanager
     async def serving(self, settings: PageSettings, pack: str, history: Path | None) -> AsyncIterator[PackTopics]:
-        """Have a pack shown; the first one starts the server of its address, the last one ends it.
+        """Show a pack. The first pack starts the server of its address, the last one ends it.
 
         Raises:
-            UserError: Two packs name one address with different tokens, or the token cannot be read.
+            UserError: Two packs have one address with different tokens, or the token cannot be read.
         """
         page = self._open.get(settings.listen)
         if page is None:
@@ -99,7 +99,7 @@ class Pages:
 
 
 class _Page:
-    """One server, and the packs that it shows."""
+    """Page server and the number of its packs."""
 
     def __init__(self, settings: PageSettings, opened: Callable[[str], object]) -> None:
         self.settings, self.packs = settings, 0
@@ -108,13 +108,13 @@ class _Page:
         self._started: asyncio.Task[PageServer] | None = None
 
     async def start(self) -> None:
-        """Once, for the first pack."""
+        """Start the server, unless an earlier pack started it."""
         if self._started is None:
             self._started = asyncio.ensure_future(self._server.__aenter__())
         await asyncio.shield(self._started)
 
     async def stop(self) -> None:
-        """End the server, where it was started."""
+        """End the server, if it was started."""
         if self._started is not None:
             await asyncio.wait([self._started])
             await self._server.__aexit__(None, None, None)

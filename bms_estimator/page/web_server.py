@@ -1,4 +1,4 @@
-"""An HTTP server of pages: static files, the event stream, queries; nothing can be changed through it."""
+"""Read-only HTTP server of a page: static files, event stream, queries."""
 
 import asyncio
 import contextlib
@@ -22,15 +22,16 @@ PING_S = 5.0
 WRITE_S = 30.0
 """Time without progress after which a reader is disconnected [s]."""
 MAX_STREAMS = 32
-"""Streams at a time, of all packs together."""
-AGAIN_S = 10.0
-"""Retry interval of an address that is in use [s]."""
-CLOSING_S = 1.0
+"""Maximum number of concurrent event streams."""
+RETRY_S = 10.0
+"""Retry interval of an address that cannot be listened on [s]."""
+SHUTDOWN_TIMEOUT_S = 1.0
+"""Timeout of open connections at shutdown [s]."""
 
 ASK = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>bms_estimator</title><form action="/" method="get">
 <p><label>Token <input name="token" type="password" autofocus autocomplete="off"></label> <button>Open</button></p>
-<p>It stands in the file that token_file names where the page is served.</p></form></html>"""
+<p>It is in the file token_file of the page's settings.</p></form></html>"""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -57,15 +58,15 @@ class _Stream(NamedTuple):
 
 
 class WebServer:
-    """Serves while the context lasts.
+    """HTTP server while the context lasts.
 
     Args:
         settings: Address and access of the page.
         files: Static files by the path of their URL.
         newest: Content of the event stream ``/events``.
-        handlers: What else is answered, by path.
-        opened: Called with its address once it is served.
-        patient: An address that is taken, or not there yet, is tried again; else it is an error.
+        handlers: Handlers of queries, by path.
+        opened: Called with the address once the server listens.
+        patient: True: retry an address that is in use or does not exist yet; False: raise an error.
 
     Raises:
         UserError: The token cannot be read.
@@ -82,8 +83,8 @@ class WebServer:
         patient: bool = True,
     ) -> None:
         self._newest, self._opened, self._patient = newest, opened, patient
-        self._guard: AccessControl = guard_of(settings)
-        self._wanted, self._listening = settings.address, settings.address
+        self._access: AccessControl = guard_of(settings)
+        self._configured_address, self._listening = settings.address, settings.address
         self._files = {path: _read(file) for path, file in files.items()}
         self._handlers = {**dict.fromkeys(files, self._file), "/events": self._events, **handlers}
         self._streams: dict[Reader, _Stream] = {}
@@ -102,26 +103,28 @@ class WebServer:
         """Listen.
 
         Raises:
-            UserError: The address cannot be had, and we are not patient.
+            UserError: The address cannot be listened on, and ``patient`` is False.
         """
-        app = web.Application(middlewares=[self._check], client_max_size=1024)
+        app = web.Application(middlewares=[self._exempt_connection], client_max_size=1024)
         app.on_response_prepare.append(_protect)
         for path, handler in self._handlers.items():
             app.router.add_get(path, handler)
-        self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=CLOSING_S)
+        self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=SHUTDOWN_TIMEOUT_S)
         await self._runner.setup()
         try:
             await self._listen(self._runner)
         except OSError as error:
             if not self._patient:
                 await self._runner.cleanup()
-                raise UserError(f"page.listen = {_text(self._wanted)}: {error.strerror}; name another one") from None
-            log.warning("the page is not served yet", listen=_text(self._wanted), reason=error.strerror)
+                raise UserError(
+                    f"page.listen = {_text(self._configured_address)}: {error.strerror}; name another one"
+                ) from None
+            log.warning("the page is not served yet", listen=_text(self._configured_address), reason=error.strerror)
             self._task = asyncio.create_task(self._listen_later(self._runner), name="page")
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Part from all browsers."""
+        """End all streams and connections, and stop listening."""
         if self._task:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -132,55 +135,55 @@ class WebServer:
             await self._runner.cleanup()
 
     async def _listen(self, runner: web.AppRunner) -> None:
-        """Take the address.
+        """Listen on the address.
 
         Raises:
-            OSError: It cannot be had.
+            OSError: The address cannot be listened on.
         """
         listener = Listener(cast("web.Server", runner.server))
-        port = await listener.open(self._wanted.host, self._wanted.port)
+        port = await listener.open(self._configured_address.host, self._configured_address.port)
         self._listener = listener
-        self._listening = self._wanted._replace(port=port)
+        self._listening = self._configured_address._replace(port=port)
         log.info("live page", url=self.url)
         self._opened(self.url)
 
     async def _listen_later(self, runner: web.AppRunner) -> None:
         while True:
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(RETRY_S)
             try:
                 return await self._listen(runner)
             except OSError:  # already reported
                 continue
 
     @web.middleware
-    async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def _exempt_connection(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Exempt the connection from displacement while its request is handled."""
         with CONNECTIONS.serving(request.transport):
-            return await self._checked(request, handler)
+            return await self._authorize(request, handler)
 
-    async def _checked(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def _authorize(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Require a permitted host name and the token."""
-        if not self._guard.knows_host(request.headers.get("Host", "")):
-            raise web.HTTPForbidden(text="not under this name: add it to page.hosts, or --host\n")
-        shown = request.query.get("token")
-        if shown is not None and self._guard.knows_token(shown):
-            return self._let_in()
-        given = request.headers.get("Authorization", "")
-        if self._guard.knows_cookie(request.cookies.get(self._cookie, "")):
+        if not self._access.is_own_host(request.headers.get("Host", "")):
+            raise web.HTTPForbidden(text="host name not accepted: add it to page.hosts, or --host\n")
+        token = request.query.get("token")
+        if token is not None and self._access.is_valid_token(token):
+            return self._set_cookie()
+        authorization = request.headers.get("Authorization", "")
+        if self._access.is_valid_cookie(request.cookies.get(self._cookie, "")):
             return await handler(request)
-        if given.startswith("Bearer ") and self._guard.knows_token(given.removeprefix("Bearer ")):
+        if authorization.startswith("Bearer ") and self._access.is_valid_token(authorization.removeprefix("Bearer ")):
             return await handler(request)
         raise web.HTTPUnauthorized(text=ASK, content_type="text/html", headers={"WWW-Authenticate": "Bearer"})
 
     @property
     def _cookie(self) -> str:
-        """Cookies belong to a host, regardless of the port."""
+        """Name of the cookie. It contains the port, because browsers share cookies between the ports of a host."""
         return f"bms_page_{self._listening.port}"
 
-    def _let_in(self) -> web.Response:
+    def _set_cookie(self) -> web.Response:
         """Set the cookie, and redirect to the address without the token."""
         response = web.Response(status=303, headers={"Location": "/"})
-        response.set_cookie(self._cookie, self._guard.cookie, max_age=31_536_000, httponly=True, samesite="Strict")
+        response.set_cookie(self._cookie, self._access.cookie, max_age=31_536_000, httponly=True, samesite="Strict")
         return response
 
     async def _file(self, request: web.Request) -> web.StreamResponse:

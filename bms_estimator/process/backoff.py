@@ -6,18 +6,18 @@ FIRST_RETRY_S = 0.5
 """First retry delay of a missing or lost port; it doubles with each attempt [s]."""
 
 MAX_RETRY_S = 10.0
-
+"""Maximum retry delay of a missing or lost port [s]."""
 FIRST_DELAY_S = 2.0
-"""The first pause; doubles with each [s]."""
+"""First delay of a ``Backoff``; it doubles with each attempt [s]."""
 MAX_DELAY_S = 30.0
-"""A broker in the house is back before long [s]."""
+"""Maximum delay of a ``Backoff`` [s]. A local broker is usually unavailable for a short time only."""
 
 
 class Backoff:
     """Increasing delays with jitter, so that not all clients of a broker reconnect at the same time.
 
     Args:
-        first_s: The first [s].
+        first_s: First delay [s].
     """
 
     def __init__(self, first_s: float = FIRST_DELAY_S) -> None:

@@ -1,4 +1,4 @@
-"""Timestamps that outlive the process, which give the length of unmeasured gaps."""
+"""Timestamps that remain comparable across restarts, for the length of gaps without samples."""
 
 import ctypes
 import math
@@ -13,18 +13,18 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 TIMESYNCD = Path("/run/systemd/timesync/synchronized")
 """File that exists once systemd-timesyncd has set the clock since boot."""
 TIME_ERROR = 5
-"""Return value of adjtimex(2) while nothing sets the wall clock."""
+"""Return value of adjtimex(2) while the wall clock is not synchronized."""
 TIMEX_BYTES = 512
-"""More than a ``struct timex`` has anywhere."""
+"""Buffer size for a ``struct timex`` [bytes], larger than on any platform."""
 
 
 @dataclass(frozen=True)
 class BootTimestamp:
-    """Timestamp that outlives the process, and maybe a reboot.
+    """Timestamp that can be compared after a restart of the process, and after a reboot if the wall clock was right.
 
     Attributes:
-        wall_s: Wall clock [s since 1970]. Without a battery the clock stops while the machine is off.
-        synchronised: Whether the wall clock is known to be right.
+        wall_s: Wall clock [s since 1970]. A clock without a battery stops while the machine is off.
+        synchronised: True if the wall clock is synchronized.
         boot_s: Time since the machine started, including suspend [s].
         boot: Identifier of the boot; empty if unknown.
     """
@@ -45,15 +45,18 @@ class BootTimestamp:
 def synchronised() -> bool:
     """Return True if the wall clock counts as synchronized.
 
-    By the kernel, or by systemd-timesyncd if the kernel may not be queried.
+    The kernel reports it, or systemd-timesyncd if the kernel must not be queried.
     """
-    only_read = ctypes.create_string_buffer(TIMEX_BYTES)
-    state = int(ctypes.CDLL(None).adjtimex(only_read))
+    timex = ctypes.create_string_buffer(TIMEX_BYTES)
+    state = int(ctypes.CDLL(None).adjtimex(timex))
     return TIMESYNCD.exists() if state < 0 else state < TIME_ERROR
 
 
 def boot_timestamp() -> BootTimestamp:
-    """Now. The unit hides /proc/sys and passes the boot id in ``BMS_BOOT_ID``."""
+    """Return the present timestamp.
+
+    The systemd unit hides /proc/sys, and passes the boot id in ``BMS_BOOT_ID``.
+    """
     boot = os.environ.get("BMS_BOOT_ID") or (BOOT_ID.read_text(encoding="ascii") if BOOT_ID.exists() else "")
     return BootTimestamp(
         wall_s=time.time(),

@@ -1,4 +1,4 @@
-"""A child that does not outlive its parent, however that ends."""
+"""Child processes that end with their parent, even after a SIGKILL."""
 
 import ctypes
 import os
@@ -13,16 +13,16 @@ PR_SET_PDEATHSIG = 1
 def ends_with_us() -> Callable[[], None] | None:
     """Return a ``preexec_fn`` with which the kernel sends the child SIGTERM when its parent thread ends.
 
-    Only the kernel can do this after a SIGKILL of the parent. Start the child from the main thread. None on systems other than
-    Linux.
+    Only the kernel can do this after a SIGKILL of the parent. The child must be started from the main thread. The result is
+    None on systems other than Linux.
     """
     if sys.platform != "linux":
         return None
     prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
 
-    def ask() -> None:
+    def request_signal() -> None:
         prctl(PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGTERM))
-        if os.getppid() != parent:  # killed before it was requested
+        if os.getppid() != parent:  # the parent ended before the request
             os._exit(1)
 
-    return ask
+    return request_signal

@@ -1,4 +1,4 @@
-"""A thread for calls that wait for a disk, which may never answer."""
+"""Executor for calls that wait for a disk, which may hang."""
 
 import queue
 import threading
@@ -11,7 +11,9 @@ T = TypeVar("T")
 
 
 class DiskThread(Executor):
-    """Runs calls one after the other. The process ends without it: ``ThreadPoolExecutor`` would wait for a hung disk.
+    """Executor that runs calls one after the other in a daemon thread.
+
+    The process can exit while a call hangs, unlike with ``ThreadPoolExecutor``.
 
     Args:
         name: Name of the thread.
@@ -22,7 +24,7 @@ class DiskThread(Executor):
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Have ``fn`` called once those before it have ended."""
+        """Queue a call of ``fn`` after the earlier calls."""
         future: Future[T] = Future()
 
         def call() -> None:
@@ -30,7 +32,7 @@ class DiskThread(Executor):
                 return
             try:
                 future.set_result(fn(*args, **kwargs))
-            except BaseException as error:  # noqa: BLE001 - it belongs to who waits for the call
+            except BaseException as error:  # noqa: BLE001 - it is raised to the caller that waits
                 future.set_exception(error)
 
         self._calls.put(call)

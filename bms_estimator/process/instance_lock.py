@@ -1,4 +1,4 @@
-"""A pack is served by one process at a time."""
+"""Lock that lets only one process serve a pack at a time."""
 
 import contextlib
 import errno
@@ -16,49 +16,49 @@ from bms_estimator.model.errors import UserError
 
 ROOT = 0
 ATTEMPTS, PAUSE_S = 20, 0.01
-"""Number of attempts to take a name that is held but not listening, and the delay between them [s]."""
+"""Number of attempts to bind a name whose holder does not listen, and the delay between them [s]."""
 _CREDENTIALS = struct.Struct("3i")
-"""``struct ucred``: process, user, group."""
+"""Layout of ``struct ucred``: process, user, group."""
 
 log = structlog.get_logger(__name__)
 
 
 @contextlib.contextmanager
 def instance_lock(folder: Path, pack: str) -> Iterator[None]:
-    """Serve a pack alone: two services would overwrite each other's checkpoint and availability.
+    """Hold the lock of a pack, because two services would overwrite each other's checkpoint and availability.
 
-    Held is an abstract socket named after folder and pack. It disappears with the process, is not a file that could
-    be deleted or left over, and does not depend on a disk. Whoever is on the machine could take the name
-    first; so a holder that may not write the folder anyway does not count. An unknown holder counts as a service,
-    because two services are worse than none. A container with a network of its own has names of its own.
+    The lock is an abstract socket named after folder and pack. It disappears with the process, cannot be deleted or left
+    over like a file, and does not depend on a disk. Any user of the machine could bind the name first. A holder without
+    write permission for the folder is therefore ignored. An unknown holder counts as a service, because two services are
+    worse than none. A container with its own network namespace has its own names.
 
     Args:
         folder: Folder of the pack's state.
         pack: Name of the pack.
 
     Raises:
-        UserError: Another process serves it.
+        UserError: Another process serves the pack.
     """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as held:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as lock:
         try:
-            _hold(held, folder, pack)
+            _bind(lock, folder, pack)
         except OSError as error:
-            log.warning("cannot make sure that this pack is served once", reason=error.strerror)
+            log.warning("cannot ensure that only one process serves this pack", reason=error.strerror)
         yield
 
 
-def _hold(held: socket.socket, folder: Path, pack: str) -> None:
-    """Take the name, unless a service has it.
+def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
+    """Bind the name of the lock, unless a service has it.
 
     Raises:
-        UserError: One has it.
-        OSError: The system refuses such a name.
+        UserError: A service has the name.
+        OSError: The system rejects the name.
     """
-    name, told = _name(folder, pack), None
+    name, process_id = _name(folder, pack), None
     for _ in range(ATTEMPTS):
         try:
-            held.bind(name)
-            held.listen(1)
+            lock.bind(name)
+            lock.listen(1)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
@@ -66,43 +66,45 @@ def _hold(held: socket.socket, folder: Path, pack: str) -> None:
             return
         try:
             process, user = _holder(name)
-        except ConnectionRefusedError:  # it is about to listen, or has just ended
+        except ConnectionRefusedError:  # the holder does not listen yet, or has just ended
             time.sleep(PAUSE_S)
             continue
         except BlockingIOError:
             break
         if user not in _writers(folder):
-            log.warning("a stranger has this pack's name: cannot make sure that it is served once", user=user)
+            log.warning("another user holds this pack's lock: cannot ensure that only one process serves it", user=user)
             return
-        told = process
+        process_id = process
         break
-    raise UserError(f"{pack}: this pack is served already, by {f'process {told}' if told else 'another process'}")
+    raise UserError(
+        f"{pack}: this pack is served already, by {f'process {process_id}' if process_id else 'another process'}"
+    )
 
 
 def _name(folder: Path, pack: str) -> str:
-    """Return a name within the length limit of a socket's."""
-    place = os.path.realpath(folder)
-    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{place}/{pack}')).hexdigest()[:32]}"
+    """Return the name of the lock, a hash within the length limit of socket names."""
+    real_folder = os.path.realpath(folder)
+    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{real_folder}/{pack}')).hexdigest()[:32]}"
 
 
 def _holder(name: str) -> tuple[int, int]:
     """Return process and user that hold a name.
 
     Raises:
-        ConnectionRefusedError: No process holds it, or the holder does not listen.
-        BlockingIOError: The listen queue of the holder is full. It accepts no connection, and the system reports the holder only to
-            as many clients as the queue holds, even after they have gone.
+        ConnectionRefusedError: No process holds the name, or the holder does not listen.
+        BlockingIOError: The listen queue of the holder is full. The holder never accepts a connection, so that clients
+            stay in the queue even after they have ended.
     """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
-        asking.setblocking(False)
-        asking.connect(name)
-        told = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    process, user, _ = _CREDENTIALS.unpack(told)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.setblocking(False)
+        client.connect(name)
+        credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    process, user, _ = _CREDENTIALS.unpack(credentials)
     return process, user
 
 
 def _writers(folder: Path) -> set[int]:
-    """Users whose processes may serve the pack."""
+    """Return the users whose processes may serve the pack."""
     users = {ROOT, os.geteuid()}
     with contextlib.suppress(OSError):
         users.add(folder.stat().st_uid)

@@ -15,7 +15,7 @@ HEADER_S = 10.0
 IDLE_S = 30.0
 """Deadline from the end of a response to the next complete request header [s]."""
 MAX_CONNECTIONS = 256
-"""Connections of all listeners of the process together."""
+"""Maximum number of connections of all listeners of the process."""
 DESCRIPTOR_FRACTION = 0.25
 """Fraction of RLIMIT_NOFILE that connections may use; the rest is reserved for checkpoints, databases and MQTT."""
 ADDRESS_FRACTION = 0.5
@@ -72,7 +72,7 @@ class Connections:
         return len(self._open)
 
     def add(self, connected: socket.socket, transport: asyncio.Transport, address: str) -> None:
-        """Add a connection and start the deadline of its first request; close it if there is no room."""
+        """Add a connection and start the deadline of its first request; close it if the limits do not allow it."""
         if not self._make_room(address):
             transport.abort()
             return
@@ -100,7 +100,7 @@ class Connections:
         connection.deadline = asyncio.get_running_loop().call_later(IDLE_S, self._expire, connection)
 
     def _expire(self, connection: _Connection) -> None:
-        """Close a connection, unless its client has read a part of the response since."""
+        """Close a connection, unless its client has read a part of the response since the deadline was set."""
         unsent = connection.transport.get_write_buffer_size()
         if unsent and (not connection.unsent or unsent < connection.unsent):
             self._wait(connection)
@@ -108,7 +108,7 @@ class Connections:
             connection.transport.abort()
 
     def _make_room(self, address: str) -> bool:
-        """Return whether an address may have one more connection, displacing another if necessary."""
+        """Return True if an address may have one more connection; close an idle one if necessary."""
         self._prune()
         own = [each for each in self._open.values() if each.address == address]
         if len(own) >= self._address_limit:
@@ -135,7 +135,7 @@ class Connections:
 
 
 CONNECTIONS = Connections()
-"""Connections of this process: all its listeners share the descriptors."""
+"""Connections of this process, shared by all listeners, because they share its descriptors."""
 
 
 class Listener:
@@ -176,7 +176,7 @@ class Listener:
         return port
 
     async def close(self) -> None:
-        """Stop accepting; open connections are the server's to close."""
+        """Stop accepting. The server closes the open connections."""
         for timer in self._resuming.values():
             timer.cancel()
         self._resuming.clear()
@@ -190,7 +190,7 @@ class Listener:
         self._sockets = []
 
     def _accept(self, listening: socket.socket) -> None:
-        """Accept one connection; the loop calls again while others wait."""
+        """Accept one connection. The event loop calls this method again while others wait."""
         try:
             connected, address = listening.accept()
         except (BlockingIOError, InterruptedError, ConnectionError):  # the client has gone meanwhile
@@ -204,7 +204,7 @@ class Listener:
         task.add_done_callback(self._connecting.discard)
 
     def _pause(self, listening: socket.socket) -> None:
-        """Accept no connection for ``RETRY_S``: the loop would otherwise report the waiting one without end."""
+        """Accept no connection for ``RETRY_S``. Otherwise the loop would report the waiting one in a busy loop."""
         loop = asyncio.get_running_loop()
         loop.remove_reader(listening)
         self._resuming[listening] = loop.call_later(RETRY_S, self._resume, listening)

@@ -1,4 +1,4 @@
-"""Log lines: JSON for a journal or a pipe, readable on a terminal. On stderr; stdout belongs to results."""
+"""Configuration of the log on stderr: JSON for a journal or a pipe, readable text on a terminal."""
 
 import contextlib
 import os
@@ -17,14 +17,14 @@ _levels: dict[str, LogLevel] = {}
 
 
 def configure_logs(lines: MutableSequence[str] | None = None) -> None:
-    """Set structlog up for this process.
+    """Configure structlog for this process.
 
     Args:
-        lines: Gets the lines in place of stderr: a live view hides what else is written on its terminal.
+        lines: List that receives the lines in place of stderr, for a live view that uses the terminal itself.
     """
     readable = lines is not None or (sys.stderr.isatty() and "JOURNAL_STREAM" not in os.environ)
     wide = lines is None
-    last: list[Any] = (
+    renderers: list[Any] = (
         [structlog.dev.ConsoleRenderer(30 if wide else 0, colors=wide, pad_level=wide)]
         if readable
         else [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
@@ -33,11 +33,11 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
         processors=[
             structlog.contextvars.merge_contextvars,
             structlog.processors.add_log_level,
-            _talkative,
+            _drop_below_level,
             structlog.processors.TimeStamper(fmt="iso" if wide else "%H:%M:%SZ", utc=True),
-            *last,
+            *renderers,
         ],
-        logger_factory=lambda *_: _Lines(stderr.take if lines is None else lines.append),
+        logger_factory=lambda *_: _LineLogger(stderr.take if lines is None else lines.append),
     )
 
 
@@ -55,25 +55,25 @@ def set_level(pack: str, level: LogLevel) -> None:
     _levels[pack] = level
 
 
-def _talkative(_: object, __: str, line: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+def _drop_below_level(_: object, __: str, line: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
     """Drop lines below the level.
 
     Raises:
-        structlog.DropEvent: It is.
+        structlog.DropEvent: The line is below the level.
     """
-    least = min((LEVELS.index(level) for level in _levels.values()), default=0)
-    if line["level"] in LEVELS and LEVELS.index(line["level"]) < least:
+    min_level = min((LEVELS.index(level) for level in _levels.values()), default=0)
+    if line["level"] in LEVELS and LEVELS.index(line["level"]) < min_level:
         raise structlog.DropEvent
     return line
 
 
-class _Lines:
-    """A logger of structlog that hands on lines."""
+class _LineLogger:
+    """Logger of structlog that passes lines to a function."""
 
-    def __init__(self, take: Callable[[str], object]) -> None:
-        self._take = take
+    def __init__(self, write_line: Callable[[str], object]) -> None:
+        self._write_line = write_line
 
     def msg(self, message: str) -> None:
-        self._take(message)
+        self._write_line(message)
 
     debug = info = warning = error = critical = exception = msg

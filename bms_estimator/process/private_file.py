@@ -1,4 +1,4 @@
-"""Files for their owner alone, each written so that after a power cut there is the old one or the new one."""
+"""Files that only their owner can read, written atomically: a power failure leaves the old or the new content."""
 
 import os
 import stat
@@ -6,51 +6,51 @@ from pathlib import Path
 
 
 class UnsafeFileError(Exception):
-    """The file in place of a private file belongs to another user."""
+    """The path of a private file is not a regular file, or the file is too long."""
 
 
-def read_private(path: Path, longest: int) -> bytes:
-    """Read a whole regular file; refuse links and other file types.
+def read_private(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file; reject symbolic links and other file types.
 
     Args:
         path: The file.
-        longest: Maximum size [bytes].
+        max_bytes: Maximum size [bytes].
 
     Raises:
-        UnsafeFileError: It is too long or no file.
-        OSError: It cannot be read.
+        UnsafeFileError: The path is too long a file, or no regular file.
+        OSError: The file cannot be read.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     with open(descriptor, "rb") as file:  # noqa: PTH123 - a descriptor has no Path
         found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode) or found.st_size > longest:
+        if not stat.S_ISREG(found.st_mode) or found.st_size > max_bytes:
             raise UnsafeFileError("no file, or too long")
         return file.read()
 
 
 def write_private(path: Path, content: bytes | memoryview) -> None:
-    """Write a whole file atomically, and wait until the disk has it. Root writes for the owner of the folder.
+    """Write a file atomically, and sync it to disk. A file written by root gets the owner of the folder.
 
     Args:
-        path: The file, in a folder that is there; beside it ``<stem>.new`` is written first.
-        content: All of it.
+        path: The file, in an existing folder. ``<stem>.new`` next to it is written first, and then renamed.
+        content: New content of the file.
 
     Raises:
-        OSError: The disk cannot be written. The old file is as it was.
+        OSError: The disk cannot be written. The old file is unchanged.
     """
     new = path.with_suffix(".new")
-    new.unlink(missing_ok=True)  # left by a power cut, or an unexpected symlink
+    new.unlink(missing_ok=True)  # left by a power failure, or an unexpected symbolic link
     with open(new, "xb", opener=_private) as file:
         if os.geteuid() == 0:
-            folder_is = path.parent.stat()
-            os.fchown(file.fileno(), folder_is.st_uid, folder_is.st_gid)
+            owner = path.parent.stat()
+            os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
     new.replace(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
-        os.fsync(folder)  # its name, too
+        os.fsync(folder)  # syncs the new name
     finally:
         os.close(folder)
 

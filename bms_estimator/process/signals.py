@@ -42,7 +42,10 @@ def startup_signals() -> Iterator[None]:
 
 
 def _end(*_: object) -> None:
-    """End the process without an exception, which the compiler would lose; in a thread, because the interrupted code may hold the log's lock."""
+    """End the process without an exception, because one may be lost in the compiler.
+
+    This is done in a thread, because the interrupted code may hold the lock of the log.
+    """
 
     def end() -> None:
         log.info("asked to end before samples were taken")

@@ -14,11 +14,11 @@ log = structlog.get_logger(__name__)
 def state_folder(settings: Settings) -> Path:
     """Return the folder of checkpoints, and create it.
 
-    It is that of the settings, otherwise systemd's StateDirectory, otherwise the user's XDG state folder. If it cannot
-    be created, a later save reports it.
+    The folder is ``state.folder`` of the settings, otherwise systemd's StateDirectory, otherwise the user's XDG state folder.
+    If one of the latter two cannot be created, a warning is logged, and a later save reports the error.
 
     Raises:
-        UserError: The folder of the settings cannot be made.
+        UserError: The folder of the settings cannot be created.
     """
     systemd = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
     home = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
@@ -26,9 +26,9 @@ def state_folder(settings: Settings) -> Path:
     try:
         folder = folder.expanduser()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except (OSError, RuntimeError) as error:  # the latter of a user without a home
+    except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home folder
         reason = error.strerror if isinstance(error, OSError) else str(error)
         if settings.state.folder:
             raise UserError(f"state.folder = {folder}: {reason}") from error
-        log.warning("the state cannot outlive a restart", folder=str(folder), reason=reason)
+        log.warning("the state will be lost at a restart", folder=str(folder), reason=reason)
     return folder

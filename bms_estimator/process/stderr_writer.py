@@ -1,32 +1,32 @@
-"""Stderr that nothing waits for: whoever reads it, or the disk behind it, may hang."""
+"""Non-blocking writer of stderr, because its reader, or the disk behind it, may hang."""
 
 import os
 import queue
 import threading
 import time
 
-WAITING_LINES = 1000
+MAX_QUEUED_LINES = 1000
 """Maximum number of log lines waiting for the reader; further lines are lost and counted."""
-END_S = 1.0
-"""Time that the process waits at its end for the reader [s]."""
+DRAIN_TIMEOUT_S = 1.0
+"""Maximum time that the process waits for the reader before it ends [s]."""
 STDERR = 2
 
 
 class Stderr:
-    """Lines for stderr, written by a thread that the end of the process does not wait for.
+    """Writer of lines to stderr in a daemon thread, which does not delay the end of the process.
 
     Attributes:
         lost: Number of lost lines.
     """
 
     def __init__(self) -> None:
-        self._lines: queue.Queue[str] = queue.Queue(WAITING_LINES)
+        self._lines: queue.Queue[str] = queue.Queue(MAX_QUEUED_LINES)
         self._thread = threading.Thread(target=self._run, name="stderr", daemon=True)
         self._lock = threading.Lock()
         self.lost = 0
 
     def take(self, line: str) -> None:
-        """Have a line written; from any thread, at once."""
+        """Queue a line; callable from any thread, never blocking."""
         try:
             self._lines.put_nowait(line)
         except queue.Full:
@@ -36,8 +36,8 @@ class Stderr:
                 self._thread.start()
 
     def drain(self) -> None:
-        """Wait until all is written, but no longer than ``END_S``."""
-        end_s = time.monotonic() + END_S
+        """Wait until all lines are written, but no longer than ``DRAIN_TIMEOUT_S``."""
+        end_s = time.monotonic() + DRAIN_TIMEOUT_S
         with self._lines.all_tasks_done:
             while self._lines.unfinished_tasks and time.monotonic() < end_s:
                 self._lines.all_tasks_done.wait(end_s - time.monotonic())
@@ -46,7 +46,7 @@ class Stderr:
         while True:
             rest = f"{self._lines.get()}\n".encode(errors="replace")
             try:
-                while rest:  # not by sys.stderr: its buffer would wait once more, as the process ends
+                while rest:  # not by sys.stderr, whose buffer is flushed, and may block, when the process ends
                     rest = rest[os.write(STDERR, rest) :]
             except OSError:  # a full disk costs only this line
                 self.lost += 1

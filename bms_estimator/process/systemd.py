@@ -10,28 +10,28 @@ CREDENTIALS = Path("/run/credentials")
 
 
 class SystemdNotifier:
-    """Sends states to the socket of ``NOTIFY_SOCKET``; does nothing without one.
+    """Sender of states to the socket of ``NOTIFY_SOCKET``. It does nothing without the variable.
 
-    One process may serve several packs. Systemd knows one service, so a state is sent when all packs have reached it
-    since it was last sent. So it is ready with the last of them, and alive while each is.
+    One process may serve several packs, but is a single service for systemd. A state is therefore sent when all packs have
+    reported it since it was last sent: the service is ready with its last pack, and alive while all packs are.
 
     Args:
         packs: Names of the packs.
         environment: Environment with ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC``.
-        doing: Text for people.
+        activity: Verb of the status text.
     """
 
     def __init__(
-        self, packs: Collection[str], environment: Mapping[str, str] = os.environ, *, doing: str = "estimating"
+        self, packs: Collection[str], environment: Mapping[str, str] = os.environ, *, activity: str = "estimating"
     ) -> None:
-        self._packs, self._doing = frozenset(packs), doing
+        self._packs, self._activity = frozenset(packs), activity
         self._awaited: dict[str, set[str]] = {}
         self._texts = dict.fromkeys(packs, "")
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.watchdog_s = float(environment.get("WATCHDOG_USEC", "0")) / 1e6 if for_us else 0.0
-        """Time after which systemd takes us for dead [s]; 0: it does not watch."""
+        """Watchdog timeout of systemd [s]; 0: no watchdog."""
 
     def ready(self, pack: str) -> None:
         """Report that the pack's loop runs."""
@@ -53,7 +53,7 @@ class SystemdNotifier:
     @property
     def _status(self) -> str:
         packs = (f"{pack}: {text}" if text else pack for pack, text in sorted(self._texts.items()))
-        return f"STATUS={self._doing} {', '.join(packs)}"
+        return f"STATUS={self._activity} {', '.join(packs)}"
 
     def _send_with_last(self, pack: str, state: str, more: str = "") -> None:
         awaited = self._awaited.setdefault(state, set(self._packs))
@@ -81,6 +81,6 @@ def credential(name: Path) -> Path:
 
 
 def is_for_the_service(name: Path) -> bool:
-    """Return True for a file that only the running service can read: a name or path of a systemd credential that is absent here."""
+    """Return True for a systemd credential, by name or path, that is not readable here but may be for the service."""
     named = not name.is_absolute() or name.is_relative_to(CREDENTIALS)
     return named and not os.access(credential(name), os.R_OK)

@@ -1,23 +1,23 @@
-"""Tasks that talk with the server, and how they end: its library, and wait_for of Python 3.11, may swallow a cancellation."""
+"""Reliable cancellation of tasks: some libraries, and wait_for of Python 3.11, may swallow a cancellation."""
 
 import asyncio
 from collections.abc import Coroutine
 from typing import Any
 
-AGAIN_S = 0.1
+CANCEL_INTERVAL_S = 0.1
 """Interval at which a task that ignores cancellation is cancelled again [s]."""
 
 
 async def end(*tasks: asyncio.Future[Any]) -> None:
-    """Cancel until all have ended; nothing that must be finished may be in them."""
-    while left := {task for task in tasks if not task.done()}:
-        for task in left:
+    """Cancel tasks repeatedly until all have ended. They must not contain work that has to be finished."""
+    while unfinished := {task for task in tasks if not task.done()}:
+        for task in unfinished:
             task.cancel()
-        await asyncio.wait(left, timeout=AGAIN_S)
+        await asyncio.wait(unfinished, timeout=CANCEL_INTERVAL_S)
 
 
 async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:
-    """Run all until one ends, end the others, raise what one raised."""
+    """Run coroutines until one ends, cancel the others, and raise the first exception of any of them."""
     tasks = [asyncio.ensure_future(coroutine) for coroutine in coroutines]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

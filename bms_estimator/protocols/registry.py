@@ -1,6 +1,6 @@
 """All device protocols by their names.
 
-Every module of ``protocols.devices`` is found by itself: a new device is one new file.
+All modules of ``protocols.devices`` are registered automatically, so that a new device needs only one new file.
 """
 
 import importlib
@@ -14,7 +14,7 @@ from bms_estimator.protocols.base.device import Device
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 
 BOARD = "binary"
-"""Name of the firmware's own protocol. It is not a ``Device``, because its decoder would load numba for a text meter."""
+"""Name of the firmware's protocol. It is no ``Device``, because its decoder imports numba, which other devices do not need."""
 
 
 def _find_devices() -> dict[str, Device]:
@@ -22,8 +22,11 @@ def _find_devices() -> dict[str, Device]:
     modules = (
         importlib.import_module(f"{devices.__name__}.{each.name}") for each in pkgutil.iter_modules(devices.__path__)
     )
-    found: list[Device] = [module.DEVICE for module in modules]
-    return {device.name: device for device in sorted(found, key=lambda device: (device.has_binary_frames, device.name))}
+    found_devices: list[Device] = [module.DEVICE for module in modules]
+    return {
+        device.name: device
+        for device in sorted(found_devices, key=lambda device: (device.has_binary_frames, device.name))
+    }
 
 
 DEVICES: Mapping[str, Device] = _find_devices()
@@ -41,11 +44,11 @@ class Sensor(Protocol):
 
     @property
     def current_sign(self) -> CurrentSign:
-        """Direction that the device reports as positive."""
+        """Direction of the current that the device reports as positive."""
 
     @property
     def address(self) -> int | None:
-        """Address of the device on its bus; None: the first that answers."""
+        """Address of the device on its bus; None: the first that responds."""
 
     @property
     def sample_rate_hz(self) -> int:

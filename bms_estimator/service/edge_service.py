@@ -46,7 +46,7 @@ async def serve_edge(
     if settings.edge is None:
         raise UserError('edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"')
     stop, name = stop_on_signal(stop), settings.pack.name
-    notifier = notifier or SystemdNotifier([name], doing="sending samples of")
+    notifier = notifier or SystemdNotifier([name], activity="sending samples of")
     set_level(name, settings.log.level)
     source = open_line_source(settings) or SerialSource(settings.sensor, memory=KnownBoardFile(folder, name))
     with instance_lock(folder, name):

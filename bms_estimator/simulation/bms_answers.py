@@ -1,4 +1,4 @@
-"""Responses of a BMS to each query, by protocol: the other side of ``protocols.devices``."""
+"""Responses of a simulated BMS to each request, by protocol: the encoders for the decoders in ``protocols.devices``."""
 
 import math
 import struct
@@ -28,9 +28,9 @@ Answers = Mapping[bytes, Callable[[Measured], bytes]]
 """Responses by query."""
 
 
-def _steps(value: float, per_unit: float, least: int, most: int) -> int:
-    """Quantize a value to a converter's steps within its range."""
-    return min(max(round(value * per_unit), least), most)
+def _steps(value: float, per_unit: float, minimum: int, maximum: int) -> int:
+    """Convert a value to integer steps, limited to a range."""
+    return min(max(round(value * per_unit), minimum), maximum)
 
 
 def _u16(value: float, per_unit: float) -> int:
@@ -42,76 +42,78 @@ def _jbd(register: int, data: bytes) -> bytes:
     return bytes((jbd.START, register)) + body + jbd.checksum(body) + bytes((jbd.END,))
 
 
-def _jbd_basic(told: Measured) -> bytes:
-    probes = [] if math.isnan(told.temperature_c) else [_u16(told.temperature_c + jbd.ZERO_C / 10, 10)]
+def _jbd_basic(measured: Measured) -> bytes:
+    probes = [] if math.isnan(measured.temperature_c) else [_u16(measured.temperature_c + jbd.ZERO_C / 10, 10)]
     data = struct.pack(
         ">HhHHHHHHHBBBBB",
-        *(_u16(told.voltage_v, 100), _steps(-told.current_a, 100, -0x8000, 0x7FFF)),
-        *(_u16(told.soc * told.capacity_ah, 100), _u16(told.capacity_ah, 100), 0, 0, 0, 0, 0),
-        *(0x20, _steps(told.soc, 100, 0, 100), 3, len(told.cells_v), len(probes)),
+        *(_u16(measured.voltage_v, 100), _steps(-measured.current_a, 100, -0x8000, 0x7FFF)),
+        *(_u16(measured.soc * measured.capacity_ah, 100), _u16(measured.capacity_ah, 100), 0, 0, 0, 0, 0),
+        *(0x20, _steps(measured.soc, 100, 0, 100), 3, len(measured.cells_v), len(probes)),
     )
     return _jbd(jbd.BASIC, data + struct.pack(f">{len(probes)}H", *probes))
 
 
-def _jbd_cells(told: Measured) -> bytes:
-    return _jbd(jbd.CELLS, struct.pack(f">{len(told.cells_v)}H", *(_u16(v, 1000) for v in told.cells_v)))
+def _jbd_cells(measured: Measured) -> bytes:
+    return _jbd(jbd.CELLS, struct.pack(f">{len(measured.cells_v)}H", *(_u16(v, 1000) for v in measured.cells_v)))
 
 
 def _daly(command: int, data: bytes) -> bytes:
-    return daly.sealed(bytes((daly.START, PACK, command, daly.DATA_BYTES)) + data.ljust(daly.DATA_BYTES, b"\0"))
+    return daly.with_checksum(bytes((daly.START, PACK, command, daly.DATA_BYTES)) + data.ljust(daly.DATA_BYTES, b"\0"))
 
 
-def _daly_status(told: Measured) -> bytes:
-    return _daly(daly.STATUS, bytes((len(told.cells_v), int(not math.isnan(told.temperature_c)))))
+def _daly_status(measured: Measured) -> bytes:
+    return _daly(daly.STATUS, bytes((len(measured.cells_v), int(not math.isnan(measured.temperature_c)))))
 
 
-def _daly_cells(told: Measured) -> bytes:
-    steps = [_u16(v, 1000) for v in told.cells_v] + [0, 0]
-    frames = range(math.ceil(len(told.cells_v) / daly.CELLS_A_FRAME))
+def _daly_cells(measured: Measured) -> bytes:
+    steps = [_u16(v, 1000) for v in measured.cells_v] + [0, 0]
+    frames = range(math.ceil(len(measured.cells_v) / daly.CELLS_A_FRAME))
     return b"".join(_daly(daly.CELLS, struct.pack(">B3H", i + 1, *steps[3 * i : 3 * i + 3])) for i in frames)
 
 
-def _daly_probes(told: Measured) -> bytes:
-    there = not math.isnan(told.temperature_c)
-    return _daly(daly.PROBES, bytes((1, _steps(told.temperature_c + daly.ZERO_C, 1, 1, 255) if there else 0)))
+def _daly_probes(measured: Measured) -> bytes:
+    there = not math.isnan(measured.temperature_c)
+    return _daly(daly.PROBES, bytes((1, _steps(measured.temperature_c + daly.ZERO_C, 1, 1, 255) if there else 0)))
 
 
-def _daly_pack(told: Measured) -> bytes:
-    current = _u16(told.current_a + daly.NO_CURRENT / 10, 10)
-    return _daly(daly.PACK, struct.pack(">4H", _u16(told.voltage_v, 10), 0, current, _u16(told.soc, 1000)))
+def _daly_pack(measured: Measured) -> bytes:
+    current = _u16(measured.current_a + daly.ZERO_CURRENT / 10, 10)
+    return _daly(daly.PACK, struct.pack(">4H", _u16(measured.voltage_v, 10), 0, current, _u16(measured.soc, 1000)))
 
 
-def _jk_old(told: Measured) -> bytes:
-    amperes = _steps(abs(told.current_a), 100, 0, jk.CHARGING - 1) | (jk.CHARGING if told.current_a < 0.0 else 0)
-    celsius = jk.ABSENT_C if math.isnan(told.temperature_c) else _steps(told.temperature_c, 1, -39, 100)
+def _jk_old(measured: Measured) -> bytes:
+    amperes = _steps(abs(measured.current_a), 100, 0, jk.CHARGING - 1) | (
+        jk.CHARGING if measured.current_a < 0.0 else 0
+    )
+    celsius = jk.ABSENT_C if math.isnan(measured.temperature_c) else _steps(measured.temperature_c, 1, -39, 100)
     probe = celsius if celsius >= 0 else 100 - celsius
-    cells = b"".join(struct.pack(">BH", i, _u16(v, 1000)) for i, v in enumerate(told.cells_v, 1))
+    cells = b"".join(struct.pack(">BH", i, _u16(v, 1000)) for i, v in enumerate(measured.cells_v, 1))
     registers = (
         bytes((jk.CELLS, len(cells)))
         + cells
         + struct.pack(">BHBHBH", 0x80, probe, jk.BOX_C, probe, jk.BATTERY_C, probe)
-        + struct.pack(">BHBH", jk.VOLTAGE, _u16(told.voltage_v, 100), jk.CURRENT, amperes)
-        + struct.pack(">BBBB", 0x85, _steps(told.soc, 100, 0, 100), 0x86, 2)
-        + struct.pack(">BHBI", 0x8A, len(told.cells_v), 0xAA, round(told.capacity_ah))
+        + struct.pack(">BHBH", jk.VOLTAGE, _u16(measured.voltage_v, 100), jk.CURRENT, amperes)
+        + struct.pack(">BBBB", 0x85, _steps(measured.soc, 100, 0, 100), 0x86, 2)
+        + struct.pack(">BHBI", 0x8A, len(measured.cells_v), 0xAA, round(measured.capacity_ah))
         + bytes((jk.SOFTWARE,))
         + NAME.ljust(15, b"_")
         + bytes((jk.VERSION, 1))
     )
     head = bytes((0, 0, 0, 0, jk.READ_ALL, jk.FROM_BMS, jk.ANSWER))
     body = head + registers + bytes((0, 0, 0, 0, jk.OLD_END))
-    return jk.old_sealed(jk.OLD_START + (len(body) + 6).to_bytes(2, "big") + body)
+    return jk.with_old_checksum(jk.OLD_START + (len(body) + 6).to_bytes(2, "big") + body)
 
 
-def _jk_newer(told: Measured) -> bytes:
+def _jk_newer(measured: Measured) -> bytes:
     frame = bytearray(jk.FRAME_BYTES)
     frame[:5] = jk.START + bytes((jk.REALTIME,))
-    struct.pack_into(f"<{len(told.cells_v)}H", frame, 6, *(_u16(v, 1000) for v in told.cells_v))
-    struct.pack_into("<I", frame, 70, (1 << len(told.cells_v)) - 1)
-    struct.pack_into("<I", frame, 150, round(1000 * told.voltage_v))
-    struct.pack_into("<i", frame, 158, round(-1000 * told.current_a))
-    probe = jk.ABSENT_DECI_C if math.isnan(told.temperature_c) else round(10 * told.temperature_c)
+    struct.pack_into(f"<{len(measured.cells_v)}H", frame, 6, *(_u16(v, 1000) for v in measured.cells_v))
+    struct.pack_into("<I", frame, 70, (1 << len(measured.cells_v)) - 1)
+    struct.pack_into("<I", frame, 150, round(1000 * measured.voltage_v))
+    struct.pack_into("<i", frame, 158, round(-1000 * measured.current_a))
+    probe = jk.ABSENT_DECI_C if math.isnan(measured.temperature_c) else round(10 * measured.temperature_c)
     struct.pack_into("<2h", frame, 162, probe, probe)
-    frame[173] = _steps(told.soc, 100, 0, 100)
+    frame[173] = _steps(measured.soc, 100, 0, 100)
     frame[-1] = sum(frame) & 0xFF
     record = struct.pack(">BBHH", PACK, jk.MODBUS_WRITE, jk.REALTIME_REGISTER, 1)
     return bytes(frame) + record + jk.crc16(record)
@@ -119,19 +121,19 @@ def _jk_newer(told: Measured) -> bytes:
 
 BMS_ANSWERS: Mapping[str, Answers] = {
     "jbd": {
-        jbd.question(jbd.NAME): lambda _: _jbd(jbd.NAME, NAME),
-        jbd.question(jbd.CELLS): _jbd_cells,
-        jbd.question(jbd.BASIC): _jbd_basic,
+        jbd.request(jbd.NAME): lambda _: _jbd(jbd.NAME, NAME),
+        jbd.request(jbd.CELLS): _jbd_cells,
+        jbd.request(jbd.BASIC): _jbd_basic,
     },
     "daly": {
-        daly.question(daly.HOSTS[0], daly.STATUS): _daly_status,
-        daly.question(daly.HOSTS[0], daly.CELLS): _daly_cells,
-        daly.question(daly.HOSTS[0], daly.PROBES): _daly_probes,
-        daly.question(daly.HOSTS[0], daly.PACK): _daly_pack,
+        daly.request(daly.HOSTS[0], daly.STATUS): _daly_status,
+        daly.request(daly.HOSTS[0], daly.CELLS): _daly_cells,
+        daly.request(daly.HOSTS[0], daly.PROBES): _daly_probes,
+        daly.request(daly.HOSTS[0], daly.PACK): _daly_pack,
     },
-    "jk": {jk.OLD_QUESTION: _jk_old},
-    "jk-pb": {jk.question(PACK): _jk_newer},
+    "jk": {jk.OLD_REQUEST: _jk_old},
+    "jk-pb": {jk.request(PACK): _jk_newer},
 }
 """Responses by protocol; ``jk`` and ``jk-pb`` are the two families of JK."""
 MAX_CELLS = 32
-"""No protocol has room for more in all its frames."""
+"""Maximum number of cells that the frames of all protocols can hold."""

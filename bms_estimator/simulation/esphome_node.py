@@ -1,4 +1,4 @@
-"""A JK-BMS without hardware, as an ESPHome node publishes it by MQTT: the twin of ``source.profile = "esphome-jk"``."""
+"""Simulated ESPHome node that publishes a JK-BMS by MQTT, for ``source.profile = "esphome-jk"``."""
 
 import asyncio
 import random
@@ -18,14 +18,14 @@ from bms_estimator.simulation.virtual_adc import Reading
 INTERVAL_S = 2.0
 """Poll interval of the node [s]."""
 SPREAD_V = 0.004
-"""Standard deviation of the cells among each other [V]."""
+"""Standard deviation of the cell voltages from their mean [V]."""
 
 
 class SimulatedNode:
-    """Publishes what a pack has at its terminals.
+    """Simulated node that publishes the readings of a pack.
 
     Args:
-        signal: What the pack has, by time [s].
+        signal: Readings of the pack as a function of time [s].
         cells: Number of cells in series.
         mqtt: The broker.
         prefix: Name of the node.
@@ -47,15 +47,15 @@ class SimulatedNode:
         seed: int = 0,
     ) -> None:
         self._signal, self._prefix, self._speed = signal, prefix, speed
-        self._apart_v = _apart(cells, random.Random(seed))
+        self._deviations_v = _cell_deviations(cells, random.Random(seed))
         self.path = f"{prefix}/sensor/+/state on {', '.join(mqtt.urls)}"
         self.time_s = 0.0
         """Time of the last reading [s]."""
         self.samples = 0
         self._end_s = 0.0
         will = Message(f"{prefix}/status", b"offline", 1, retain=True)
-        hello = ConnectOptions(f"{prefix}-{secrets.token_hex(4)}", will, lambda *_: None)
-        self._link = ReconnectLoop(brokers(mqtt), hello, BrokerConnector(mqtt), self._serve, DeliveryStats())
+        options = ConnectOptions(f"{prefix}-{secrets.token_hex(4)}", will, lambda *_: None)
+        self._link = ReconnectLoop(brokers(mqtt), options, BrokerConnector(mqtt), self._serve, DeliveryStats())
 
     def __enter__(self) -> Self:
         """Nothing to open: ``run`` connects."""
@@ -70,28 +70,28 @@ class SimulatedNode:
         await self._link.run()
 
     async def _serve(self, connection: Connection) -> None:
-        """While the broker is there."""
+        """Publish the readings while the broker is connected."""
         await self._publish(connection, {"status": "online"})
         loop = asyncio.get_running_loop()
         offset_s = loop.time() - self.time_s / self._speed
         while self.time_s + INTERVAL_S <= self._end_s:
             await asyncio.sleep(max(offset_s + (self.time_s + INTERVAL_S) / self._speed - loop.time(), 0.0))
             self.time_s += INTERVAL_S
-            said = {f"sensor/{self._prefix}_{name}/state": text for name, text in self._states()}
-            await self._publish(connection, said)
+            states = {f"sensor/{self._prefix}_{name}/state": text for name, text in self._states()}
+            await self._publish(connection, states)
             self.samples += 1
         await self._publish(connection, {"status": "offline"})
         self._link.closing.set()
 
     async def _publish(self, connection: Connection, states: Mapping[str, str]) -> None:
-        """Each on its topic, retained as ESPHome does."""
+        """Publish each state on its topic, retained as by ESPHome."""
         for topic, text in states.items():
             await connection.publish(Message(f"{self._prefix}/{topic}", text.encode(), 0, retain=True))
 
     def _states(self) -> Iterator[tuple[str, str]]:
-        """Names as in the examples of esphome-jk-bms, with the decimals of its sensors; the current is positive on charge."""
+        """Yield name and text of each sensor as in the examples of esphome-jk-bms; the current is positive on charge."""
         current_a, voltage_v, temperature_c = self._signal(self.time_s)
-        cells_v = [voltage_v / len(self._apart_v) + apart_v for apart_v in self._apart_v]
+        cells_v = [voltage_v / len(self._deviations_v) + deviations_v for deviations_v in self._deviations_v]
         yield "min_cell_voltage", f"{min(cells_v):.3f}"
         yield "max_cell_voltage", f"{max(cells_v):.3f}"
         yield from ((f"cell_voltage_{n}", f"{v:.3f}") for n, v in enumerate(cells_v, start=1))
@@ -101,8 +101,8 @@ class SimulatedNode:
         yield "temperature_sensor_1", f"{temperature_c:.1f}"
 
 
-def _apart(cells: int, dice: random.Random) -> Sequence[float]:
+def _cell_deviations(cells: int, rng: random.Random) -> Sequence[float]:
     """Return the deviation of each cell from their mean [V]."""
-    apart_v = [dice.gauss(0.0, SPREAD_V) for _ in range(cells)]
-    mean_v = sum(apart_v) / cells
-    return [v - mean_v for v in apart_v]
+    deviations_v = [rng.gauss(0.0, SPREAD_V) for _ in range(cells)]
+    mean_v = sum(deviations_v) / cells
+    return [v - mean_v for v in deviations_v]

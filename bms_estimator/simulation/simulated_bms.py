@@ -10,10 +10,10 @@ from bms_estimator.simulation.bms_answers import BMS_ANSWERS, MAX_CELLS, Measure
 from bms_estimator.simulation.simulated_meter import Signal, SimulatedMeter
 from bms_estimator.simulation.virtual_adc import Reading
 
-HEARD_BYTES = 64
-"""No question is longer."""
-MISSING_BYTES = 5
-"""Length of a truncated response [bytes]."""
+MAX_REQUEST_BYTES = 64
+"""Maximum length of a request [bytes]."""
+CUT_BYTES = 5
+"""Number of bytes that a truncated response lacks."""
 SPREAD_V = 0.004
 """Maximum deviation of a cell from the mean [V]."""
 
@@ -28,7 +28,7 @@ class BmsFault(Enum):
 
 
 class SimulatedBms(SimulatedMeter):
-    """A BMS with some cells.
+    """Simulated BMS on a pseudo-terminal.
 
     Args:
         protocol: A key of ``BMS_ANSWERS``.
@@ -67,24 +67,24 @@ class SimulatedBms(SimulatedMeter):
         """Apply ``fault`` to the next ``answers`` responses without one."""
         self._faults.extend([fault] * answers)
 
-    def mend(self) -> None:
-        """Let nothing happen to answers any more."""
+    def clear_faults(self) -> None:
+        """Discard the remaining faults."""
         self._faults.clear()
 
-    def message(self, reading: Reading) -> bytes:  # noqa: ARG002 - as all of them
-        """Nothing by itself."""
+    def message(self, reading: Reading) -> bytes:  # noqa: ARG002 - interface
+        """Return no bytes, because a BMS sends nothing unsolicited."""
         return b""
 
-    def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:
-        """Respond to each query in ``heard``, in order."""
-        said, end = b"", 0
-        while found := min(
-            ((at, question) for question in self._answers if (at := heard.find(question, end)) >= 0), default=None
+    def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
+        """Respond to each request in ``received``, in order."""
+        responses, end = b"", 0
+        while first := min(
+            ((at, request) for request in self._answers if (at := received.find(request, end)) >= 0), default=None
         ):
-            at, question = found
-            end = at + len(question)
-            said += self._spoiled(self._answers[question](self._measured(reading)))
-        return said, max(end, len(heard) - HEARD_BYTES)
+            at, request = first
+            end = at + len(request)
+            responses += self._with_fault(self._answers[request](self._measured(reading)))
+        return responses, max(end, len(received) - MAX_REQUEST_BYTES)
 
     def _measured(self, reading: Reading) -> Measured:
         cell_v = reading.voltage_v / len(self._offsets_v)
@@ -93,7 +93,7 @@ class SimulatedBms(SimulatedMeter):
             reading.voltage_v, reading.current_a, reading.temperature_c, cells_v, self._soc(), self._capacity_ah
         )
 
-    def _spoiled(self, answer: bytes) -> bytes:
+    def _with_fault(self, answer: bytes) -> bytes:
         """Apply a fault to a response."""
         match self._faults.popleft() if self._faults else None:
             case BmsFault.SILENCE:
@@ -102,7 +102,7 @@ class SimulatedBms(SimulatedMeter):
                 at = len(answer) // 2
                 return answer[:at] + bytes((answer[at] ^ 0x55,)) + answer[at + 1 :]
             case BmsFault.SHORT:
-                return answer[:-MISSING_BYTES]
+                return answer[:-CUT_BYTES]
             case BmsFault.NOISE:
                 return self._random.randbytes(20) + answer
         return answer

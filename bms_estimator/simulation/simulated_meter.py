@@ -1,7 +1,6 @@
-"""Battery monitors and batteries without hardware: they speak their makers' protocols on a pseudo-terminal.
+"""Simulated battery monitors and batteries, with their makers' protocols on a pseudo-terminal.
 
-Beside ``virtual_board``, which speaks the firmware's. They round as the device does, and report the pack at that
-time.
+The values are rounded as by the device. ``virtual_board`` simulates the firmware's board.
 """
 
 import asyncio
@@ -15,11 +14,11 @@ from typing import Self
 from bms_estimator.simulation.virtual_adc import Reading
 
 Signal = Callable[[float], Reading]
-"""Readings by time [s], which never steps back."""
+"""Readings as a function of time [s], which never decreases."""
 
 
 class SimulatedMeter(ABC):
-    """A device on a pseudo-terminal. Open it as a context manager, then ``run`` it.
+    """Simulated device on a pseudo-terminal. Open it as a context manager, then ``run`` it.
 
     Args:
         signal: The simulated pack.
@@ -50,7 +49,7 @@ class SimulatedMeter(ABC):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Pull the plug: the host's descriptor dies."""
+        """Close the pseudo-terminal, as if the device were unplugged."""
         for descriptor in (self._master, self._slave):
             os.close(descriptor)
 
@@ -58,27 +57,27 @@ class SimulatedMeter(ABC):
     def message(self, reading: Reading) -> bytes:
         """Encode a reading."""
 
-    def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:  # noqa: ARG002 - for those that are asked
-        """Respond to ``heard``; return the response and the number of bytes consumed."""
-        return b"", len(heard)
+    def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:  # noqa: ARG002 - for polled devices
+        """Return the response to ``received``, and the number of consumed bytes."""
+        return b"", len(received)
 
     def send(self, data: bytes) -> None:
-        """Put any bytes on the line; a host that does not read loses them."""
+        """Write arbitrary bytes to the line. They are lost if the host does not read."""
         try:
             os.write(self._master, data)
         except BlockingIOError:
             return
 
     async def run(self, seconds: float = math.inf) -> None:
-        """Speak and answer for ``seconds`` of its time."""
+        """Send messages and responses for ``seconds`` of simulated time."""
         loop, inbox = asyncio.get_running_loop(), bytearray()
-        start_s, heard = loop.time(), asyncio.Event()
+        start_s, has_input = loop.time(), asyncio.Event()
 
-        def hear() -> None:
+        def read_input() -> None:
             inbox.extend(os.read(self._master, 4096))
-            heard.set()
+            has_input.set()
 
-        loop.add_reader(self._master, hear)
+        loop.add_reader(self._master, read_input)
         try:
             due_s = 0.0
             while (now_s := (loop.time() - start_s) * self._speed) < seconds:
@@ -86,14 +85,14 @@ class SimulatedMeter(ABC):
                     due_s += self.period_s
                     self._report(now_s)
                 if inbox:
-                    said, understood = self.answer(bytes(inbox), self._read(now_s))
-                    del inbox[:understood]
-                    self.send(said)
-                heard.clear()
+                    response, consumed = self.answer(bytes(inbox), self._read(now_s))
+                    del inbox[:consumed]
+                    self.send(response)
+                has_input.clear()
                 wait_s = (min(due_s, seconds) - now_s) / self._speed
                 try:
                     async with asyncio.timeout(wait_s if math.isfinite(wait_s) else None):
-                        await heard.wait()
+                        await has_input.wait()
                 except TimeoutError:
                     continue
         finally:
@@ -112,12 +111,12 @@ class SimulatedMeter(ABC):
 
 
 class SimulatedVeDirect(SimulatedMeter):
-    """A SmartShunt: a block each second, and a history block without present values."""
+    """Simulated SmartShunt, which sends a block and a history block each second."""
 
     period_s = 1.0
 
     def message(self, reading: Reading) -> bytes:
-        """Both blocks."""
+        """Return both blocks."""
         temperature = "---" if math.isnan(reading.temperature_c) else f"{reading.temperature_c:.0f}"
         fields = {
             "PID": "0xA389",
@@ -143,29 +142,29 @@ def _block(fields: Mapping[str, str]) -> bytes:
 
 
 class SimulatedJunctek(SimulatedMeter):
-    """A monitor of Junctek at address 1."""
+    """Simulated Junctek monitor at address 1."""
 
     def message(self, reading: Reading) -> bytes:
-        """All measured values."""
-        warm = 25.0 if math.isnan(reading.temperature_c) else reading.temperature_c
+        """Return the response with all measured values."""
+        temperature = 25.0 if math.isnan(reading.temperature_c) else reading.temperature_c
         values = [
             round(100 * reading.voltage_v),
             round(100 * abs(reading.current_a)),
-            *(50_000, 1_000, 10_000, round(self.time_s), round(warm) + 100, 0, 0),
+            *(50_000, 1_000, 10_000, round(self.time_s), round(temperature) + 100, 0, 0),
             int(reading.current_a < 0.0),
             *(0, 0),
         ]
         return b":r50=1,%d,%s,\r\n" % (sum(values) % 255 + 1, ",".join(map(str, values)).encode())
 
-    def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:
+    def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
         """Respond to ``:R50=1,``."""
-        *lines, rest = heard.split(b"\n")
+        *lines, rest = received.split(b"\n")
         asked = sum(line.startswith(b":R50=1,") for line in lines)
-        return asked * self.message(reading), len(heard) - len(rest)
+        return asked * self.message(reading), len(received) - len(rest)
 
 
 class SimulatedPylontech(SimulatedMeter):
-    """Console of one battery with a number of cells.
+    """Simulated Pylontech console with one battery.
 
     Args:
         signal: The simulated pack.
@@ -179,37 +178,37 @@ class SimulatedPylontech(SimulatedMeter):
 
     def message(self, reading: Reading) -> bytes:
         """Return the table of all batteries."""
-        each, warm = round(1e3 * reading.voltage_v / self._cells), self._warm(reading)
+        each, temperature = round(1e3 * reading.voltage_v / self._cells), self._millidegrees(reading)
         head = (
             "Power Volt   Curr   Tempr  Tlow   Thigh  Vlow   Vhigh  Base.St  Volt.St  Curr.St  Temp.St  Coulomb  Time"
         )
         volt, amp = round(1e3 * reading.voltage_v), -round(1e3 * reading.current_a)
-        row = f"1     {volt:<6} {amp:<6} {warm:<6} {warm:<6} {warm:<6} {each:<6} {each:<6} {_state(amp):<8} Normal"
+        row = f"1     {volt:<6} {amp:<6} {temperature:<6} {temperature:<6} {temperature:<6} {each:<6} {each:<6} {_state(amp):<8} Normal"
         absent = ["2     -      -      -      -      -      -      -      Absent   -"]
         return _table("pwr", [head, row + "   Normal   Normal   50%      2026-01-01 00:00:00", *absent])
 
-    def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:
+    def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
         """Respond to ``pwr`` and ``bat 1``."""
-        *lines, rest = heard.replace(b"\r", b"\n").split(b"\n")
-        said = b"".join(self._command(line.decode("ascii", "replace").strip(), reading) for line in lines)
-        return said, len(heard) - len(rest)
+        *lines, rest = received.replace(b"\r", b"\n").split(b"\n")
+        response = b"".join(self._command(line.decode("ascii", "replace").strip(), reading) for line in lines)
+        return response, len(received) - len(rest)
 
     def _command(self, line: str, reading: Reading) -> bytes:
         match line.split():
             case ["pwr"]:
                 return self.message(reading)
             case ["bat", "1"]:
-                each, warm = round(1e3 * reading.voltage_v / self._cells), self._warm(reading)
+                each, temperature = round(1e3 * reading.voltage_v / self._cells), self._millidegrees(reading)
                 amp = -round(1e3 * reading.current_a)
                 head = "Battery  Volt     Curr     Tempr    Base State   Volt. State  Curr. State  Temp. State  Coulomb"
-                tail = f"{amp:<8} {warm:<8} {_state(amp):<12} Normal       Normal       Normal       50%"
+                tail = f"{amp:<8} {temperature:<8} {_state(amp):<12} Normal       Normal       Normal       50%"
                 return _table(line, [head, *(f"{n:<8} {each:<8} {tail}" for n in range(self._cells))])
             case []:
                 return b"\n\rpylon>"
         return f"{line}\n\r@\r\r\nUnknown command '{line}' - try 'help'\r\n\r$$\r\n\rpylon>".encode()
 
     @staticmethod
-    def _warm(reading: Reading) -> int:
+    def _millidegrees(reading: Reading) -> int:
         return 25_000 if math.isnan(reading.temperature_c) else round(reading.temperature_c) * 1000
 
 

@@ -1,6 +1,6 @@
-"""A simulated pack under a load: what a simulated board has at its sensors.
+"""Simulated pack under an endless load, with the cell model of Chen and Mora (2.1)-(2.4).
 
-The cell of Chen and Mora (2.1)-(2.4) under a load that never ends: an empty pack is charged, a full one is not.
+An empty pack is charged; a full one is not charged further.
 """
 
 import math
@@ -14,35 +14,36 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.simulation.virtual_adc import Reading
 
 EMPTY_SOC, FULL_SOC = 0.05, 0.95
-"""The load stops at the one and begins again at the other; in between the pack is charged. Above the other no load charges it."""
+"""The load stops at ``EMPTY_SOC``, and the pack is charged up to ``FULL_SOC``. Above ``FULL_SOC`` no load charges it."""
 ROOM_C = 25.0
 PULSE_S = 10.0
+"""Duration of a pulse, and of the pause after it [s]."""
 MIN_STEP_S, MAX_STEP_S = 1.0, 5.0
-MAX_CHARGE = 0.25
-"""Random steps also charge, with up to this part of the current."""
+MAX_CHARGE_FRACTION = 0.25
+"""Maximum charging current of random steps, as a fraction of the load current."""
 
 Load = Iterator[tuple[float, float]]
-"""Seconds, current [A], positive on discharge; endless."""
+"""Endless sequence of duration [s] and current [A], positive on discharge."""
 
 
 def constant(current_a: float, _seed: int = 0) -> Load:
-    """One current."""
+    """Yield a constant current."""
     while True:
         yield math.inf, current_a
 
 
 def pulses(current_a: float, _seed: int = 0) -> Load:
-    """On and off, ``PULSE_S`` each."""
+    """Yield alternately ``PULSE_S`` of the current and of no current."""
     while True:
         yield PULSE_S, current_a
         yield PULSE_S, 0.0
 
 
 def random_steps(current_a: float, seed: int = 0) -> Load:
-    """Return a schedule of steps of random length and height, some of them charging."""
-    dice = random.Random(seed)
+    """Yield steps of random duration and current; some of them charge."""
+    rng = random.Random(seed)
     while True:
-        yield dice.uniform(MIN_STEP_S, MAX_STEP_S), current_a * dice.uniform(-MAX_CHARGE, 1.0)
+        yield rng.uniform(MIN_STEP_S, MAX_STEP_S), current_a * rng.uniform(-MAX_CHARGE_FRACTION, 1.0)
 
 
 class LoadName(StrEnum):
@@ -62,12 +63,12 @@ LOADS: dict[LoadName, Callable[[float, int], Load]] = {
 
 
 class SimulatedPack:
-    """Signal of a board: call it with times that never step back.
+    """Simulated pack. Call it with times that never decrease.
 
     Args:
-        cell: The pack as one object.
+        cell: Cell model of the whole pack.
         load: Load profile.
-        soc: At time 0, 0..1; the pack is at rest then.
+        soc: SOC at time 0, 0..1, at which the pack is at rest.
     """
 
     def __init__(self, cell: CellModel, load: Load, *, soc: float = 0.9) -> None:
@@ -84,7 +85,7 @@ class SimulatedPack:
 
     @property
     def soc(self) -> float:
-        """The truth, 0..1."""
+        """True SOC, 0..1."""
         return self._state[0]
 
     def __call__(self, time_s: float) -> Reading:
@@ -97,7 +98,7 @@ class SimulatedPack:
         return Reading(self._current_a, float(voltage_v), ROOM_C)
 
     def _next_current(self, dt_s: float) -> float:
-        """Return the current of the load ``dt_s`` later; charging stops its time."""
+        """Return the current ``dt_s`` later. The load pauses while the pack is charged."""
         self._charging = self.soc <= (FULL_SOC if self._charging else EMPTY_SOC)
         if self._charging:
             return self._charge_a

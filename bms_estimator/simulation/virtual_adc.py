@@ -1,4 +1,4 @@
-"""Divider, current sensor, NTC and 10-bit converter of the board, in Python: what the virtual board measures with."""
+"""Simulated divider, current sensor, NTC and 10-bit converter of the board."""
 
 import math
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ CLOCK_HZ = 16_000_000
 AUX_PER_S = 100
 AUX_MAX = 63
 SLOTS_PER_S = 8000
-"""Conversions of the firmware per second; a pair of them is one of voltage and one of current."""
+"""Conversions of the firmware per second, alternately of voltage and current."""
 RATIOMETRIC_V = 5.0
 """Supply at which the data sheet of a ratiometric sensor gives its slope [V]."""
 _NOISE_POINTS = 1 << 16
 
 
 class Reading(NamedTuple):
-    """Values at the sensors; current positive on discharge, temperature NaN without an NTC."""
+    """True values at the sensors; current positive on discharge, temperature NaN without an NTC."""
 
     current_a: float
     voltage_v: float
@@ -27,7 +27,7 @@ class Reading(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Conversions of one window, added up."""
+    """Sums of the conversions of one window."""
 
     voltage: int
     current: int
@@ -38,10 +38,10 @@ class Sums(NamedTuple):
 
 @dataclass(frozen=True)
 class BoardParts:
-    """The parts on the board as built; the defaults are the firmware's."""
+    """Parts of the board as built; the defaults are those of the firmware."""
 
     supply_v: float = 5.0
-    """AVcc, the converter's reference, which the host has to find out."""
+    """AVcc, the converter's reference, which the host does not know [V]."""
     bandgap_v: float = 1.1
     divider: float = 6.1
     volts_per_ampere: float = 0.1
@@ -49,19 +49,19 @@ class BoardParts:
     ratiometric: bool = True
     """The current sensor is supplied with AVcc, and its slope is proportional to that."""
     current_zero: float = 0.5
-    """Sensor's output without current, as a part of the supply."""
+    """Sensor's output without current, as a fraction of the supply."""
     ntc_series_ohm: int = 10_000
     ntc_r25_ohm: int = 10_000
     ntc_beta_k: int = 3950
 
     @property
-    def part_per_ampere(self) -> float:
-        """Slope of the current sensor as a part of the supply [1/A]."""
+    def fraction_per_ampere(self) -> float:
+        """Slope of the current sensor as a fraction of the supply [1/A]."""
         return self.volts_per_ampere / (RATIOMETRIC_V if self.ratiometric else self.supply_v)
 
 
 class VirtualConverter:
-    """Converts readings as the firmware does: many times in a window, rounded to 10 bits, added up.
+    """Simulated converter. As in the firmware, a window is the sum of many conversions of 10 bits.
 
     Args:
         parts: The board as built.
@@ -78,7 +78,7 @@ class VirtualConverter:
         """Return the sums of ``count`` pairs of conversions."""
         parts = self.parts
         voltage = self.convert(reading.voltage_v / parts.divider / parts.supply_v, count)
-        current = self.convert(parts.current_zero + reading.current_a * parts.part_per_ampere, count)
+        current = self.convert(parts.current_zero + reading.current_a * parts.fraction_per_ampere, count)
         return Sums(
             int(voltage.sum()),
             int(current.sum()),
@@ -88,20 +88,20 @@ class VirtualConverter:
         )
 
     def bandgap(self, count: int) -> int:
-        """Sum of ``count`` conversions of the internal reference."""
+        """Return the sum of ``count`` conversions of the internal reference."""
         return int(self.convert(self.parts.bandgap_v / self.parts.supply_v, count).sum())
 
     def ntc(self, temperature_c: float, count: int) -> int:
-        """Sum of ``count`` conversions of the NTC; of an open input without one."""
+        """Return the sum of ``count`` conversions of the NTC, or of an open input for a temperature of NaN."""
         if math.isnan(temperature_c):
             return count * (FULL_SCALE - 1)
         parts = self.parts
         r_ohm = parts.ntc_r25_ohm * math.exp(parts.ntc_beta_k * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
         return int(self.convert(r_ohm / (r_ohm + parts.ntc_series_ohm), count).sum())
 
-    def convert(self, part_of_reference: float, count: int) -> NDArray[np.float64]:
-        """``count`` conversions of a voltage given as a part of the reference."""
-        steps: NDArray[np.float64] = np.full(count, part_of_reference * FULL_SCALE)
+    def convert(self, fraction_of_reference: float, count: int) -> NDArray[np.float64]:
+        """Return ``count`` conversions of a voltage, given as a fraction of the reference."""
+        steps: NDArray[np.float64] = np.full(count, fraction_of_reference * FULL_SCALE)
         if self._noise is not None:
             if self._cursor + count > _NOISE_POINTS:
                 self._cursor = 0
@@ -111,7 +111,7 @@ class VirtualConverter:
 
 
 def window_of(rate_hz: int) -> tuple[int, int]:
-    """Pairs of conversions in a sample's window and its length [ns], as the firmware divides its clock."""
+    """Return the number of conversion pairs in a window and its length [ns], with the clock division of the firmware."""
     slots = SLOTS_PER_S // rate_hz // 2 * 2
     cycles = round(CLOCK_HZ / (rate_hz * slots))
     return slots // 2, slots * cycles * 1_000_000_000 // CLOCK_HZ

@@ -1,6 +1,6 @@
-"""A sensor board without hardware: speaks the firmware's protocol on a pseudo-terminal, faults at will.
+"""Simulated sensor board: uses the firmware's protocol on a pseudo-terminal, with optional faults.
 
-For trying things out (``bms-estimator simulate``), for the demo where the firmware's simulator is absent, and for tests.
+``bms-estimator simulate``, the demo without the firmware's simulator, and tests use it.
 """
 
 import asyncio
@@ -52,23 +52,23 @@ from bms_estimator.simulation.virtual_adc import (
 )
 
 Signal = Callable[[float], Reading] | Iterable[Reading]
-"""Readings by time [s], or one for each sample; the board stops where they end."""
+"""Readings as a function of time [s], or one reading for each sample. The board stops after the last one."""
 
 FIRMWARE = (0, 2, 0)
 RATE_HZ_AT_RESET = 100
-_LINE_BYTES = 2048
-"""Maximum number of bytes waiting for a host that does not read; then samples are dropped, as a board does."""
-_WAKE_S = 0.002
-"""Samples that fall due within so short a time leave together, as on USB [s]."""
-_PATIENCE_S = 1.0
-"""Time that the last bytes wait for a host that may not read [s]."""
-_LOOK_S = 0.01
-"""Interval at which a new host is looked for [s]."""
+_MAX_UNSENT_BYTES = 2048
+"""Maximum number of unsent bytes. If the host does not read, further samples are dropped, as on a board."""
+_MIN_SLEEP_S = 0.002
+"""Minimum sleep [s]. Samples that are due within this time are sent together, as on USB."""
+_DRAIN_TIMEOUT_S = 1.0
+"""Time for which the board waits at its end for a host to read the last bytes [s]."""
+_HOST_POLL_S = 0.01
+"""Interval of the check for a host that opens the line [s]."""
 _BOOT_S = 0.2
-"""Opening the port resets a board; it starts after the host has discarded the old bytes on the line [s]."""
+"""Delay from the opening of the port to the first sample [s]. Opening resets a board, and the host discards old bytes."""
 _BURST = 256
 _BOOT_READINGS = 256
-_NEAR_MIDDLE = 0.1
+_MAX_ZERO_OFFSET = 0.1
 
 
 def _millionths(least: float, most: float) -> range:
@@ -82,7 +82,7 @@ _RANGES = {
     MessageType.COMMAND_SET_CURRENT_SLOPE: _millionths(MIN_VOLTS_PER_AMPERE, MAX_VOLTS_PER_AMPERE),
     MessageType.COMMAND_SET_RATIOMETRIC: range(2),
 }
-"""Range of the number that a command sets."""
+"""Valid values of the commands that store a number."""
 
 
 class BoardFault(Enum):
@@ -98,13 +98,13 @@ class BoardFault(Enum):
 
 
 class VirtualBoard:
-    """A board on a pseudo-terminal. Open it as a context manager, then ``run`` it.
+    """Simulated board on a pseudo-terminal. Open it as a context manager, then ``run`` it.
 
     Args:
         signal: The simulated pack.
         rate_hz: Samples per second until the host requests another rate.
         mode: ``text`` prints ``voltage,current,temperature`` lines and takes no commands.
-        speed: Board seconds per second; ``math.inf``: as fast as the host reads.
+        speed: Speed relative to real time; ``math.inf``: as fast as the host reads.
         parts: Parts of the board as built.
         noise_lsb: Noise of its converter [steps].
         serial: Serial number.
@@ -132,7 +132,7 @@ class VirtualBoard:
         self._clock_us = clock_us
         parts = self._converter.parts
         self._zero_ppm = round(parts.current_zero * 1e6)
-        self._kept: dict[int, int] = {
+        self._stored: dict[int, int] = {
             MessageType.COMMAND_SET_SERIAL: serial,
             MessageType.COMMAND_SET_BANDGAP: round(parts.bandgap_v * 1e6),
             MessageType.COMMAND_SET_DIVIDER: round(parts.divider * 1e6),
@@ -143,7 +143,7 @@ class VirtualBoard:
         self._boot_id = self._random.randrange(1 << 16)
         self._first_rate_hz = rate_hz
         self._faults: deque[BoardFault] = deque()
-        self._late = b""
+        self._delayed_frame = b""
         self._inbox = b""
         self._line = bytearray()
         self._drained = asyncio.Event()
@@ -154,7 +154,7 @@ class VirtualBoard:
         self.time_s = 0.0
         """Time of the pack model at the end of the last sample [s]; it continues across resets."""
         self.samples = 0
-        """Samples taken since the board was made."""
+        """Number of samples since the board was created."""
         self.relay_high = False
         """Level of the relay pin."""
         self._boot(ResetCause.POWER_ON)
@@ -168,8 +168,8 @@ class VirtualBoard:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Pull the plug: the host's descriptor dies."""
-        self._unhear()  # before its number is reused: a loop that still had it would not notice the new one
+        """Close the pseudo-terminal, as if the board were unplugged."""
+        self._stop_watching()  # before its number is reused, because the loop would not notice the new descriptor
         for descriptor in (self._master, self._slave):
             if descriptor >= 0:
                 os.close(descriptor)
@@ -182,25 +182,25 @@ class VirtualBoard:
         try:
             await self._sample_until(self.time_s + seconds, loop)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(None if math.isinf(self._speed) else _PATIENCE_S):
+                async with asyncio.timeout(None if math.isinf(self._speed) else _DRAIN_TIMEOUT_S):
                     await self._drain()
         finally:
-            self._unhear()
+            self._stop_watching()
 
-    def _unhear(self) -> None:
-        """Stop watching the line in the event loop, if it runs in one."""
+    def _stop_watching(self) -> None:
+        """Remove the line from the event loop, if the board runs."""
         if self._loop is not None and self._master >= 0:
             self._loop.remove_reader(self._master)
             self._loop.remove_writer(self._master)
         self._loop = None
 
     async def run_for_host(self) -> None:
-        """``run`` from when a host opens the line: samples before would be lost."""
-        os.close(self._slave)  # the line hangs up while no process has it open
+        """Wait until a host opens the line, then ``run``. Earlier samples would be lost."""
+        os.close(self._slave)  # the poll reports a hangup while no process has the line open
         self._slave, line = -1, select.poll()
         line.register(self._master, 0)
         while line.poll(0):  # noqa: ASYNC110 - the system does not report when a line is opened
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_HOST_POLL_S)
         self._slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._slave)
         await asyncio.sleep(_BOOT_S)
@@ -208,7 +208,7 @@ class VirtualBoard:
         await self.run()
 
     async def _drain(self) -> None:
-        """Wait until the line has taken all bytes."""
+        """Wait until all bytes are written to the line."""
         while self._line:
             self._drained.clear()
             await self._drained.wait()
@@ -222,7 +222,7 @@ class VirtualBoard:
         self._boot(cause)
 
     def send(self, data: bytes) -> None:
-        """Put any bytes on the line."""
+        """Write arbitrary bytes to the line."""
         self._line += data
         self._flush()
 
@@ -232,7 +232,7 @@ class VirtualBoard:
 
     def _boot(self, cause: ResetCause) -> None:
         self._cause = cause
-        self.relay_high, self._relay_then, self._relay_s, self._relay_word, self._relay_told_s = (
+        self.relay_high, self._relay_fallback, self._relay_s, self._relay_word, self._relay_command_s = (
             False,
             RELAY_KEEP,
             0,
@@ -264,10 +264,10 @@ class VirtualBoard:
             if math.isinf(self._speed) and self._line:
                 await self._drain()
             else:
-                await asyncio.sleep(max(due_s - loop.time(), 0.0 if math.isinf(self._speed) else _WAKE_S))
+                await asyncio.sleep(max(due_s - loop.time(), 0.0 if math.isinf(self._speed) else _MIN_SLEEP_S))
 
     def _take_sample(self) -> bool:
-        """Take one sample and put it on the line. Returns False when the signal has ended."""
+        """Send one sample. Return False if the signal has ended."""
         self.time_s += self._period_ns * 1e-9
         reading = next(self._readings, None)
         if reading is None:
@@ -278,7 +278,7 @@ class VirtualBoard:
         self._watch_relay()
         message = self._message(reading)
         self._sequence = (self._sequence + 1) % MODULUS
-        if len(self._line) > _LINE_BYTES and not math.isinf(self._speed):
+        if len(self._line) > _MAX_UNSENT_BYTES and not math.isinf(self._speed):
             self._overrun = True
             return True
         self._overrun = False
@@ -298,19 +298,19 @@ class VirtualBoard:
         return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, n, int(status))
 
     def _text(self, message: SampleMessage, reading: Reading) -> bytes:
-        """Return the line that a hobby sketch prints."""
+        """Return the line that a simple Arduino sketch would print."""
         parts = self._converter.parts
         volts_per_step = parts.supply_v / FULL_SCALE / message.count
         voltage_v = message.voltage_sum * volts_per_step * parts.divider
         part = message.current_sum / message.count / FULL_SCALE
-        current_a = (part - parts.current_zero) / parts.part_per_ampere
+        current_a = (part - parts.current_zero) / parts.fraction_per_ampere
         if math.isnan(reading.temperature_c):
             return b"%.3f,%.3f\r\n" % (voltage_v, current_a)
         return b"%.3f,%.3f,%.1f\r\n" % (voltage_v, current_a, reading.temperature_c)
 
     def _frame(self, message: SampleMessage) -> bytes:
-        """Bytes for a sample, with what faults make of them."""
-        frame, late, self._late = message.encode(), self._late, b""
+        """Return the bytes of a sample, changed by the next fault if there is one."""
+        frame, late, self._delayed_frame = message.encode(), self._delayed_frame, b""
         if not self._faults:
             return frame + late
         match self._faults.popleft():
@@ -325,7 +325,7 @@ class VirtualBoard:
             case BoardFault.DUPLICATE:
                 frame *= 2
             case BoardFault.SWAP:
-                frame, self._late = b"", frame
+                frame, self._delayed_frame = b"", frame
             case BoardFault.NEWER_VERSION:
                 frame = message.encode(PROTOCOL_VERSION + 1)
             case BoardFault.GARBAGE:
@@ -338,17 +338,17 @@ class VirtualBoard:
             *FIRMWARE,
             reset_cause=self._cause,
             boot_id=self._boot_id,
-            serial=self._kept[MessageType.COMMAND_SET_SERIAL],
+            serial=self._stored[MessageType.COMMAND_SET_SERIAL],
             sequence=self._sequence,
             board_us=self._ns // 1000 % MODULUS,
             rate_hz=self._rate_hz,
             period_ns=self._period_ns,
             adc_bits=10,
-            channels=Channels.NTC + Channels.CURRENT_RATIOMETRIC * self._kept[MessageType.COMMAND_SET_RATIOMETRIC],
-            divider_ppm=self._kept[MessageType.COMMAND_SET_DIVIDER],
-            current_uv_per_a=self._kept[MessageType.COMMAND_SET_CURRENT_SLOPE],
+            channels=Channels.NTC + Channels.CURRENT_RATIOMETRIC * self._stored[MessageType.COMMAND_SET_RATIOMETRIC],
+            divider_ppm=self._stored[MessageType.COMMAND_SET_DIVIDER],
+            current_uv_per_a=self._stored[MessageType.COMMAND_SET_CURRENT_SLOPE],
             current_zero_ppm=self._zero_ppm,
-            bandgap_uv=self._kept[MessageType.COMMAND_SET_BANDGAP],
+            bandgap_uv=self._stored[MessageType.COMMAND_SET_BANDGAP],
             bandgap_sum=self._boot_bandgap,
             bandgap_count=_BOOT_READINGS,
             ntc_series_ohm=parts.ntc_series_ohm,
@@ -357,7 +357,7 @@ class VirtualBoard:
         )
 
     def _receive(self) -> None:
-        """Bytes of the host."""
+        """Read from the host and handle complete commands."""
         with contextlib.suppress(BlockingIOError):
             self._inbox += os.read(self._master, 4096)
         *frames, self._inbox = self._inbox.split(DELIMITER)
@@ -365,9 +365,9 @@ class VirtualBoard:
             return
         for frame in frames:
             with contextlib.suppress(ProtocolError):  # no response: the host repeats the request
-                self._obey(unseal(frame) if frame else b"")
+                self._handle_command(unseal(frame) if frame else b"")
 
-    def _obey(self, packet: bytes) -> None:
+    def _handle_command(self, packet: bytes) -> None:
         if not packet:
             return
         kind, body = packet[1], packet[2:]
@@ -387,52 +387,52 @@ class VirtualBoard:
             self._answer(kind, AckResult.OK if rate_hz in RATE_HZ else AckResult.BAD_VALUE, self._period_ns)
         elif kind == MessageType.COMMAND_SET_RELAY and len(body) == 4:
             self._set_relay(*struct.unpack("<I", body))
-        elif kind in self._kept and len(body) == 4:
+        elif kind in self._stored and len(body) == 4:
             self._store(MessageType(kind), *struct.unpack("<I", body))
         else:
             self._answer(kind, AckResult.UNKNOWN_COMMAND, 0)
 
     def _store(self, kind: MessageType, value: int) -> None:
-        """Take a number if it is in its range."""
-        good = value in _RANGES[kind]
-        if good:
-            self._kept[kind] = value
-        self._answer(kind, AckResult.OK if good else AckResult.BAD_VALUE, self._kept[kind])
+        """Store the number of a command if it is valid."""
+        is_valid = value in _RANGES[kind]
+        if is_valid:
+            self._stored[kind] = value
+        self._answer(kind, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._stored[kind])
 
     def _set_relay(self, word: int) -> None:
-        """Bits as ``relay_word`` has them; a level in silence needs a time."""
+        """Set the relay from the bits of ``relay_word``. A fallback level needs a delay."""
         then, silent_s = word >> 8 & 0xFF, word >> 16
-        good = (
+        is_valid = (
             word & 0xFE == 0
             and then <= RELAY_HIGH
             and silent_s <= MAX_SILENT_S
             and (then == RELAY_KEEP or silent_s > 0)
         )
-        if good:
-            self.relay_high, self._relay_then, self._relay_s = bool(word & 1), then, silent_s
-            self._relay_told_s = self.time_s
+        if is_valid:
+            self.relay_high, self._relay_fallback, self._relay_s = bool(word & 1), then, silent_s
+            self._relay_command_s = self.time_s
             self._relay_word = word
-        self._answer(MessageType.COMMAND_SET_RELAY, AckResult.OK if good else AckResult.BAD_VALUE, self._relay_word)
+        self._answer(MessageType.COMMAND_SET_RELAY, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._relay_word)
 
     def _watch_relay(self) -> None:
-        """Apply the relay's fallback when the host is silent."""
-        if self._relay_then != RELAY_KEEP and self.time_s - self._relay_told_s >= self._relay_s:
-            self.relay_high, self._relay_then = self._relay_then == RELAY_HIGH, RELAY_KEEP
+        """Set the relay to its fallback level after the delay without a relay command."""
+        if self._relay_fallback != RELAY_KEEP and self.time_s - self._relay_command_s >= self._relay_s:
+            self.relay_high, self._relay_fallback = self._relay_fallback == RELAY_HIGH, RELAY_KEEP
 
     def _zero_current(self) -> None:
-        """Take the present current as zero."""
+        """Store the present current as zero."""
         count = window_of(1)[0]
         part = self._converter.window(self._reading, count).current / count / FULL_SCALE
-        good = abs(part - 0.5) <= _NEAR_MIDDLE
-        self._zero_ppm = round(part * 1e6) if good else self._zero_ppm
-        result = AckResult.OK if good else AckResult.BAD_VALUE
+        is_valid = abs(part - 0.5) <= _MAX_ZERO_OFFSET
+        self._zero_ppm = round(part * 1e6) if is_valid else self._zero_ppm
+        result = AckResult.OK if is_valid else AckResult.BAD_VALUE
         self._answer(MessageType.COMMAND_ZERO_CURRENT, result, self._zero_ppm)
 
     def _answer(self, command: int, result: AckResult, value: int) -> None:
         self.send(Ack(command, result, value).encode())
 
     def _flush(self) -> None:
-        """Write what the pseudo-terminal takes; the rest when it takes more."""
+        """Write as much as the pseudo-terminal accepts; register a writer for the rest."""
         if self._master < 0:
             return
         with contextlib.suppress(BlockingIOError):
@@ -442,5 +442,5 @@ class VirtualBoard:
             asyncio.get_running_loop().add_writer(self._master, self._flush)
         else:
             self._drained.set()
-            with contextlib.suppress(RuntimeError):  # before the loop runs there is no writer either
+            with contextlib.suppress(RuntimeError):  # no event loop is running, so that there is no writer
                 asyncio.get_running_loop().remove_writer(self._master)

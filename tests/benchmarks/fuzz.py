@@ -299,7 +299,7 @@ def _jbd_summed(random: random.Random, data: bytes) -> bytes:
 
 def _daly_summed(random: random.Random, data: bytes) -> bytes:
     at = data.find(b"\xa5", random.randrange(len(data) + 1))
-    return data[:at] + daly.sealed(data[at : at + 12]) + data[at + 13 :] if at >= 0 else data
+    return data[:at] + daly.with_checksum(data[at : at + 12]) + data[at + 13 :] if at >= 0 else data
 
 
 def _jk_summed(random: random.Random, data: bytes) -> bytes:
@@ -312,7 +312,7 @@ def _jk_summed(random: random.Random, data: bytes) -> bytes:
         return data
     body = data[at + 4 :][:480]
     frame = jk.OLD_START + (len(body) + 7).to_bytes(2, "big") + body + bytes((jk.OLD_END,))
-    return data[:at] + jk.old_sealed(frame)
+    return data[:at] + jk.with_old_checksum(frame)
 
 
 def _headed(random: random.Random, data: bytes) -> bytes:

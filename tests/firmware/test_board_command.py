@@ -28,7 +28,7 @@ def test_a_board_whose_bandgap_was_wrong_measures_right_once_its_aref_was_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
-    monkeypatch.setattr(device_detection, "REFERENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "REFERENCE_TIMEOUT_S", LONG_S)
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 22.2, 25.0)])
     with SimavrBoard(readings, avcc_mv=4750) as board, Host(board.path) as host:
         assert host.ask(set_bandgap_command(1.02)).value == 1_020_000

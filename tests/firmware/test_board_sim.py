@@ -42,7 +42,7 @@ def test_wrong_arguments_get_the_usage(tmp_path: Path, arguments: list[str]) -> 
     assert "usage" in ended.stderr
 
 
-def test_it_ends_when_told_though_no_host_ever_came(tmp_path: Path) -> None:
+def test_signal_ends_it_without_a_host(tmp_path: Path) -> None:
     with SimavrBoard(write_readings(tmp_path / "readings.csv", [(0.0, 0.0, 12.0)])) as board:
         assert board.path  # leaving asserts the clean end
 
@@ -75,7 +75,7 @@ def test_readings_come_through_a_pipe_and_their_end_can_be_the_boards() -> None:
     assert means[140] == pytest.approx(20.0 / 30.5 * 1024, abs=1.0)
 
 
-def test_it_ends_when_told_while_it_waits_for_readings() -> None:
+def test_signal_ends_it_while_it_waits_for_readings() -> None:
     command = [str(SIMULATOR), str(ELF), "--readings", "-", "--speed", "inf"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as board:
         assert board.stdin

@@ -1,4 +1,4 @@
-"""The firmware's ELF in simavr, asked and read over its serial line."""
+"""Firmware in simavr, tested over its serial line."""
 
 import itertools
 import math

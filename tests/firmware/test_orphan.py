@@ -18,7 +18,7 @@ board.wait()
 """
 
 
-def test_it_ends_with_a_parent_that_is_killed(firmware: None, tmp_path: Path) -> None:
+def test_simulator_ends_when_its_parent_is_killed(firmware: None, tmp_path: Path) -> None:
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 0.1, 3.8)])
     command = [sys.executable, "-c", START, SIMULATOR, ELF, "--readings", readings]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}

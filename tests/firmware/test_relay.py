@@ -31,7 +31,7 @@ def current_a(host: Host) -> float:
     return (sample.current_sum / sample.count - 512.0) / STEPS_PER_A
 
 
-def test_the_pin_is_low_after_a_reset_and_goes_where_it_is_told(host: Host) -> None:
+def test_relay_pin_is_low_after_reset_and_follows_commands(host: Host) -> None:
     assert current_a(host) == pytest.approx(LOAD_A, abs=0.1)
     for high in (True, False, True):
         relay = Relay(high, None)
@@ -43,7 +43,7 @@ def test_the_pin_is_low_after_a_reset_and_goes_where_it_is_told(host: Host) -> N
     assert current_a(host) == pytest.approx(LOAD_A, abs=0.1)
 
 
-def test_a_number_that_is_none_changes_nothing(host: Host) -> None:
+def test_invalid_relay_word_changes_nothing(host: Host) -> None:
     host.ask(set_relay_command(Relay(high=True, high_when_silent=None)))
     for word in (2, 1 | 3 << 8, 1 << 8, 2 << 8 | 3601 << 16, 0x00000080):
         ack = host.ask(command(MessageType.COMMAND_SET_RELAY, struct.pack("<I", word)))
@@ -53,7 +53,7 @@ def test_a_number_that_is_none_changes_nothing(host: Host) -> None:
 
 
 @pytest.mark.parametrize("high", [True, False])
-def test_once_the_host_is_silent_the_pin_goes_where_it_was_told_to_or_stays(host: Host, high: bool) -> None:
+def test_silent_host_sets_the_fallback_level(host: Host, high: bool) -> None:
     host.ask(set_relay_command(Relay(high=high, high_when_silent=None, silent_s=2)))
     host.take(400)
     assert current_a(host) == pytest.approx(0.0 if high else LOAD_A, abs=0.1)

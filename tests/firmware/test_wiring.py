@@ -1,4 +1,4 @@
-"""The drawing and its table: they fit each other, the firmware and a full pack."""
+"""Consistency of the wiring diagram and its table with each other, the firmware and a full pack."""
 
 import math
 import re
@@ -49,7 +49,7 @@ def test_the_firmware_and_the_virtual_board_are_built_as_drawn() -> None:
     assert f"{divider:g} : 1" in DRAWING
 
 
-def test_the_documented_step_and_the_default_resolution_are_what_is_said_of_them() -> None:
+def test_documented_step_matches_the_default_resolution() -> None:
     assert f"{5.0 * (R1 + R2) / R2 / FULL_SCALE * 1e3:.1f} mV" in TABLE
     assert f"{SensorSettings().voltage_resolution_v * 1e3:.1f} mV unless set" in TABLE
 

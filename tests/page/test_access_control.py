@@ -27,12 +27,12 @@ def test_an_address_is_read(text, host, port, loopback):
 @pytest.mark.parametrize(
     "text", ["", "8765", "127.0.0.1", "127.0.0.1:x", "127.0.0.1:99999", "a@b:1", "a:1/x", "::1:80", "x..y:80"]
 )
-def test_what_is_no_address_is_refused(text):
+def test_invalid_address_is_rejected(text):
     with pytest.raises(ValueError, match="host:port"):
         PageSettings(listen=text)
 
 
-def test_beyond_this_machine_a_token_is_needed():
+def test_token_is_required_beyond_this_machine():
     with pytest.raises(ValueError, match=r'listen = "0\.0\.0\.0:8765" is open to other machines: name a token_file'):
         PageSettings(listen="0.0.0.0:8765")
 
@@ -41,7 +41,7 @@ def test_beyond_this_machine_a_token_is_needed():
     ("text", "said"),
     [(None, "cannot be read: No such file"), (b"short\n", "has 5 letters, must have 16"), (b"\xff" * 20, "not UTF-8")],
 )
-def test_a_token_that_cannot_be_is_said(tmp_path, text, said):
+def test_invalid_token_is_reported(tmp_path, text, said):
     file = tmp_path / "token"
     if text is not None:
         file.write_bytes(text)
@@ -49,15 +49,15 @@ def test_a_token_that_cannot_be_is_said(tmp_path, text, said):
         guard_of(PageSettings(listen="0.0.0.0:8765", token_file=file))
 
 
-def test_a_token_is_known_with_its_newline_off(tmp_path):
+def test_newline_after_the_token_is_ignored(tmp_path):
     (tmp_path / "token").write_text(f"{TOKEN}\n")
     guard = guard_of(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
-    assert guard.knows_token(TOKEN)
-    assert not any(guard.knows_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
-    assert not guard.knows_token("\udcff" * 16)  # as aiohttp has a header that is no UTF-8
-    assert not guard.knows_cookie("\udcff" * 64)
-    assert guard.knows_cookie(guard.cookie)
-    assert not guard.knows_cookie(TOKEN)
+    assert guard.is_valid_token(TOKEN)
+    assert not any(guard.is_valid_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
+    assert not guard.is_valid_token("\udcff" * 16)  # as aiohttp has a header that is no UTF-8
+    assert not guard.is_valid_cookie("\udcff" * 64)
+    assert guard.is_valid_cookie(guard.cookie)
+    assert not guard.is_valid_cookie(TOKEN)
     assert TOKEN not in guard.cookie
 
 
@@ -76,5 +76,5 @@ def test_a_token_is_known_with_its_newline_off(tmp_path):
         ("[", False),
     ],
 )
-def test_only_names_of_ours_are_answered(host, known):
-    assert AccessControl(["bms.example.org"]).knows_host(host) is known
+def test_only_own_host_names_are_accepted(host, known):
+    assert AccessControl(["bms.example.org"]).is_own_host(host) is known

@@ -1,4 +1,4 @@
-"""The page's hub: the newest message of each topic, for readers of any speed."""
+"""Hub of the page: newest payload of each topic, for fast and slow readers."""
 
 import json
 import sys
@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.page.event_stream import MESSAGE_BYTES, Reader
+from bms_estimator.page.event_stream import MAX_MESSAGE_BYTES, Reader
 from bms_estimator.page.pack_topics import RECENT_STATES, PackTopics
 from bms_estimator.store.minute import epoch_s
 
@@ -21,7 +21,7 @@ async def read(reader: Reader) -> dict[str, Any]:
     return json.loads(await reader.next(1.0))
 
 
-async def test_who_comes_finds_what_came_last_of_all_packs():
+async def test_new_reader_gets_the_last_values_of_all_packs():
     hub = PackTopics()
     hub.put("attic", "state", state(0.0))
     hub.put("attic", "state", state(1.0))
@@ -34,7 +34,7 @@ async def test_who_comes_finds_what_came_last_of_all_packs():
     assert found["attic/recent"]["voltage_v"] == [13.0, 14.0]
 
 
-async def test_a_slow_reader_finds_the_newest_alone_however_much_came():
+async def test_slow_reader_gets_only_the_newest_values():
     hub = PackTopics()
     with hub.reading() as reader:
         for number in range(10_000):
@@ -50,7 +50,7 @@ async def test_a_slow_reader_finds_the_newest_alone_however_much_came():
     assert hub.readers == 0
 
 
-async def test_of_a_pack_that_has_emptied_its_topics_nothing_is_kept():
+async def test_pack_with_cleared_topics_is_removed():
     hub = PackTopics()
     hub.put("attic", "availability", "online")
     hub.put("attic", "state", state(0.0))
@@ -66,7 +66,7 @@ async def test_of_a_pack_that_has_emptied_its_topics_nothing_is_kept():
     assert found["attic/elements"] == {}
 
 
-def test_what_is_too_deep_to_be_written_is_left_out():
+def test_payload_nested_too_deeply_is_ignored():
     hub, deep = PackTopics(), 0
     for _ in range(sys.getrecursionlimit() + 1):
         deep = [deep]
@@ -83,13 +83,13 @@ async def test_a_reader_ends_when_the_hub_closes():
 
 
 @pytest.mark.parametrize("topic", ["schema", "home_assistant", "home_assistant/problems", "response/state", "x"])
-async def test_what_is_not_shown_is_not_kept(topic):
+async def test_topics_not_shown_are_not_stored(topic):
     hub = PackTopics()
     hub.put("attic", topic, {"a": 1})
     assert hub.packs == []
 
 
-async def test_a_topic_that_was_emptied_is_gone_and_readers_hear_of_it():
+async def test_cleared_topic_is_removed_and_readers_are_notified():
     hub = PackTopics()
     hub.put("attic", "availability", "online")
     hub.put("attic", "alarm/soc_low", {"active": True})
@@ -117,14 +117,14 @@ async def test_curves_have_a_point_each_second_and_a_bounded_number():
     "payload", ["text", 3, [], {}, {"time": 3}, {"time": "x"}, {"time": TIME.format(1), "soc": "x"}]
 )
 @pytest.mark.parametrize("topic", ["state", "parameters", "health", "alarm/x"])
-async def test_what_others_may_publish_is_borne(topic, payload):
+async def test_invalid_payloads_are_ignored(topic, payload):
     hub = PackTopics()
     hub.put("attic", topic, payload)
     with hub.reading() as reader:
         assert (await read(reader))[f"attic/{topic}"] == payload
 
 
-async def test_elements_are_kept_by_percent_of_soc_where_they_are_valid():
+async def test_valid_elements_are_stored_by_percent_of_soc():
     hub = PackTopics()
 
     def report(soc, value, *, valid=True):
@@ -148,7 +148,7 @@ async def test_a_state_dated_in_the_future_does_not_stop_the_curves(ahead: str) 
         assert (await read(reader))["attic/recent"]["voltage_v"] == [13.0, 15.0]
 
 
-async def test_a_message_to_a_reader_is_bounded_and_the_rest_comes_next() -> None:
+async def test_message_size_is_limited_and_the_rest_follows() -> None:
     hub = PackTopics()
     for number in range(100):
         hub.put("attic", f"alarm/{number}", "x" * 10_000)
@@ -157,12 +157,12 @@ async def test_a_message_to_a_reader_is_bounded_and_the_rest_comes_next() -> Non
         while text := await reader.next(0.0):
             sizes.append(len(text))
             found |= json.loads(text)
-    assert max(sizes) < 1.1 * MESSAGE_BYTES
+    assert max(sizes) < 1.1 * MAX_MESSAGE_BYTES
     assert len(sizes) > 1
     assert sum(key.startswith("attic/alarm/") for key in found) == 100
 
 
-async def test_a_pack_that_is_dropped_is_named_no_more() -> None:
+async def test_dropped_pack_is_removed_from_the_list() -> None:
     hub = PackTopics()
     for pack in ("attic", "cellar"):
         hub.put(pack, "availability", "online")
@@ -174,7 +174,7 @@ async def test_a_pack_that_is_dropped_is_named_no_more() -> None:
         assert await read(reader) == {"packs": {"names": ["cellar"], "hidden": 7}}
 
 
-async def test_the_link_is_said_once_for_each_change():
+async def test_link_state_is_sent_once_for_each_change():
     hub = PackTopics()
     hub.set_link_state("no broker")
     with hub.reading() as reader:

@@ -1,4 +1,4 @@
-"""The page's server over real sockets: files, stream, token, history; and an address in use."""
+"""Page server over real sockets: files, stream, token, history, and an address in use."""
 
 import asyncio
 import contextlib
@@ -57,7 +57,7 @@ async def messages(response: aiohttp.ClientResponse) -> AsyncIterator[dict[str, 
             yield json.loads(line[6:])
 
 
-def test_all_that_a_browser_is_given_is_small_and_comes_from_here():
+def test_static_files_are_small_and_local():
     given = [file.path for file in FILES.values()]
     assert sorted(given) == sorted(STATIC.iterdir())
     assert sum(path.stat().st_size for path in given) <= MAX_BYTES
@@ -65,7 +65,7 @@ def test_all_that_a_browser_is_given_is_small_and_comes_from_here():
     assert not any("http://" in text.replace("http://www.w3.org/2000/svg", "") or "https://" in text for text in own)
 
 
-async def test_files_come_with_their_kind_protected_and_once(hub, past):
+async def test_files_have_media_type_security_headers_and_etag(hub, past):
     async with browsing(hub, past) as session:
         for path, (file, kind) in FILES.items():
             async with session.get(path) as response:
@@ -82,7 +82,7 @@ async def test_files_come_with_their_kind_protected_and_once(hub, past):
             assert response.status == 405
 
 
-async def test_who_reads_gets_what_is_known_and_then_what_is_new(hub, past):
+async def test_reader_gets_stored_and_then_new_values(hub, past):
     hub.put("attic", "availability", "online")
     async with browsing(hub, past) as session, session.get("/events") as response:
         assert response.content_type == "text/event-stream"
@@ -92,14 +92,14 @@ async def test_who_reads_gets_what_is_known_and_then_what_is_new(hub, past):
         assert (await anext(stream)) == {"attic/state": {"time": "2026-11-22T16:00:00Z", "soc": 0.5}}
 
 
-async def test_silence_is_broken_so_that_a_lost_line_is_found_out(hub, past, monkeypatch):
+async def test_keep_alive_events_reveal_a_lost_connection(hub, past, monkeypatch):
     monkeypatch.setattr(of_server, "PING_S", 0.05)
     async with browsing(hub, past) as session, session.get("/events") as response:
         stream = messages(response)
         assert [await anext(stream) for _ in range(3)] == [{}, {}, {}]
 
 
-async def test_one_who_reads_nothing_holds_a_bounded_amount_and_is_parted_from(hub, past, monkeypatch):
+async def test_client_that_reads_nothing_is_disconnected(hub, past, monkeypatch):
     monkeypatch.setattr(of_server, "WRITE_S", 0.2)
     async with browsing(hub, past) as session:
         reader, writer = await asyncio.open_connection(session._base_url.host, session._base_url.port, limit=1024)
@@ -114,7 +114,7 @@ async def test_one_who_reads_nothing_holds_a_bounded_amount_and_is_parted_from(h
         writer.close()
 
 
-async def test_a_stream_too_many_replaces_the_oldest_one_of_the_address_that_has_most(
+async def test_excess_stream_replaces_the_oldest_of_the_busiest_address(
     hub: PackTopics, past: HistoryQuery, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(of_server, "MAX_STREAMS", 3)
@@ -141,7 +141,7 @@ async def test_a_stream_too_many_replaces_the_oldest_one_of_the_address_that_has
             assert "attic/availability" in await anext(stream)
 
 
-async def test_readers_that_never_read_share_what_waits_for_them(hub: PackTopics, past: HistoryQuery) -> None:
+async def test_stalled_readers_share_their_texts(hub: PackTopics, past: HistoryQuery) -> None:
     for number in range(256):
         hub.put("attic", f"alarm/{number}", f"{number}".zfill(65_000))
     process = psutil.Process()
@@ -162,14 +162,14 @@ async def test_readers_that_never_read_share_what_waits_for_them(hub: PackTopics
     assert grown < 100e6, f"{grown / 1e6:.0f} MB"
 
 
-async def test_a_name_that_is_not_ours_is_not_answered(hub, past):
+async def test_foreign_host_name_is_rejected(hub, past):
     async with browsing(hub, past) as session:
         for path in ("/", "/events", "/history"):
             async with session.get(path, headers={"Host": "evil.example.org"}) as response:
                 assert response.status == 403
 
 
-async def test_a_token_is_shown_once_and_a_cookie_goes_on(hub, past, tmp_path):
+async def test_token_is_replaced_by_a_cookie(hub, past, tmp_path):
     (tmp_path / "token").write_text(TOKEN)
     settings = PageSettings(listen="0.0.0.0:0", token_file=tmp_path / "token")
     async with browsing(hub, past, settings) as session:
@@ -196,7 +196,7 @@ async def test_a_token_is_shown_once_and_a_cookie_goes_on(hub, past, tmp_path):
             assert response.status == 200
 
 
-async def test_history_comes_in_a_bounded_number_of_points(tmp_path, hub):
+async def test_history_has_a_limited_number_of_points(tmp_path, hub):
     await keep(tmp_path / "attic.sqlite", [at(30.0 * s) for s in range(4000)])  # 33 h
     now_s = epoch_s(at(30.0 * 3999).estimate.time)
     past = HistoryQuery(lambda: now_s)
@@ -227,8 +227,8 @@ async def test_a_pack_without_a_database_has_no_history(tmp_path, hub, past):
         assert "no history there" in await response.text()
 
 
-async def test_an_address_that_is_taken_is_said_and_tried_again(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "AGAIN_S", 0.05)
+async def test_address_in_use_is_reported_and_retried(hub, past, monkeypatch):
+    monkeypatch.setattr(of_server, "RETRY_S", 0.05)
     opened = asyncio.Queue[str]()
     with socket.create_server(("127.0.0.1", 0)) as other:
         settings = PageSettings(listen=f"127.0.0.1:{other.getsockname()[1]}")

@@ -27,7 +27,7 @@ sys.stdin.read()
 """Holds the name of its first argument as the user of its second until its input ends."""
 
 
-def test_a_pack_is_served_once_at_a_time_however_often_a_second_service_is_tried(tmp_path: Path) -> None:
+def test_second_service_of_a_pack_is_rejected(tmp_path: Path) -> None:
     served = "^pack: this pack is served already, by "
     for _ in range(2):
         with instance_lock(tmp_path, "pack"):
@@ -57,7 +57,7 @@ def test_a_service_that_does_not_listen_yet_counts_and_one_that_has_just_ended_d
         assert not lines
 
 
-def test_a_folder_that_is_deleted_and_made_anew_lets_no_second_service_in(tmp_path: Path) -> None:
+def test_recreated_folder_admits_no_second_service(tmp_path: Path) -> None:
     folder = tmp_path / "state"
     folder.mkdir()
     (tmp_path / "link").symlink_to(folder)
@@ -71,7 +71,7 @@ def test_a_folder_that_is_deleted_and_made_anew_lets_no_second_service_in(tmp_pa
         assert not list(folder.iterdir())
 
 
-def test_a_link_that_was_planted_where_a_lock_file_would_be_leads_to_nothing(tmp_path: Path) -> None:
+def test_symlink_in_place_of_a_lock_file_is_ignored(tmp_path: Path) -> None:
     victim, link = tmp_path / "victim", tmp_path / "pack.lock"
     victim.write_text("precious")
     link.symlink_to(victim)
@@ -82,7 +82,7 @@ def test_a_link_that_was_planted_where_a_lock_file_would_be_leads_to_nothing(tmp
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
-def test_a_stranger_who_takes_the_name_first_does_not_keep_the_service_from_starting(tmp_path: Path) -> None:
+def test_lock_held_by_another_user_is_ignored(tmp_path: Path) -> None:
     command = [sys.executable, "-c", SQUAT, _name(tmp_path, "pack")[1:], str(NOBODY)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe) as stranger:

@@ -22,7 +22,7 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     structlog.reset_defaults()
 
 
-def test_the_level_may_change_and_is_that_of_the_most_talkative_pack(lines: list[str]) -> None:
+def test_level_is_the_lowest_of_all_packs_and_can_change(lines: list[str]) -> None:
     log = structlog.get_logger()
     log.info("1")
     set_level("a", "error")
@@ -36,7 +36,7 @@ def test_the_level_may_change_and_is_that_of_the_most_talkative_pack(lines: list
     assert [line.split()[-1] for line in lines] == ["1", "2", "3", "5"]
 
 
-def test_lines_that_nobody_reads_are_lost_and_counted_and_those_that_wait_come_in_order(
+def test_unread_lines_are_counted_and_queued_ones_keep_their_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     release, written = threading.Event(), []
@@ -47,7 +47,7 @@ def test_lines_that_nobody_reads_are_lost_and_counted_and_those_that_wait_come_i
         return min(len(data), 3)  # as pipes do
 
     monkeypatch.setattr(stderr_writer, "os", SimpleNamespace(write=write))
-    monkeypatch.setattr(stderr_writer, "WAITING_LINES", 4)
+    monkeypatch.setattr(stderr_writer, "MAX_QUEUED_LINES", 4)
     out = Stderr()
     for i in range(20):
         out.take(f"line {i}")

@@ -1,4 +1,4 @@
-"""A device is one file: everything that depends on its name follows."""
+"""Registry of protocols: one new file registers a device everywhere."""
 
 import subprocess
 import sys

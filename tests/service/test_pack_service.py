@@ -67,4 +67,4 @@ def test_a_user_without_a_home_is_served_and_told_that_the_state_is_lost(monkeyp
     monkeypatch.setenv("HOME", "~")
     with capture_logs() as lines:
         state_folder(Settings())
-    assert [line["event"] for line in lines] == ["the state cannot outlive a restart"]
+    assert [line["event"] for line in lines] == ["the state will be lost at a restart"]

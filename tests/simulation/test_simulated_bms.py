@@ -1,4 +1,4 @@
-"""Simulated BMS on a pseudo-terminal before the real reader of serial lines: values, cells, faults, silence, replay."""
+"""Simulated BMS on a pseudo-terminal read by the real serial source: values, cells, faults, silence, replay."""
 
 import asyncio
 import contextlib
@@ -30,9 +30,9 @@ COUNTED = {
 }
 """Where a fault shows."""
 FASTER = {
-    "protocols.base.polled_protocol.PACE_S": 0.1,
-    "protocols.base.polled_protocol.GAP_S": 0.01,
-    "sources.serial.serial_source.TALK_S": 0.02,
+    "protocols.base.polled_protocol.POLL_CYCLE_S": 0.1,
+    "protocols.base.polled_protocol.QUERY_INTERVAL_S": 0.01,
+    "sources.serial.serial_source.SEND_INTERVAL_S": 0.02,
 }
 """Than a BMS is asked, to spare time."""
 
@@ -106,7 +106,7 @@ async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happen
             bms.inject(BmsFault.SILENCE, 1_000_000)
             await until(lambda: board.message)
             assert "open, but silent" in (board.message or "")
-            bms.mend()
+            bms.clear_faults()
             await taken.more(1)
             assert board.message is None
             counters = board.counters

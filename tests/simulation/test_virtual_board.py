@@ -260,7 +260,7 @@ async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_opens_th
 
 async def test_the_relay_goes_where_it_was_told_to_once_the_host_is_silent_and_low_at_a_reset() -> None:
     def told(high: bool, then: bool | None, silent_s: int = 0) -> Event:
-        return lambda b: b._obey(unseal(set_relay_command(Relay(high, then, silent_s))))
+        return lambda b: b._handle_command(unseal(set_relay_command(Relay(high, then, silent_s))))
 
     seen: dict[int, bool] = {}
     look: Event = lambda b: seen.update({b.samples: b.relay_high})  # noqa: E731
@@ -277,6 +277,6 @@ async def test_a_relay_command_that_is_none_changes_nothing() -> None:
     bad = command(MessageType.COMMAND_SET_RELAY, (1 << 8).to_bytes(4, "little"))  # a level in silence, but no time
     one = board()
     acks = FrameDecoder()
-    acks.feed(0.0, b"\0" + await received(one, 20, {10: lambda b: b._obey(unseal(bad))}))
+    acks.feed(0.0, b"\0" + await received(one, 20, {10: lambda b: b._handle_command(unseal(bad))}))
     assert [(ack.result, ack.value) for ack in acks.take_acks()] == [(AckResult.BAD_VALUE, 0)]
     assert not one.relay_high

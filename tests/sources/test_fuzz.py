@@ -1,4 +1,4 @@
-"""A little of ``make fuzz``: each reader of foreign bytes takes its kept corpus and some hundred mutated inputs."""
+"""Short version of ``make fuzz``: the stored corpus and a few hundred mutated inputs for each parser."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Sources that are no serial line: what is brought becomes samples, is recorded, and replays to the same bits."""
+"""Line sources: lines become samples, are recorded, and replay bit-identically."""
 
 import asyncio
 from collections.abc import AsyncGenerator, Sequence
@@ -22,7 +22,7 @@ TEXT = SensorSettings(protocol="text")
 
 
 class Scripted(LineProducer):
-    """Each time it is begun it plays the next script; after the last it brings nothing more."""
+    """Producer that plays the next script at each start; after the last one it stays silent."""
 
     name = "a device"
 
@@ -41,7 +41,7 @@ class Scripted(LineProducer):
 
 
 async def take(source: LineSource, samples: int) -> SampleBlock:
-    """The next so many samples."""
+    """Return the next samples."""
     blocks: list[SampleBlock] = []
     async with asyncio.timeout(LONG_S):
         async for block in source:
@@ -62,7 +62,7 @@ def lines(*volts: float) -> list[bytes]:
     return [CONNECTED, *(sample_json_line(v, -2.0, temperature_c=21.5, cells_v=[v / 16, None]) for v in volts)]
 
 
-async def test_what_is_lost_is_brought_anew_with_a_reason_and_counted():
+async def test_lost_source_is_reopened_with_reason_and_counter():
     script = [SourceUnavailableError("no answer")], [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
     source = LineSource(Scripted(*script), TEXT, first_retry_s=0.001)
     with capture_logs() as logged:
@@ -79,7 +79,7 @@ async def test_what_is_lost_is_brought_anew_with_a_reason_and_counted():
     assert reasons == ["a device: no answer; trying again", "a device: [Errno 5] Input/output error; trying again"]
 
 
-async def test_a_recording_of_what_was_brought_replays_to_the_same_bits(tmp_path: Path):
+async def test_capture_of_lines_replays_bit_identically(tmp_path: Path):
     path = tmp_path / "brought.raw"
     sensor = SensorSettings(protocol="text", current_sign="charge_positive")
     brought = [*lines(50.0, 51.0), b"junk\n", *lines(52.0)[1:], sample_json_line(53.0, 1.25, time_s=7.5)]
@@ -95,11 +95,11 @@ async def test_a_recording_of_what_was_brought_replays_to_the_same_bits(tmp_path
     assert again.decoder.counters["text_errors"] == 1
 
 
-async def test_it_says_that_nothing_comes_and_what_comes_instead():
+async def test_missing_and_invalid_lines_are_reported():
     junk = [CONNECTED, b'{"soc":1}\n', b'{"voltage":"unavailable"}\n']
     for script, said in (
         ([CONNECTED], "a device: connected, but silent"),
-        (junk, 'a device: lines come that do not tell voltage and current; the first: \'{"voltage":"unavailable"}\''),
+        (junk, 'a device: lines without voltage and current arrive; the first: \'{"voltage":"unavailable"}\''),
     ):
         source = LineSource(Scripted(script), TEXT, period_s=0.001, check_interval_s=0.001)
         async with source:
@@ -108,7 +108,7 @@ async def test_it_says_that_nothing_comes_and_what_comes_instead():
             taking.cancel()
 
 
-async def test_a_fault_of_ours_is_not_hidden():
+async def test_internal_error_is_raised():
     source = LineSource(Scripted([*lines(50.0), KeyError("ours")]), TEXT)
     async with source:
         with pytest.raises(KeyError, match="ours"):
@@ -121,7 +121,7 @@ def test_a_line_is_a_sample(values: tuple[float, float]):
         sample_json_line(*values)
 
 
-def test_a_source_makes_the_sensor_what_its_lines_are_unless_told():
+def test_source_sets_sensor_defaults():
     settings = Settings.model_validate({"source": {"kind": "linux", "voltage_scale": 4.0}})
     assert (settings.sensor.protocol, settings.sensor.voltage_resolution_v) == ("text", 5e-3)
     told = SensorSettings(voltage_resolution_v=0.1, current_sign="charge_positive")

@@ -1,4 +1,4 @@
-"""What comes from others is a number or is refused, with the file, the place and what is wrong."""
+"""Strict parsing: foreign input is a valid number or is rejected with file, position and reason."""
 
 import binascii
 import gzip
@@ -24,7 +24,7 @@ HEAD = "time_s,current_a,voltage_v,temperature_c\n"
 
 
 @pytest.mark.parametrize("text", ["3.9", " 3.9\r", "+3.9", "39e-1", "003.9"])
-def test_a_decimal_number_is_one(text: str) -> None:
+def test_decimal_number_is_accepted(text: str) -> None:
     assert number(text) == 3.9
 
 
@@ -32,17 +32,17 @@ def test_a_decimal_number_is_one(text: str) -> None:
     "text",
     ["3_9", "", " ", "٣", "\uff13", "nan", "inf", "1e999", "0x1f", "1d5", "3,9", "3.9V", "--3", "1e", ".", "1 2"],
 )
-def test_what_is_no_decimal_number_is_none(text: str) -> None:
+def test_other_text_is_no_decimal_number(text: str) -> None:
     with pytest.raises(ValueError, match="no decimal number"):
         number(text)
 
 
-def test_a_word_for_nothing_is_nothing() -> None:
+def test_word_for_a_missing_value_is_nan() -> None:
     assert all(math.isnan(measured(text)) for text in ("nan", "NaN", "-nan", "inf", "-Infinity", "ovf"))
 
 
 @pytest.mark.parametrize("cell", ["3_9", "٣", "0x10", "True"])
-def test_a_cell_of_a_table_that_python_takes_for_a_number_is_refused(tmp_path: Path, cell: str) -> None:
+def test_table_cell_that_only_python_accepts_is_rejected(tmp_path: Path, cell: str) -> None:
     path = tmp_path / "odd.csv"
     path.write_text(f"{HEAD}0,1,3.7,25\n1,1,{cell},25\n", encoding="utf-8")
     with pytest.raises(UserError, match=rf"odd\.csv: line 3: voltage_v = '{cell}': must be a number"):
@@ -50,9 +50,7 @@ def test_a_cell_of_a_table_that_python_takes_for_a_number_is_refused(tmp_path: P
 
 
 @pytest.mark.parametrize("word", ["nan", "inf", "", "-Infinity", "1e999"])
-async def test_what_was_not_measured_is_missing_in_a_table_and_a_temperature_that_is_none_is_counted(
-    tmp_path: Path, word: str
-) -> None:
+async def test_missing_and_implausible_table_values_are_nan(tmp_path: Path, word: str) -> None:
     path = tmp_path / "hot.csv"
     path.write_text(f"{HEAD}0,1,3.7,1e308\n1,1,3.7,-61\n2,1,3.7,{'nan' if word == '1e999' else word}\n3,1,3.7,25\n")
     replay = Replay(open_capture(path))
@@ -64,12 +62,12 @@ async def test_what_was_not_measured_is_missing_in_a_table_and_a_temperature_tha
 
 
 @pytest.mark.parametrize("column", [["3_9", "3.7"], ["3.7", "3.7"], [b"1", b"2"], [1j, 2j], [[1], [2]], [True, False]])
-def test_a_column_in_memory_that_is_not_of_numbers_is_refused(column: list[object]) -> None:
+def test_column_without_numbers_is_rejected(column: list[object]) -> None:
     with pytest.raises(UserError, match="the table: column voltage_v holds"):
         load_capture({"time_s": [0.0, 1.0], "current_a": [0, 0], "voltage_v": column})
 
 
-def test_none_in_a_column_in_memory_is_missing() -> None:
+def test_none_in_a_column_is_nan() -> None:
     columns = load_capture({"time_s": [0, 1], "current_a": [None, 1], "voltage_v": [3.7, 3.7]})
     assert columns["current_a"].tolist() == pytest.approx([math.nan, 1.0], nan_ok=True)
 
@@ -99,7 +97,7 @@ def header(path: Path, text: bytes) -> Path:
     ids=lambda text: text[:24].decode("latin-1"),
 )
 @pytest.mark.parametrize("packed", [False, True])
-def test_a_capture_whose_header_is_odd_is_refused_with_its_name(tmp_path: Path, text: bytes, packed: bool) -> None:
+def test_capture_with_invalid_header_is_rejected_with_its_path(tmp_path: Path, text: bytes, packed: bool) -> None:
     path = header(tmp_path / "odd.bms", text)
     if packed:
         path = tmp_path / "odd.bms.gz"
@@ -109,7 +107,7 @@ def test_a_capture_whose_header_is_odd_is_refused_with_its_name(tmp_path: Path, 
             read(path)
 
 
-def test_a_later_version_and_an_unknown_device_are_named(tmp_path: Path) -> None:
+def test_later_version_and_unknown_protocol_are_reported(tmp_path: Path) -> None:
     path = header(tmp_path / "new.bms", b'{"version": 2, "mode": {"any": "thing"}}')
     with pytest.raises(UserError, match=r"new\.bms: version 2, this program reads version 1"):
         read_header(path)

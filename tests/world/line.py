@@ -101,10 +101,10 @@ class Board:
         self._ns += self._window_ns
         parts, count = self._parts, self._count
         voltage = self._sum(reading.voltage_v / parts.divider / parts.supply_v, count)
-        current = self._sum(parts.current_zero + reading.current_a * parts.part_per_ampere, count)
+        current = self._sum(parts.current_zero + reading.current_a * parts.fraction_per_ampere, count)
         if self.text:
             volts = voltage / count / FULL_SCALE * parts.supply_v * parts.divider
-            amperes = (current / count / FULL_SCALE - parts.current_zero) / parts.part_per_ampere
+            amperes = (current / count / FULL_SCALE - parts.current_zero) / parts.fraction_per_ampere
             return b"%.4f,%.4f,%.1f\r\n" % (volts, amperes, reading.temperature_c)
         aux = self._ntc(reading.temperature_c) if self._ntc_next else self._bandgap()
         status = BoardStatus.AUX_IS_NTC * self._ntc_next | (self._cause << 4)

@@ -56,14 +56,14 @@ def no_sensor_availability() -> Iterator[None]:
 @contextlib.contextmanager
 def no_second_try() -> Iterator[None]:
     """A disk that did not take the board once is not asked again."""
-    asked = BoardCheck._remember
+    asked = BoardCheck._store_board
 
     def remember(self: BoardCheck, now_s: float) -> None:
-        if not self._failed:
+        if not self._store_failed:
             asked(self, now_s)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(BoardCheck, "_remember", remember)
+        patch.setattr(BoardCheck, "_store_board", remember)
         yield
 
 

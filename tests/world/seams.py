@@ -63,7 +63,7 @@ class _Instead:
         return getattr(self._module, name)
 
 
-SLOWER = (("service.live_loop", "LAG_STEP_S", 2.0), ("sources.serial.serial_source", "TALK_S", 0.5))
+SLOWER = (("service.live_loop", "LAG_STEP_S", 2.0), ("sources.serial.serial_source", "SEND_INTERVAL_S", 0.5))
 """What looks around all the time does so less often: module, name, seconds. It is what an idle hour would cost most."""
 REMEMBERED = (("estimator.settings_records", "decay_table"),)
 """Pure functions whose values are worth keeping from start to start."""

@@ -379,7 +379,7 @@ class World:
         if self.process is not None:
             board = self.process.board
             no_room = (
-                board is not None and len(board._door._held) == MAX_PENDING_READS
+                board is not None and len(board._board_check._pending) == MAX_PENDING_READS
             )  # samples that find none are not counted
             self.process.foreign |= no_room or self.cable.board is self.foreigner
             if not self.board.text and self.process.reference.feed(data):
@@ -444,11 +444,11 @@ class World:
         """Each byte that came was given to the decoder or is counted; each valid sample was taken, or dropped and counted."""
         if process.board is None:
             return
-        door, counters = process.board._door, process.board.counters
+        door, counters = process.board._board_check, process.board.counters
         held = door.pending_protocol is not None
         if self.timeline.now_s - process.delivered_s <= 0.05 or self._reads(process):
             return
-        given = counters["bytes_received"] + counters["unadmitted_bytes"] + sum(len(data) for _, data in door._held)
+        given = counters["bytes_received"] + counters["unadmitted_bytes"] + sum(len(data) for _, data in door._pending)
         if given != process.delivered_bytes:
             self.fail(f"{process.delivered_bytes} bytes came, {given} are counted: {counters}")
         if self.settings.sensor.protocol == "binary" and not process.foreign:
@@ -460,7 +460,7 @@ class World:
         """A port that was lost before its board was known: what it said is nobody's."""
         if door.pending_protocol is not None:
             nobodys = Reference()
-            nobodys.feed(b"".join(data for _, data in door._held))
+            nobodys.feed(b"".join(data for _, data in door._pending))
             process.reference.samples -= nobodys.samples
         opened()
 
@@ -487,7 +487,7 @@ class World:
             self.fail(f"{ahead_s - process.first_ahead_s:.1f} s are counted that were none")
 
     def _reads(self, process: Process) -> int:
-        return int(process.board._line._reads.qsize())
+        return int(process.board._port._chunks.qsize())
 
     def _check_memory(self, process: Process) -> None:
         """Nothing grows."""
@@ -595,7 +595,9 @@ class World:
             board = made(*arguments, **named)
             if self.process is not None:
                 self.process.board = board
-                board._door.opened = partial(self._reopened, self.process, board._door, board._door.opened)
+                board._board_check.on_port_opened = partial(
+                    self._reopened, self.process, board._board_check, board._board_check.on_port_opened
+                )
             return board
 
         service.SerialSource = make

@@ -96,16 +96,16 @@ def board(
             hello = asked.hello()
             typer.echo(_described(hello))
             if aref_v is not None:
-                told = asked.tell(set_bandgap_command(_bandgap_v(asked, hello, aref_v)))
+                told = asked.send(set_bandgap_command(_bandgap_v(asked, hello, aref_v)))
                 typer.echo(f"bandgap: was {_volts(hello)}, now {_volts(told)}")
             if divider is not None:
-                told = asked.tell(set_divider_command(divider))
+                told = asked.send(set_divider_command(divider))
                 typer.echo(f"divider: was {_divider(hello)}, now {_divider(told)}")
             if volts_per_ampere is not None or ratiometric is not None:
                 told = _set_current(asked, volts_per_ampere, ratiometric)
                 typer.echo(f"current: was {_slope(hello)}, now {_slope(told)}")
             if serial is not None:
-                told = asked.tell(set_serial_command(serial))
+                told = asked.send(set_serial_command(serial))
                 typer.echo(f"serial: was {hello.serial:08x}, now {told.serial:08x}")
     except NoPortError as error:
         raise UserError(str(error)) from None
@@ -152,9 +152,9 @@ def _bandgap_v(asked: BoardClient, hello: Hello, aref_v: float) -> float:
 
 def _set_current(asked: BoardClient, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
     if ratiometric is not None:
-        told = asked.tell(set_ratiometric_command(ratiometric))
+        told = asked.send(set_ratiometric_command(ratiometric))
     if volts_per_ampere is not None:
-        told = asked.tell(set_current_slope_command(volts_per_ampere))
+        told = asked.send(set_current_slope_command(volts_per_ampere))
     return told
 
 

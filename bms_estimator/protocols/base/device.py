@@ -9,12 +9,12 @@ from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 
 @dataclass(frozen=True)
 class Resolution:
-    """Defaults of ``[sensor]`` for one kind of device. None: the default of a board of the firmware holds."""
+    """Defaults of ``[sensor]`` for one kind of device. None: the default of the firmware's board."""
 
     baud: int | None = None
     """Baud rate of its serial port."""
     current_sign: CurrentSign | None = None
-    """Direction that it reports as positive."""
+    """Direction of the current that the device reports as positive."""
     period_s: float | None = None
     """Time between two samples [s]."""
     voltage_resolution_v: float | None = None
@@ -33,10 +33,10 @@ class Device:
 
     Attributes:
         name: Value of ``sensor.protocol``.
-        make: Makes the protocol from the sign of the current and the address (None: the first device that answers).
+        make: Creates the protocol from the sign of the current and the address (None: the first device that responds).
         resolution: Defaults of ``[sensor]``.
-        has_binary_frames: True if its frames are not lines of text. A search for devices queries such devices last, because a
-            device that reads lines takes their queries for the beginning of a line.
+        has_binary_frames: True if its frames are not lines of text. A device search sends their queries last, because a device that
+            reads lines would interpret them as the beginning of a line.
     """
 
     name: str

@@ -1,7 +1,4 @@
-"""Base class of device protocols.
-
-Bytes from a device to samples, and bytes that it is sent. It does not depend on a port.
-"""
+"""Base class of device protocols, which decode received bytes to samples and encode requests. It does no I/O."""
 
 import math
 from abc import ABC, abstractmethod
@@ -22,24 +19,24 @@ class Command:
 
     done: bool = False
     refusal: str | None = None
-    """Why the device does not do it, for people."""
+    """Reason why the device rejects the command, as text; None if it does not."""
 
 
 class DeviceProtocol(ABC):
-    """Bytes with arrival times to samples, and the bytes that are to be sent. Does no I/O, and never raises on bytes.
+    """Device protocol: decodes received bytes to samples, and encodes requests. It raises no error on invalid bytes.
 
-    All that it yields follows from the calls of ``feed`` alone: a recording of them replays to the same bits.
+    The samples depend only on the calls of ``feed``. A capture of these calls therefore replays bit-identically.
     """
 
     cells: CellBlock = NO_CELLS
-    """Beside the samples that ``feed`` or ``feed_reads`` returned last."""
+    """Cell voltages of the samples that ``feed`` or ``feed_reads`` returned last [V]."""
     probing: bool = False
-    """True while the device is unknown; ``next_output`` then sends only queries that change nothing in any device."""
+    """True while the device is unknown. Then ``next_output`` returns only queries that change nothing in any device."""
 
     @property
     @abstractmethod
     def counters(self) -> Mapping[str, int]:
-        """Since start: ``bytes_received``, ``frames_received`` (samples handed on), and faults by kind."""
+        """Counts since start: ``bytes_received``, ``frames_received`` (decoded samples), and faults by kind."""
 
     @property
     @abstractmethod
@@ -53,17 +50,17 @@ class DeviceProtocol(ABC):
 
     @property
     def board(self) -> Mapping[str, str]:
-        """Hello of the device: ``serial`` if it has a serial number; empty before the hello."""
+        """Properties that the device reported, such as its number ``serial``; empty before."""
         return {}
 
     @property
     def clock_ppm(self) -> float | None:
-        """Rate of the device's clock over that of arrivals [1e-6]; None if unknown."""
+        """Rate error of the device's clock relative to the arrival times [1e-6]; None if unknown."""
         return None
 
     @property
     def allowed_silence_s(self) -> float:
-        """Maximum time without data of a working device [s]."""
+        """Maximum time without data while the device works [s]."""
         return 0.0
 
     @abstractmethod
@@ -81,7 +78,7 @@ class DeviceProtocol(ABC):
     def feed_reads(
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
     ) -> SampleBlock:
-        """Decode many reads of the line, as a ``CaptureBatch`` holds them: the same samples as ``feed`` for each."""
+        """Decode many reads of the line, the arrays of a ``CaptureBatch``, to the samples that ``feed`` would return."""
         blocks, cells = [np.empty(0, dtype=SAMPLE)], list[Sequence[float]]()
         begin = 0
         for arrival_s, end in zip(arrivals_s.tolist(), ends.tolist(), strict=True):
@@ -91,40 +88,40 @@ class DeviceProtocol(ABC):
         self.cells = cell_block(cells)
         return np.concatenate(blocks)
 
-    def serial_number_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for those that tell one
-        """Return the serial number that the device would have at the end of ``data`` without feeding it; None without one."""
+    def serial_number_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for subclasses
+        """Return the serial number in ``data`` without decoding it; None if ``data`` contains none."""
         return None
 
-    def on_port_opened(self) -> None:  # noqa: B027 - most have nothing to forget
-        """Reset after the port was opened: the next bytes may be another device's, or the same one's after a reset."""
+    def on_port_opened(self) -> None:  # noqa: B027 - most subclasses have no state to reset
+        """Reset after the port was opened. The next bytes may be from another device, or from a device that was reset."""
 
-    def next_output(self, now_s: float) -> bytes:  # noqa: ARG002 - for those that ask
-        """Return the bytes to send now; nothing before a device that sends on its own was recognized.
+    def next_output(self, now_s: float) -> bytes:  # noqa: ARG002 - for subclasses
+        """Return the bytes to send now. For a device that sends by itself, nothing is returned before it is recognized.
 
         Args:
-            now_s: On the clock of the arrivals [s].
+            now_s: Present time on the clock of the arrival times [s].
         """
         return b""
 
     def command(self, name: str) -> Command:
-        """Have ``next_output`` send what makes the device do ``name``, such as ``current_zero``.
+        """Queue a command for ``next_output``, such as ``current_zero``.
 
         Raises:
-            UserError: It takes no such command.
+            UserError: The device has no such command.
         """
-        raise UserError(f"this board takes no commands, nor {name}")
+        raise UserError(f"this device takes no commands: {name}")
 
-    def relay(self, relay: Relay) -> Command:  # noqa: ARG002 - for those that have one
-        """Have ``next_output`` send what sets the level of the relay pin.
+    def relay(self, relay: Relay) -> Command:  # noqa: ARG002 - for subclasses
+        """Queue the command that sets the level of the relay pin.
 
         Raises:
-            UserError: It does not exist.
+            UserError: The device has no relay pin.
         """
         raise UserError("this board has no relay pin")
 
 
 def cell_block(rows: Sequence[Sequence[float]]) -> CellBlock:
-    """Cell voltages of samples with different numbers of cells [V]."""
+    """Return the cell voltages of samples [V]. Rows with fewer cells are filled up with NaN."""
     cells = max(map(len, rows), default=0)
     if cells == 0:
         return NO_CELLS

@@ -1,4 +1,4 @@
-"""Parser of printed lines: columns, key=value or JSON."""
+"""Reading of a device, and parser of printed lines: columns, key=value or JSON."""
 
 import json
 import math
@@ -10,19 +10,19 @@ from typing import NamedTuple
 from bms_estimator.model.decimal_text import NUMBER, measured, number
 
 CONNECTED = b""
-"""Empty line that reports that the device can be reached now."""
+"""Empty line with which a line producer reports that it is connected."""
 
 
 class Reading(NamedTuple):
-    """Values of one line."""
+    """Measured values of one moment."""
 
     voltage_v: float
     current_a: float
-    """Current with the board's sign."""
+    """Current with the device's sign [A]."""
     temperature_c: float = nan
     cells_v: tuple[float, ...] = ()
     time_s: float = nan
-    """Timestamp by a clock of its own, with any origin."""
+    """Timestamp by the device's clock, with any origin [s]; NaN: not reported."""
 
 
 _VOLT: Mapping[str, float] = {"": 1.0, "v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3}
@@ -37,16 +37,16 @@ _NAMES = {
     "voltage_v": ("V", "v", "U", "u", "volt", "volts", "voltage", "vbat", "vbatt", "bus_voltage", "pack_voltage"),
     "current_a": ("I", "i", "A", "amp", "amps", "current", "ibat", "ibatt"),
     "temperature_c": ("T", "temp", "temperature"),  # t may be the time
-    "time_s": ("time",),  # with its unit alone: boards print times of any kind
+    "time_s": ("time",),  # only with its unit, because boards print times in any unit
     "cells_v": ("cells", "cell_voltages"),
 }
-_KNOWN = {
+_QUANTITIES = {
     f"{name}_{unit}" if unit else name: (field, unit)
     for field, names in _NAMES.items()
     for name in names
     for unit in _UNITS[field]
 }
-"""Name in a line: its quantity, and its unit if the name contains it."""
+"""Quantity, and unit if the name contains one, by name in a line."""
 
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 _PAIR = re.compile(
@@ -60,7 +60,7 @@ _PAIR = re.compile(
 def read_line(line: bytes) -> Reading | None:
     """Parse a line; None if it has no voltage and current.
 
-    ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
+    Examples: ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
     ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
     ``time_s`` is the board's timestamp; a cell that is ``null`` was not measured. Unknown names are skipped. A repeated name or an unknown
     unit makes the line invalid.
@@ -69,9 +69,9 @@ def read_line(line: bytes) -> Reading | None:
         line = line.replace(b",", b".")
     try:
         if line.lstrip().startswith(b"{"):
-            return _combined(_members(line))
+            return _to_reading(_members(line))
         if b"=" in line or b":" in line:
-            return _combined(_pairs(line.decode("ascii", "replace")))
+            return _to_reading(_pairs(line.decode("ascii", "replace")))
         columns = line.translate(_SEPARATORS).decode("ascii").split()
         if len(columns) not in (2, 3):
             return None
@@ -80,43 +80,43 @@ def read_line(line: bytes) -> Reading | None:
         return None
 
 
-Said = tuple[str, list[float], str]
+_NamedValues = tuple[str, list[float], str]
 """Name, values, unit or an empty string."""
 
 
-def _pairs(text: str) -> Iterable[Said]:
+def _pairs(text: str) -> Iterable[_NamedValues]:
     for name, values, unit in _PAIR.findall(text):
         yield name, [number(value) for value in values.split(",")], unit
 
 
-def _members(line: bytes) -> Iterable[Said]:
+def _members(line: bytes) -> Iterable[_NamedValues]:
     for name, value in json.loads(line.decode(), parse_float=number, parse_constant=number).items():
         values = [nan if v is None else v for v in value] if isinstance(value, list) else [value]
         if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
             yield name, [float(v) for v in values], ""
 
 
-def _combined(said: Iterable[Said]) -> Reading | None:
-    """Return the reading of named values.
+def _to_reading(named_values: Iterable[_NamedValues]) -> Reading | None:
+    """Combine named values to a reading; None without voltage or current.
 
     Raises:
         ValueError: A name is duplicated, or has an unknown unit or the wrong number of values.
     """
-    found: dict[str, list[float]] = {}
-    for name, values, unit in said:
-        field, named_unit = _KNOWN.get(name) or _KNOWN.get(name.lower()) or ("", "")
+    values_si: dict[str, list[float]] = {}
+    for name, values, unit in named_values:
+        field, named_unit = _QUANTITIES.get(name) or _QUANTITIES.get(name.lower()) or ("", "")
         if not field:
             continue
         factor = _UNITS[field].get((unit or named_unit).lower())
-        if factor is None or field in found or (field != "cells_v" and len(values) != 1):
+        if factor is None or field in values_si or (field != "cells_v" and len(values) != 1):
             raise ValueError(name)
-        found[field] = [factor * value for value in values]
-    if "voltage_v" not in found or "current_a" not in found:
+        values_si[field] = [factor * value for value in values]
+    if "voltage_v" not in values_si or "current_a" not in values_si:
         return None
     (voltage_v,), (current_a,), (temperature_c,), (time_s,) = (
-        found.get(field, [nan]) for field in _UNITS if field != "cells_v"
+        values_si.get(field, [nan]) for field in _UNITS if field != "cells_v"
     )
-    return Reading(voltage_v, current_a, temperature_c, tuple(found.get("cells_v", ())), time_s)
+    return Reading(voltage_v, current_a, temperature_c, tuple(values_si.get("cells_v", ())), time_s)
 
 
 def sample_json_line(
@@ -131,13 +131,13 @@ def sample_json_line(
 
     Args:
         voltage_v: Voltage of the pack's terminals [V].
-        current_a: As the device counts it [A]; ``sensor.current_sign`` gives the sign.
+        current_a: Current with the device's sign, see ``sensor.current_sign`` [A].
         temperature_c: None or NaN: not measured [degC].
         cells_v: Cell voltages, from the first on; None or NaN: not measured [V].
-        time_s: Time of measurement by the device's clock, with any origin; None: not reported [s].
+        time_s: Timestamp by the device's clock, with any origin [s]; None: not reported.
 
     Raises:
-        ValueError: Voltage or current is no number.
+        ValueError: Voltage or current is not finite.
     """
     if not (math.isfinite(voltage_v) and math.isfinite(current_a)):
         raise ValueError(f"no sample: {voltage_v} V, {current_a} A")

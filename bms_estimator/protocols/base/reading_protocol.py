@@ -1,4 +1,4 @@
-"""Devices that report the pack reading by reading: common parts of their decoders."""
+"""Base class of protocols whose devices report complete readings."""
 
 import math
 from abc import abstractmethod
@@ -22,21 +22,21 @@ from bms_estimator.protocols.base.reading import Reading
 
 
 class ReadingProtocol(DeviceProtocol):
-    """Bytes to readings, readings to samples. It takes no commands.
+    """Protocol that decodes bytes to readings, and readings to samples. It takes no commands.
 
-    Readings carry no clock: those of one read share the time since the read before evenly.
+    Readings have no timestamps. The readings of one read are spaced evenly over the time since the previous read.
 
     Args:
-        current_sign: What the device calls positive; samples are positive on discharge.
-        faults: Names of its counters of what went wrong.
+        current_sign: Direction of positive current of the device; samples are positive on discharge.
+        faults: Names of the fault counters.
     """
 
     def __init__(self, current_sign: CurrentSign, faults: Iterable[str]) -> None:
         self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
         self._counts = dict.fromkeys(("bytes_received", "frames_received", *faults, "implausible"), 0)
         self._first_s = self._last_s = math.nan
-        self._wrong: str | None = None
-        self._good: Reading | None = None
+        self._fault_text: str | None = None
+        self._last_reading: Reading | None = None
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -45,16 +45,16 @@ class ReadingProtocol(DeviceProtocol):
 
     @property
     def fault(self) -> str | None:
-        """Fault of the first bad frame since the last good one."""
-        return self._wrong
+        """First fault since the last reading; None without one."""
+        return self._fault_text
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is since the first sample, by arrival."""
+        """Decode one read of the line; ``time_s`` is the arrival time since the first sample."""
         self._counts["bytes_received"] += len(data)
         readings = []
         for reading in self._read(arrival_s, data):
             readings.append(reading)
-            self._good, self._wrong = reading, None
+            self._last_reading, self._fault_text = reading, None
         self.cells = cell_block([reading.cells_v for reading in readings])
         self._counts["implausible"] += forget_beyond(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
@@ -65,19 +65,19 @@ class ReadingProtocol(DeviceProtocol):
             block["temperature_c"] = [reading.temperature_c for reading in readings]
             self._counts["implausible"] += forget_beyond(block["temperature_c"], MIN_C, MAX_C)
             block["status"] = 0
-            block["time_s"] = self._times(arrival_s, len(readings))
+            block["time_s"] = self._spaced_times(arrival_s, len(readings))
         return block
 
     @abstractmethod
     def _read(self, arrival_s: float, data: bytes) -> Iterable[Reading]:
-        """Decode a chunk; report its faults to ``_count_fault``."""
+        """Decode one read of the line. Subclasses report faults with ``_count_fault``."""
 
-    def _count_fault(self, counter: str, wrong: str) -> None:
-        """Count a fault; the first one since the last good reading is reported."""
+    def _count_fault(self, counter: str, text: str) -> None:
+        """Count a fault. The first one since the last reading is reported by ``fault``."""
         self._counts[counter] += 1
-        self._wrong = self._wrong or wrong
+        self._fault_text = self._fault_text or text
 
-    def _times(self, arrival_s: float, count: int) -> NDArray[np.float64]:
+    def _spaced_times(self, arrival_s: float, count: int) -> NDArray[np.float64]:
         """Return evenly spaced times of ``count`` samples that arrived together [s]."""
         if self._counts["frames_received"] == count:
             self._first_s = self._last_s = arrival_s
@@ -99,8 +99,8 @@ class RecentCellVoltages:
         self._fresh_s = fresh_s
         self._arrival_s, self._cells_v = -math.inf, tuple[float, ...]()
 
-    def keep(self, arrival_s: float, cells_v: Sequence[float]) -> None:
-        """Store the received values."""
+    def store(self, arrival_s: float, cells_v: Sequence[float]) -> None:
+        """Store received voltages."""
         self._arrival_s, self._cells_v = arrival_s, tuple(cells_v)
 
     def at(self, arrival_s: float) -> tuple[float, ...]:

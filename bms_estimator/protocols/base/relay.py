@@ -8,6 +8,6 @@ class Relay(NamedTuple):
 
     high: bool
     high_when_silent: bool | None
-    """Level after ``silent_s`` without a command of this kind; None: it stays as it is."""
+    """Level after ``silent_s`` without a relay command; None: unchanged."""
     silent_s: int = 0
-    """0..3600."""
+    """Time without a relay command after which the level changes, 0..3600 [s]."""

@@ -1,10 +1,11 @@
 """Daly Smart BMS, protocol of the ``A5`` frames: UART or RS485 at 9600 baud.
 
-Question: ``A5 host command 08``, eight zeros, checksum; the host is 40 on RS485 and USB, 80 on UART. Answer: ``A5 01 command 08``,
-eight bytes, checksum, big-endian; cells and probes in several of them with a number first. The checksum is the sum of all
-before it, modulo 256. Current: 0.1 A about 30000, positive on discharge as python-daly-bms, batmon-ha and dbus-serialbattery
-have it; some firmwares have it the other way round (dbus-serialbattery issues 65, 70, 255), then ``sensor.current_sign`` turns it.
-Cells are numbered from frame 1, by Daly's own document from frame 0. Newer boards (H, K, M, S) speak Modbus instead.
+Request: ``A5 host command 08``, eight zeros, checksum; the host is 40 on RS485 and USB, 80 on UART. Response: ``A5 01 command 08``,
+eight bytes, checksum, big-endian; cells and probes are in several frames, each with its number as first byte. The checksum is the sum of all
+bytes before it, modulo 256. Current: 0.1 A per step, 30000 at zero, positive on discharge as in python-daly-bms, batmon-ha and
+dbus-serialbattery. Some firmwares report the opposite sign (dbus-serialbattery issues 65, 70, 255), which
+``sensor.current_sign`` corrects.
+Frame numbers of cells begin with 1, or with 0 as in Daly's own document. Newer boards (H, K, M, S) speak Modbus instead.
 """
 
 import math
@@ -23,24 +24,24 @@ START, DATA_BYTES, FRAME_BYTES = 0xA5, 8, 13
 HOSTS = (0x40, 0x80)
 PACKS = range(0x01, 0x40)
 """Addresses of responses."""
-NO_CURRENT = 30000
+ZERO_CURRENT = 30000
 ZERO_C = 40
-"""0 degC; 0 is a probe that is not there."""
+"""Value at 0 degC; the value 0 is an absent probe."""
 CELLS_A_FRAME, PROBES_A_FRAME, MAX_FRAMES = 3, 7, 16
 
 
-def sealed(frame: bytes) -> bytes:
+def with_checksum(frame: bytes) -> bytes:
     """Append the checksum."""
     return frame + bytes((sum(frame) & 0xFF,))
 
 
-def question(host: int, command: int) -> bytes:
+def request(host: int, command: int) -> bytes:
     """Build the request for ``command``; changes nothing."""
-    return sealed(bytes((START, host, command, DATA_BYTES)) + bytes(DATA_BYTES))
+    return with_checksum(bytes((START, host, command, DATA_BYTES)) + bytes(DATA_BYTES))
 
 
 class DalyProtocol(PolledProtocol):
-    """The conversation with a Daly BMS: how many cells it has until that is known, then cells, probes, pack in each round.
+    """Protocol of a Daly BMS. Each poll cycle requests cells, probes and pack, and the number of cells until it is known.
 
     Args:
         current_sign: Direction of positive current; by its documentation discharge.
@@ -51,7 +52,7 @@ class DalyProtocol(PolledProtocol):
         super().__init__("Daly BMS", re.compile(b"\xa5"), current_sign, address)
         self._cells: int | None = None
         self._probes: int | None = None
-        self._told = self._known = False  # True after a sample; and the number of cells since the port was opened
+        self._has_sample = self._known = False  # sample received; number of cells received since the port was opened
         self._first = 1  # number of the frame with cell 1
         self._cells_v: dict[int, Sequence[float]] = {}  # by the frame's number
         self._probes_c: dict[int, Sequence[float]] = {}
@@ -59,8 +60,8 @@ class DalyProtocol(PolledProtocol):
 
     @property
     def description(self) -> str | None:
-        """Number of cells, once that and a sample have arrived."""
-        return f"Daly BMS, {self._cells} cells" if self._told and self._cells is not None else None
+        """Number of cells; None before it and a sample have arrived."""
+        return f"Daly BMS, {self._cells} cells" if self._has_sample and self._cells is not None else None
 
     def on_port_opened(self) -> None:
         """Reset; the pack may be another one, with more cells."""
@@ -69,9 +70,9 @@ class DalyProtocol(PolledProtocol):
 
     def _query_variants(self) -> Sequence[Sequence[bytes]]:
         if self.probing:
-            return [[question(host, command) for host in HOSTS for command in (STATUS, CELLS, PACK)]]
+            return [[request(host, command) for host in HOSTS for command in (STATUS, CELLS, PACK)]]
         commands = (CELLS, PROBES, PACK) if self._known else (STATUS, CELLS, PROBES, PACK)
-        return [[question(host, command) for command in commands] for host in HOSTS]
+        return [[request(host, command) for command in commands] for host in HOSTS]
 
     def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
         head = data[at + 1 : at + 4]
@@ -82,7 +83,7 @@ class DalyProtocol(PolledProtocol):
         return FRAME_BYTES if head[2] == DATA_BYTES else ParseResult.LENGTH
 
     def _is_whole(self, frame: bytes) -> bool:
-        return sealed(frame[:-1]) == frame
+        return with_checksum(frame[:-1]) == frame
 
     def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
         if self._is_other(frame[1]):
@@ -93,9 +94,7 @@ class DalyProtocol(PolledProtocol):
         if command == STATUS:
             self._cells, self._probes, self._known = data[0] or None, data[1], True
         elif command in (CELLS, PROBES) and data[0] > MAX_FRAMES:
-            self._count_fault(
-                "length_errors", f"a frame with number {data[0]} comes, and there are at most {MAX_FRAMES}"
-            )
+            self._count_fault("length_errors", f"a frame has number {data[0]}, and there are at most {MAX_FRAMES}")
         elif command == CELLS:
             self._first = 0 if data[0] == 0 else self._first
             self._cells_v[data[0]], self._cells_s = [mv / 1000 for mv in struct.unpack_from(">3H", data, 1)], arrival_s
@@ -108,21 +107,21 @@ class DalyProtocol(PolledProtocol):
         cells_v = self._joined(self._cells_v, CELLS_A_FRAME, self._cells) if arrival_s - self._cells_s < FRESH_S else []
         fresh = arrival_s - self._probes_s < FRESH_S
         probes_c = self._joined(self._probes_c, PROBES_A_FRAME, self._probes) if fresh else []
-        self._cells_v, self._told = {}, True
-        there_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
-        return Reading(decivolts / 10, (deciamperes - NO_CURRENT) / 10, self._mean_c(there_c), tuple(cells_v))
+        self._cells_v, self._has_sample = {}, True
+        present_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
+        return Reading(decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, self._mean_c(present_c), tuple(cells_v))
 
-    def _joined(self, frames: Mapping[int, Sequence[float]], each: int, count: int | None) -> list[float]:
-        """Values of all frames in the order of their numbers, NaN for a missing one.
+    def _joined(self, frames: Mapping[int, Sequence[float]], values_per_frame: int, count: int | None) -> list[float]:
+        """Return the values of all frames in the order of their numbers; NaN for a missing frame.
 
         Args:
             frames: Frames by number.
-            each: Number of values in one frame.
-            count: Number of values; None: unknown, and zeros behind the last other value do not count.
+            values_per_frame: Number of values in one frame.
+            count: Number of values; None: unknown, so that trailing zeros are omitted.
         """
         if not frames:
             return []
-        lost = [math.nan] * each
+        lost = [math.nan] * values_per_frame
         values = [value for number in range(self._first, max(frames) + 1) for value in frames.get(number, lost)]
         if count is not None:
             return (values + [math.nan] * count)[:count]

@@ -1,9 +1,8 @@
 """JBD, also sold as Xiaoxiang, LLT Power, Overkill Solar: UART or RS485 at 9600 baud.
 
-Question: ``DD A5 register 00 checksum 77``. Answer: ``DD register status length data checksum 77``, big-endian. The
-checksum is 0x10000 less the sum of all bytes before it from the third on. Current: 10 mA, positive on charge. By the
-register
-map of bms-tools ("negative values indicate discharge") and the captures of esphome-jbd-bms and aiobmsble.
+Request: ``DD A5 register 00 checksum 77``. Response: ``DD register status length data checksum 77``, big-endian. The
+checksum is 0x10000 minus the sum of all bytes before it from the third on. Current: 10 mA per step, positive on
+charge. Sources: the register map of bms-tools ("negative values indicate discharge") and the captures of esphome-jbd-bms and aiobmsble.
 """
 
 import re
@@ -19,27 +18,27 @@ from bms_estimator.protocols.base.reading_protocol import RecentCellVoltages
 BASIC, CELLS, NAME = 0x03, 0x04, 0x05
 START, END, READ = 0xDD, 0x77, 0xA5
 REFUSED = 0x80
-"""Status of a successful response."""
+"""Status of a response that rejects the request; 0 is success."""
 HEAD, TAIL = 4, 3
-"""Bytes of a frame before and behind its data."""
+"""Bytes of a frame before and after its data."""
 MIN_BASIC, MAX_DATA = 23, 128
-"""Bytes: basic information without a probe; more than 32 cells, or the longest name."""
+"""Minimum length of basic information, without a probe, and maximum length of any data, more than 32 cells [bytes]."""
 ZERO_C = 2731
-"""0 degC [0.1 K]."""
+"""Value at 0 degC [0.1 K]."""
 
 
 def checksum(data: bytes) -> bytes:
-    """Return the checksum of the bytes from the third one on."""
+    """Return the checksum of the bytes of a frame from the third one on."""
     return (-sum(data) & 0xFFFF).to_bytes(2, "big")
 
 
-def question(register: int) -> bytes:
+def request(register: int) -> bytes:
     """Build the request for a register; changes nothing."""
     return bytes((START, READ, register, 0)) + checksum(bytes((register, 0))) + bytes((END,))
 
 
 class JbdProtocol(PolledProtocol):
-    """The conversation with a JBD BMS: name until it is known, then cells and basic information in each round.
+    """Protocol of a JBD BMS. Each poll cycle requests cells and basic information, and the name until it is known.
 
     Args:
         current_sign: Direction of positive current; by its documentation charge.
@@ -47,18 +46,18 @@ class JbdProtocol(PolledProtocol):
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__("JBD BMS", re.compile(b"\xdd"), current_sign)
-        self._beside = RecentCellVoltages(FRESH_S)
+        self._recent_cells = RecentCellVoltages(FRESH_S)
         self._model = ""
         self._cells: int | None = None
 
     @property
     def description(self) -> str | None:
-        """Name and number of cells, once its basic information has arrived."""
+        """Name and number of cells; None before the basic information has arrived."""
         return None if self._cells is None else f"JBD BMS {self._model}".rstrip() + f", {self._cells} cells"
 
     def _query_variants(self) -> Sequence[Sequence[bytes]]:
         registers = (CELLS, BASIC) if self._model else (NAME, CELLS, BASIC)
-        return ([question(register) for register in registers],)
+        return ([request(register) for register in registers],)
 
     def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
         if len(data) < at + HEAD:
@@ -74,11 +73,13 @@ class JbdProtocol(PolledProtocol):
     def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
         register, status, data = frame[1], frame[2], frame[HEAD:-TAIL]
         if status == REFUSED:
-            self._count_fault("refused", f"the BMS refuses to tell register 0x{register:02x}")
+            self._count_fault("refused", f"the BMS rejects a request of register 0x{register:02x}")
         elif register == NAME:
             self._model = data.decode("ascii", "replace").strip("\0 ")
         elif register == CELLS:
-            self._beside.keep(arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])])
+            self._recent_cells.store(
+                arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])]
+            )
         elif len(data) < MIN_BASIC:
             self._count_fault("length_errors", "its basic information is too short")
         else:
@@ -88,12 +89,14 @@ class JbdProtocol(PolledProtocol):
     def _basic(self, arrival_s: float, data: bytes) -> Reading:
         volts, amperes = struct.unpack_from(">Hh", data)
         self._cells, probes = data[21], data[22]
-        told = data[MIN_BASIC:][: 2 * probes]
+        probe_data = data[MIN_BASIC:][: 2 * probes]
         return Reading(
             volts / 100,
             amperes / 100,
-            self._mean_c([(step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", told[: len(told) & ~1])]),
-            self._beside.at(arrival_s)[: self._cells],
+            self._mean_c(
+                [(step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", probe_data[: len(probe_data) & ~1])]
+            ),
+            self._recent_cells.at(arrival_s)[: self._cells],
         )
 
 

@@ -1,13 +1,13 @@
-"""JK-BMS (Jikong) over its serial port at 115200 baud: two families of frames, both are taken.
+"""JK-BMS (Jikong) over its serial port at 115200 baud: two families of frames, which are both decoded.
 
 ``4E 57`` (B series, port "GPS", TTL, or RS485 by adapter), big-endian: 4E 57, length without these two, terminal, command, source,
-type, registers, record number, 68, checksum: the sum of all before it. Question: "read all". By JK's "BMS-RS485
-communication protocol" 2.5 as in esphome-jk-bms. Current: 10 mA, positive on charge; by version 0 (register C0) 10000 less it,
-by version 1 with the highest bit set on charge.
+type, registers, record number, 68, checksum: the sum of all bytes before it. Request: "read all". Source: JK's "BMS-RS485
+communication protocol" 2.5 as in esphome-jk-bms. Current: 10 mA per step. In version 0 (register
+C0) the value is 10000 at zero and decreases on charge; in version 1 the highest bit is set on charge.
 
-``55 AA EB 90`` (PB series, RS485-2), little-endian: 300 bytes, the last one the sum of the others, then a Modbus record of eight bytes that begins
-with the pack's address. The master of a line sends it unasked, other packs on a Modbus request. Voltage
-1 mV, current 1 mA, positive on charge. By the captures of esphome-jk-bms, jk-bms-passive-bridge and dbus-serialbattery.
+``55 AA EB 90`` (PB series, RS485-2), little-endian: 300 bytes, of which the last is the sum of the others, then a Modbus record of eight
+bytes that begins with the pack's address. The master of a line sends it unsolicited, other packs on a Modbus request.
+Steps of 1 mV and 1 mA, current positive on charge. Sources: the captures of esphome-jk-bms, jk-bms-passive-bridge and dbus-serialbattery.
 """
 
 import math
@@ -21,8 +21,8 @@ from bms_estimator.protocols.base.polled_protocol import ParseResult, PolledProt
 from bms_estimator.protocols.base.reading import Reading
 
 OLD_START, START = b"\x4e\x57", b"\x55\xaa\xeb\x90"
-OLD_HEAD, OLD_TAIL, OLD_MOST = 11, 9, 512
-"""Bytes of an older frame before its registers, behind them, and in all at most."""
+OLD_HEAD, OLD_TAIL, OLD_MAX_BYTES = 11, 9, 512
+"""Bytes of an older frame before its registers, after them, and in total at most."""
 READ_ALL, FROM_BMS, ANSWER, OLD_END = 0x06, 0x00, 0x01, 0x68
 REGISTER_BYTES: Mapping[int, int] = {
     **dict.fromkeys(range(0x80, 0xC1), 2),
@@ -33,10 +33,10 @@ REGISTER_BYTES: Mapping[int, int] = {
     0xB7: 15,
     0xBA: 24,
 }
-"""Length of each register but that of the cells, which contains its own length [bytes]."""
+"""Length of each register [bytes], except that of the cells, which contains its own length."""
 CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOFTWARE, VERSION = 0x79, 0x81, 0x82, 0x83, 0x84, 0xB7, 0xC0
 ABSENT_C = 140
-"""The end of an older frame's scale, -40 degC: what a probe that is not there reads."""
+"""Value of an absent probe in an older frame: the lower end of the scale, -40 degC."""
 CHARGING = 0x8000
 
 FRAME_BYTES, RECORD_BYTES = 300, 8
@@ -44,11 +44,11 @@ REALTIME, KINDS = 0x02, (0x01, 0x02, 0x03)
 MODBUS_WRITE, REALTIME_REGISTER = 0x10, 0x1620
 ABSENT_DECI_C = -2000
 LISTEN_S = 10.0
-"""Time without queries after unsolicited frames [s]: another master polls every 6 s."""
+"""Time without queries after unsolicited frames [s]. Another master polls every 6 s."""
 
 
 def crc16(data: bytes) -> bytes:
-    """Modbus CRC, as it is sent."""
+    """Return the Modbus CRC in byte order of the line."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte
@@ -57,23 +57,23 @@ def crc16(data: bytes) -> bytes:
     return crc.to_bytes(2, "little")
 
 
-def old_sealed(frame: bytes) -> bytes:
+def with_old_checksum(frame: bytes) -> bytes:
     """Append the checksum of an older frame."""
     return frame + (sum(frame) & 0xFFFF).to_bytes(4, "big")
 
 
-OLD_QUESTION = old_sealed(OLD_START + bytes((0, 19, 0, 0, 0, 0, READ_ALL, 3, 0, 0, 0, 0, 0, 0, OLD_END)))
-"""Read all registers; changes nothing."""
+OLD_REQUEST = with_old_checksum(OLD_START + bytes((0, 19, 0, 0, 0, 0, READ_ALL, 3, 0, 0, 0, 0, 0, 0, OLD_END)))
+"""Request to read all registers; it changes nothing."""
 
 
-def question(address: int) -> bytes:
-    """Build the request for a pack's real-time frame: a Modbus write, which only this BMS takes as a request."""
+def request(address: int) -> bytes:
+    """Build the request for a pack's real-time frame: a Modbus write, which only this BMS treats as a request."""
     frame = struct.pack(">BBHHBH", address, MODBUS_WRITE, REALTIME_REGISTER, 1, 2, 0)
     return frame + crc16(frame)
 
 
 class JkProtocol(PolledProtocol):
-    """The conversation with a JK-BMS.
+    """Protocol of a JK-BMS of either family.
 
     Args:
         current_sign: Direction of positive current; by its documentation charge.
@@ -82,30 +82,30 @@ class JkProtocol(PolledProtocol):
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive", address: int | None = None) -> None:
         super().__init__("JK-BMS", re.compile(re.escape(OLD_START) + b"|" + re.escape(START)), current_sign, address)
-        self._told: str | None = None
-        self._overheard_s = -math.inf  # time of an unrequested newer frame
+        self._description: str | None = None
+        self._overheard_s = -math.inf  # arrival time of the last unsolicited frame
 
     @property
     def description(self) -> str | None:
-        """Number of cells, and other properties in the frame."""
-        return self._told
+        """Number of cells, and software version or address; None before the first frame."""
+        return self._description
 
     @property
     def allowed_silence_s(self) -> float:
-        """Maximum silence [s]; longer if another master polls at its own pace."""
+        """Maximum time without data [s]. It is longer if another master polls."""
         return LISTEN_S if math.isfinite(self._overheard_s) else 0.0
 
     @property
-    def _asked_packs(self) -> Sequence[int]:
-        """Return the packs that are polled in the newer way, in turn."""
+    def _polled_packs(self) -> Sequence[int]:
+        """Addresses that are polled with the newer request, in turn."""
         return (1, 0) if self._address is None else (self._address,)
 
     def _query_variants(self) -> Sequence[Sequence[bytes]]:
-        newer = [] if self.probing else [[question(address)] for address in self._asked_packs]
-        return [[OLD_QUESTION], *newer]
+        newer = [] if self.probing else [[request(address)] for address in self._polled_packs]
+        return [[OLD_REQUEST], *newer]
 
     def on_port_opened(self) -> None:
-        """Reset, and forget other masters."""
+        """Reset; another master is unknown until its next frame."""
         super().on_port_opened()
         self._overheard_s = -math.inf
 
@@ -114,18 +114,18 @@ class JkProtocol(PolledProtocol):
         return b"" if now_s - self._overheard_s < LISTEN_S else super().next_output(now_s)
 
     def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
-        return self._look_old(data, at) if data[at] == OLD_START[0] else self._look_newer(data, at)
+        return self._old_length(data, at) if data[at] == OLD_START[0] else self._newer_length(data, at)
 
-    def _look_old(self, data: bytes, at: int) -> int | ParseResult:
+    def _old_length(self, data: bytes, at: int) -> int | ParseResult:
         if len(data) < at + OLD_HEAD:
             return ParseResult.MORE
         length = int.from_bytes(data[at + 2 : at + 4], "big") + len(OLD_START)
-        if not OLD_HEAD + OLD_TAIL <= length <= OLD_MOST:
+        if not OLD_HEAD + OLD_TAIL <= length <= OLD_MAX_BYTES:
             return ParseResult.LENGTH
         command, _, kind = data[at + 8 : at + OLD_HEAD]
         return length if (command, kind) == (READ_ALL, ANSWER) else ParseResult.NOISE
 
-    def _look_newer(self, data: bytes, at: int) -> int | ParseResult:
+    def _newer_length(self, data: bytes, at: int) -> int | ParseResult:
         if len(data) <= at + len(START):
             return ParseResult.MORE
         if data[at + len(START)] not in KINDS:
@@ -136,23 +136,23 @@ class JkProtocol(PolledProtocol):
 
     def _is_whole(self, frame: bytes) -> bool:
         if frame.startswith(OLD_START):
-            return frame[-5] == OLD_END and old_sealed(frame[:-4]) == frame
+            return frame[-5] == OLD_END and with_old_checksum(frame[:-4]) == frame
         return sum(frame[: FRAME_BYTES - 1]) & 0xFF == frame[FRAME_BYTES - 1]
 
     def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
-        return self._old(frame) if frame.startswith(OLD_START) else self._newer(arrival_s, frame)
+        return self._decode_old(frame) if frame.startswith(OLD_START) else self._decode_newer(arrival_s, frame)
 
-    def _old(self, frame: bytes) -> Reading | None:
+    def _decode_old(self, frame: bytes) -> Reading | None:
         if self._is_other(frame[7]):
             return None
         registers = dict(_registers(frame[OLD_HEAD:-OLD_TAIL]))
         if not {VOLTAGE, CURRENT} <= registers.keys():
-            self._count_fault("length_errors", "its answer tells no voltage or no current")
+            self._count_fault("length_errors", "its response contains no voltage or no current")
             return None
         cells_v = [mv / 1000 for _, mv in struct.iter_unpack(">BH", registers.get(CELLS, b""))]
-        self._told = f"JK-BMS, {len(cells_v)} cells"
+        self._description = f"JK-BMS, {len(cells_v)} cells"
         if software := registers.get(SOFTWARE, b"").decode("ascii", "replace").strip("\0 _"):
-            self._told += f", software {software}"
+            self._description += f", software {software}"
         raw = _number(registers[CURRENT])
         if _number(registers.get(VERSION, b"\0")) == 0:
             current_a = (10000 - raw) / 100
@@ -162,18 +162,18 @@ class JkProtocol(PolledProtocol):
         probes_c = [float(probe if probe <= 100 else 100 - probe) for probe in probes if probe != ABSENT_C]
         return Reading(_number(registers[VOLTAGE]) / 100, current_a, self._mean_c(probes_c), tuple(cells_v))
 
-    def _newer(self, arrival_s: float, frame: bytes) -> Reading | None:
+    def _decode_newer(self, arrival_s: float, frame: bytes) -> Reading | None:
         address = frame[FRAME_BYTES] if len(frame) > FRAME_BYTES else None
-        if address is not None and question(address) != self._asked:
+        if address is not None and request(address) != self._query:
             self._overheard_s = arrival_s
         if (address is not None and self._is_other(address)) or frame[4] != REALTIME:
             return None
-        (there,) = struct.unpack_from("<I", frame, 70)
+        (cell_bits,) = struct.unpack_from("<I", frame, 70)
         (millivolts,) = struct.unpack_from("<I", frame, 150)
         (milliamperes,) = struct.unpack_from("<i", frame, 158)
         cells = struct.unpack_from("<32H", frame, 6)
-        cells_v = [mv / 1000 for i, mv in enumerate(cells) if there >> i & 1]
-        self._told = f"JK-BMS, {len(cells_v)} cells" + ("" if address is None else f", pack {address}")
+        cells_v = [mv / 1000 for i, mv in enumerate(cells) if cell_bits >> i & 1]
+        self._description = f"JK-BMS, {len(cells_v)} cells" + ("" if address is None else f", pack {address}")
         probes_c = [c / 10 for c in struct.unpack_from("<2h", frame, 162) if c != ABSENT_DECI_C]
         return Reading(millivolts / 1000, milliamperes / 1000, self._mean_c(probes_c), tuple(cells_v))
 

@@ -1,4 +1,4 @@
-"""Boards that print text: ``protocols.base.reading`` defines the lines."""
+"""Protocol of boards that print text lines, in the formats of ``protocols.base.reading``."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,31 +21,31 @@ from bms_estimator.protocols.base.device_clock import DeviceClock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
 from bms_estimator.protocols.base.reading import Reading, read_line
 
-LINE_BYTES = 4096
-"""A longer line is noise: 400 cells of seven characters fit."""
-SHOWN_BYTES = 60
+MAX_LINE_BYTES = 4096
+"""Maximum length of a line [bytes]: 400 cells of seven characters fit. A longer line is noise."""
+MAX_SHOWN_BYTES = 60
 """Maximum number of characters of an invalid line that are shown."""
 
 
 class TextProtocol(DeviceProtocol):
-    """Lines of a board to samples. It takes no commands.
+    """Protocol of a board that prints lines. It takes no commands.
 
-    Lines without values are counted and skipped. Lines without ``time_s`` divide the time since the previous read
-    evenly. How the bytes are cut into reads changes no value but these times.
+    Lines without values are counted and skipped. Lines without ``time_s`` are spaced evenly over the time since the
+    previous read. The division of the bytes into reads affects only these times.
 
     Args:
-        current_sign: What the board calls positive; samples are positive on discharge.
+        current_sign: Direction of positive current of the board; samples are positive on discharge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
         self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
         self._rest = b""
         self._overlong = False  # the line is too long, its rest is skipped
-        self._in_step = False  # True once a line has ended, because earlier bytes may be half a line
+        self._synchronized = False  # True once a line has ended, because earlier bytes may be half a line
         self._clock, self._last_s = DeviceClock(), math.nan
         self._bytes = self._samples = self._errors = self._too_long = self._implausible = 0
-        self._bad: bytes | None = None  # the first line without values since the last good one
-        self._good: Reading | None = None
+        self._first_invalid: bytes | None = None  # the first line without values since the last good one
+        self._last_reading: Reading | None = None
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -61,31 +61,33 @@ class TextProtocol(DeviceProtocol):
 
     @property
     def fault(self) -> str | None:
-        """The first line without values, unchanged."""
-        if self._bad is None:
+        """Fault with the first invalid line since the last reading; None without one."""
+        if self._first_invalid is None:
             return None
-        shown = repr(self._bad[:SHOWN_BYTES])[1:] + ("..." if len(self._bad) > SHOWN_BYTES else "")
-        if 4 * len(self._bad.translate(None, PRINTABLE)) > len(self._bad):
+        shown = repr(self._first_invalid[:MAX_SHOWN_BYTES])[1:] + (
+            "..." if len(self._first_invalid) > MAX_SHOWN_BYTES else ""
+        )
+        if 4 * len(self._first_invalid.translate(None, PRINTABLE)) > len(self._first_invalid):
             return (
                 f"bytes that are no text come: wrong baud rate, or sensor.protocol should be binary? They begin {shown}"
             )
-        return f"lines come that do not tell voltage and current; the first: {shown}"
+        return f"lines without voltage and current arrive; the first: {shown}"
 
     @property
     def description(self) -> str | None:
-        """The last line's values, once it was a whole one."""
-        if self._good is None:
+        """Values of the last line; None before a complete line."""
+        if self._last_reading is None:
             return None
-        return f"prints text, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
+        return f"prints text, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is since the first sample, as ``DeviceClock`` has it."""
+        """Decode one read of the line; ``time_s`` is the time since the first sample, from ``DeviceClock``."""
         self._bytes += len(data)
         *lines, self._rest = (self._rest + data).split(b"\n")
         readings = [reading for line in lines if (reading := self._end_line(line)) is not None]
         if self._overlong:
             self._rest = b""
-        elif len(self._rest) > LINE_BYTES:
+        elif len(self._rest) > MAX_LINE_BYTES:
             self._begin_overlong(self._rest)
             self._rest, self._overlong = b"", True
         self.cells = cell_block([reading.cells_v for reading in readings])
@@ -110,25 +112,25 @@ class TextProtocol(DeviceProtocol):
 
     def _end_line(self, line: bytes) -> Reading | None:
         """Parse a line. A partial first line is not counted as a fault."""
-        counted, self._in_step = self._in_step, True
-        if self._overlong:  # the end of it
+        counted, self._synchronized = self._synchronized, True
+        if self._overlong:  # this is the end of the overlong line
             self._overlong = False
             return None
-        if len(line) > LINE_BYTES:
+        if len(line) > MAX_LINE_BYTES:
             self._begin_overlong(line)
             return None
         reading = read_line(line)
         if reading is not None:
-            self._bad = None
-            self._good = reading if counted else None
+            self._first_invalid = None
+            self._last_reading = reading if counted else None
         elif counted and line.strip():
             self._errors += 1
-            self._bad = self._bad or line.rstrip(b"\r")
+            self._first_invalid = self._first_invalid or line.rstrip(b"\r")
         return reading
 
     def _begin_overlong(self, line: bytes) -> None:
         self._too_long += 1
-        self._bad = self._bad or line[:LINE_BYTES]
+        self._first_invalid = self._first_invalid or line[:MAX_LINE_BYTES]
 
 
 DEVICE = Device(

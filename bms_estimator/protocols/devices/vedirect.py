@@ -1,9 +1,9 @@
 """Battery monitors of Victron Energy, BMV and SmartShunt: the text half of the VE.Direct protocol.
 
-A block each second: lines of CR LF, label, tab and value, the last of them ``Checksum`` with one byte that makes the sum of all
-bytes of the block 0 modulo 256 (Victron's VE.Direct protocol and its FAQ). V in mV, I in mA and positive on charge, T in
+The device sends a block each second. Each line is CR LF, label, tab and value. The value of the last line, ``Checksum``,
+is one byte that makes the sum of all bytes of the block 0 modulo 256 (Victron's VE.Direct protocol and its FAQ). V in mV, I in mA and positive on charge, T in
 degrees Celsius where there is a sensor. A second block contains history. HEX messages, from ``:`` to the end of the
-line, may appear in between and belong to no checksum.
+line, may appear in between and are not part of the checksum.
 """
 
 import re
@@ -16,63 +16,65 @@ from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
-BLOCK_BYTES = 2048
-"""No block is longer: 22 fields of at most 44 bytes each."""
+MAX_BLOCK_BYTES = 2048
+"""Maximum length of a block [bytes]: 22 fields of at most 44 bytes each, with a margin."""
 HEX = re.compile(rb":[0-9A-Fa-f]*\r?\n")
 END = b"Checksum\t"
 
 
 class VeDirectProtocol(ReadingProtocol):
-    """Blocks of a battery monitor to samples. It speaks by itself and is sent nothing.
+    """Protocol of a battery monitor, which sends blocks unsolicited and receives nothing.
 
     Args:
-        current_sign: As the device has it: positive on charge.
+        current_sign: Direction of positive current; by its documentation charge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__(current_sign, ("checksum_errors", "length_errors", "text_errors"))
         self._rest = b""
-        self._in_step = False  # True once a block has ended, because earlier bytes may be half a block
+        self._synchronized = False  # True once a block has ended, because earlier bytes may be half a block
         self._product = ""
 
     @property
     def description(self) -> str | None:
         """Product and the last values."""
-        if self._good is None:
+        if self._last_reading is None:
             return None
-        return f"VE.Direct battery monitor {self._product}, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
+        return f"VE.Direct battery monitor {self._product}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - the block carries no time
         self._rest += data
         while (at := self._rest.find(END)) >= 0 and len(self._rest) > at + len(END):
             end = at + len(END) + 1
             block, self._rest = self._rest[:end], self._rest[end:]
-            counted, self._in_step = self._in_step, True
+            counted, self._synchronized = self._synchronized, True
             head = HEX.sub(b"", block[:at])
-            if len(head) > BLOCK_BYTES:
-                self._count_fault("length_errors", "blocks come that are too long for VE.Direct text")
+            if len(head) > MAX_BLOCK_BYTES:
+                self._count_fault("length_errors", "blocks arrive that are too long for VE.Direct text")
             elif sum(head) + sum(block[at:]) & 0xFF:
                 if counted:
                     self._count_fault(
-                        "checksum_errors", "VE.Direct blocks come whose checksum is wrong: is the cable long?"
+                        "checksum_errors", "VE.Direct blocks with a wrong checksum arrive: is the cable too long?"
                     )
-            elif (reading := self._of(head)) is not None:
+            elif (reading := self._parse(head)) is not None:
                 yield reading
-        if len(self._rest) > BLOCK_BYTES and at < 0:
+        if len(self._rest) > MAX_BLOCK_BYTES and at < 0:
             self._rest = self._rest[-len(END) :]
-            self._count_fault("length_errors", "bytes come that are no VE.Direct text: it has 19200 baud, 8N1")
+            self._count_fault(
+                "length_errors", "bytes arrive that are no VE.Direct text: its line setting is 19200 baud, 8N1"
+            )
 
-    def _of(self, head: bytes) -> Reading | None:
-        """Parse a whole block; None for history and for a device other than a battery monitor."""
+    def _parse(self, head: bytes) -> Reading | None:
+        """Parse a complete block; None for a history block and for a device other than a battery monitor."""
         text = head.decode("ascii", "replace")
         fields = dict(line.split("\t", 1) for line in text.split("\r\n") if "\t" in line)
         if "V" not in fields:
             return None
         self._product = fields.get("BMV") or fields.get("PID", "")
         if "I" not in fields or not fields.keys() & {"SOC", "CE", "TTG"}:
-            named = f"product {fields['PID']}" if "PID" in fields else "the device"
+            device = f"product {fields['PID']}" if "PID" in fields else "the device"
             self._count_fault(
-                "text_errors", f"{named} is no battery monitor: the current that it tells is not the battery's"
+                "text_errors", f"{device} is no battery monitor: the current that it reports is not the battery's"
             )
             return None
         return self._measured(fields)

@@ -1,8 +1,8 @@
-"""Rate of the board's clock by the host's: a line under the arrival times of its samples.
+"""Rate error of the board's clock relative to the host's, from a line below the arrival times of its samples.
 
-A sample is late by the delay of line, USB bridge and scheduler, and never early. Therefore only the
-sample with the smallest delay in each ten seconds counts, and of those the lower hull: the line lies under all of
-them (Moon, Skelly, Towsley 1999). However many others were held up changes nothing. It moves no time stamp.
+Line, USB bridge and scheduler delay a sample, but never advance it. Therefore only the sample with the smallest delay in
+each ten seconds is used, and of those the lower convex hull (Moon, Skelly, Towsley 1999). Other delayed samples do not
+affect the result. The result does not change the samples' times.
 """
 
 import math
@@ -13,9 +13,9 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 CLOCK_WINDOWS = 60
-"""The last ten minutes: a resonator drifts with its temperature."""
+"""Number of windows of 10 s: ten minutes, because a resonator drifts with its temperature."""
 _WINDOW_US = 10_000_000
-_MIN_US = 60_000_000  # 1 ms, by which the least delays may differ, is 17 ppm of it
+_MIN_US = 60_000_000  # the smallest delays differ by up to 1 ms, which is 17 ppm of a minute
 _US = 1e-6
 
 
@@ -30,44 +30,44 @@ def take_arrival(d: Record, arrival_s: float) -> None:
     """Record the arrival of the sample at ``d.elapsed_us``."""
     if d.clock_windows == 0:
         d.clock_origin_s = arrival_s
-    late_s = arrival_s - d.clock_origin_s - d.elapsed_us * _US
+    delay_s = arrival_s - d.clock_origin_s - d.elapsed_us * _US
     if d.clock_windows == 0 or d.elapsed_us - d.clock_begin_us >= _WINDOW_US:
         d.clock_windows += 1
         d.clock_begin_us = d.elapsed_us
-    elif late_s >= d.clock_late_s[(d.clock_windows - 1) % CLOCK_WINDOWS]:
+    elif delay_s >= d.clock_late_s[(d.clock_windows - 1) % CLOCK_WINDOWS]:
         return
     at = (d.clock_windows - 1) % CLOCK_WINDOWS
     d.clock_at_us[at] = d.elapsed_us
-    d.clock_late_s[at] = late_s
+    d.clock_late_s[at] = delay_s
 
 
 @njit(cache=True)
 def clock_ppm(d: Record) -> float:
-    """Return the rate of the board's clock over the host's [1e-6].
+    """Return the rate error of the board's clock relative to the host's [1e-6].
 
-    NaN in the first minute, and if all samples arrived at once.
+    NaN in the first minute, and if all samples arrived at the same time.
     """
     count = min(d.clock_windows, CLOCK_WINDOWS)
-    at_s, late_s = np.empty(count), np.empty(count)
+    at_s, delay_s = np.empty(count), np.empty(count)
     for i in range(count):
         window = (d.clock_windows - count + i) % CLOCK_WINDOWS
         at_s[i] = d.clock_at_us[window] * _US
-        late_s[i] = d.clock_late_s[window]
+        delay_s[i] = d.clock_late_s[window]
     if count < 2 or at_s[-1] - at_s[0] < _MIN_US * _US:
         return math.nan
     hull = np.empty(count, np.int64)
     corners = 0
     for i in range(count):
-        while corners > 1 and _above(at_s, late_s, hull[corners - 2], hull[corners - 1], i):
+        while corners > 1 and _above(at_s, delay_s, hull[corners - 2], hull[corners - 1], i):
             corners -= 1
         hull[corners] = i
         corners += 1
-    middle_s, corner = at_s.mean(), 1  # the edge over the middle lies closest under all the points
+    middle_s, corner = at_s.mean(), 1  # the hull's edge at the mean time has the smallest mean distance from all points
     while at_s[hull[corner]] < middle_s:
         corner += 1
     begin, end = hull[corner - 1], hull[corner]
     board_s = at_s[end] - at_s[begin]
-    host_s = board_s + late_s[end] - late_s[begin]
+    host_s = board_s + delay_s[end] - delay_s[begin]
     return (board_s / host_s - 1.0) * 1e6 if host_s > 0.0 else math.nan
 
 

@@ -1,4 +1,4 @@
-"""The binary board's bytes to samples: ``wire.framing`` with its state, its messages and its counters."""
+"""Decoder of the firmware's frames to samples: state, messages and counters around the kernels of ``framing``."""
 
 import contextlib
 from collections.abc import Mapping
@@ -23,10 +23,10 @@ from bms_estimator.protocols.firmware.messages import (
 )
 from bms_estimator.protocols.firmware.scaling import SCALING, reference
 
-DEAF_BYTES = 512
-"""Number of bytes without a whole frame that shows a fault of the line: eight times the longest frame."""
+MAX_BYTES_WITHOUT_FRAME = 512
+"""Number of bytes without a valid frame that is reported as a fault: eight times the longest frame."""
 MAX_CLOCK_PPM = 20_000.0
-"""No resonator is so far off: the host slept meanwhile, or the board is a simulated one in a hurry [1e-6]."""
+"""Maximum plausible rate error of a clock [1e-6]. More shows a suspended host or an accelerated simulation."""
 HELLO_FRAME_BYTES = HELLO_BYTES + 1
 """Length of a COBS-encoded hello without its delimiter [bytes]."""
 _MESSAGES = 8
@@ -37,8 +37,8 @@ class FrameFault(Enum):
 
     WRONG_BAUD = "bytes come, but no valid frame among them: wrong baud rate?"
     TEXT = "the board prints text, not frames: sensor.protocol should be text, --text without a settings file"
-    NEWER_PROTOCOL = "the board speaks another version of the protocol: update this program or the firmware"
-    NO_HELLO = "frames come, but the board has not told its scaling yet"
+    NEWER_PROTOCOL = "the board uses another version of the protocol: update this program or the firmware"
+    NO_HELLO = "frames arrive, but the board has not sent its scaling yet"
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class FrameCounters:
 
     bytes_received: int = 0
     frames_received: int = 0
-    """Samples handed on."""
+    """Decoded samples."""
     frames_lost: int = 0
     """Frames lost by gaps in the sequence, for any reason."""
     crc_errors: int = 0
@@ -61,13 +61,16 @@ class FrameCounters:
     before_hello: int = 0
     """Samples that arrived before their scaling was known, or while another board may have been connected."""
     overruns: int = 0
-    """Samples before which the board had no room on the line."""
+    """Samples before which the board dropped others, because its send buffer was full."""
     implausible: int = 0
-    """Temperatures that no pack has: handed on as not measured."""
+    """Implausible temperatures, which were replaced by NaN."""
     resets: int = 0
     clock_jumps: int = 0
-    """Number of times that the board's clock was restarted by arrival: a sample arrived long before its timestamp, or
-    its timestamp advanced by more than arrival, sequence numbers or a gap explain."""
+    """Number of restarts of the board's clock from the arrival time.
+
+    A restart follows a sample that arrived long before its timestamp, or whose timestamp advanced more than arrival time,
+    sequence numbers or a gap explain.
+    """
 
     def as_dict(self) -> dict[str, int]:
         """Return the counters by name."""
@@ -75,12 +78,12 @@ class FrameCounters:
 
 
 class FrameDecoder:
-    """Bytes of a board to samples.
+    """Decoder of a board's bytes to samples.
 
-    All it yields follows from the calls of ``feed`` alone. It never raises on bytes; faults are counted by kind.
+    The samples depend only on the calls of ``feed``. Invalid bytes raise no error; faults are counted by kind.
 
     Args:
-        current_sign: What the board calls positive; samples are positive on discharge.
+        current_sign: Direction of positive current of the board; samples are positive on discharge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
@@ -93,14 +96,16 @@ class FrameDecoder:
         self._hello: Hello | None = None
         self._acks: list[Ack] = []
         self._printable = 0
-        self._decode(np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0)  # compiles
-        clock_ppm(self._state[0])  # so does this
+        self._decode(
+            np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0
+        )  # compiles the kernel
+        clock_ppm(self._state[0])  # compiles the kernel
 
     @property
     def hello(self) -> Hello | None:
-        """The board's last.
+        """Last hello of the board.
 
-        None before it, after a reset without a hello, and while another board may be connected.
+        None before the first one, after a reset without a hello, and while another board may be connected.
         """
         return self._hello if self._state["boot_id"][0] >= 0 else None
 
@@ -126,16 +131,16 @@ class FrameDecoder:
 
     @property
     def clock_ppm(self) -> float | None:
-        """Rate of the board's clock over that of arrivals [1e-6]; None during the first minute, and if implausible.
+        """Rate error of the board's clock relative to the arrival times, rounded to 0.1 [1e-6].
 
-        To 0.1. It changes no time stamp.
+        None during the first minute, and if implausible. It does not change the samples' times.
         """
         ppm = clock_ppm(self._state[0])
         return round(ppm, 1) if abs(ppm) < MAX_CLOCK_PPM else None
 
     @property
     def counters(self) -> FrameCounters:
-        """Since start."""
+        """Counts since start."""
         counts = self._state[_COUNTERS].item()
         return FrameCounters(**dict(zip(_COUNTERS, counts, strict=True)))
 
@@ -148,8 +153,8 @@ class FrameDecoder:
     def fault(self) -> FrameFault | None:
         """Fault of the line as a whole; None while frames arrive."""
         state = self._state[0]
-        if state["bytes_received"] - state["heard_at"] > DEAF_BYTES:
-            return FrameFault.TEXT if self._printable > DEAF_BYTES else FrameFault.WRONG_BAUD
+        if state["bytes_received"] - state["heard_at"] > MAX_BYTES_WITHOUT_FRAME:
+            return FrameFault.TEXT if self._printable > MAX_BYTES_WITHOUT_FRAME else FrameFault.WRONG_BAUD
         if state["frames_received"] == 0 and state["version_errors"] > 0:
             return FrameFault.NEWER_PROTOCOL
         if state["frames_received"] == 0 and state["before_hello"] > 0:
@@ -158,20 +163,20 @@ class FrameDecoder:
 
     def serial_number_in(self, data: bytes) -> str | None:
         """Return the serial number of the last hello in ``data`` without feeding it; empty if the board has none."""
-        state, found = self._state[0], None
+        state, serial = self._state[0], None
         begun = state["buffer"][: state["length"]].tobytes()
         for frame in (begun + data).split(DELIMITER)[:-1]:
             if len(frame) == HELLO_FRAME_BYTES:
                 with contextlib.suppress(ProtocolError):
-                    found = _hexadecimal(Hello.decode(unseal(frame)).serial)
-        return found
+                    serial = _hexadecimal(Hello.decode(unseal(frame)).serial)
+        return serial
 
     def forget_hello(self) -> None:
-        """Forget the hello until the next one; samples keep the scaling of the last."""
+        """Discard the hello. Samples use its scaling until the next one."""
         self._hello = None
 
     def take_acks(self) -> list[Ack]:
-        """Responses to commands since the last call."""
+        """Return the acknowledgments received since the last call."""
         acks, self._acks = self._acks, []
         return acks
 
@@ -187,7 +192,7 @@ class FrameDecoder:
             across a reset of the board it continues by arrival.
         """
         block = self.feed_reads(np.array([arrival_s]), np.array([len(data)]), np.frombuffer(data, dtype=np.uint8))
-        if self._state["heard_at"][0] + DEAF_BYTES < self._state["bytes_received"][0]:
+        if self._state["heard_at"][0] + MAX_BYTES_WITHOUT_FRAME < self._state["bytes_received"][0]:
             self._printable = self._printable + len(data) if is_text(data) else 0
         return block
 
@@ -198,15 +203,15 @@ class FrameDecoder:
 
         Args:
             arrivals_s: Shape (reads,): arrival time of each read [s].
-            ends: Shape (reads,): where in ``data`` each ends.
+            ends: Shape (reads,): end of each read in ``data``.
             data: Concatenated bytes of the reads.
 
         Returns:
-            As ``feed``.
+            Samples of all reads, as from ``feed``.
         """
-        room = data.size // SAMPLE_FRAME_BYTES + 2
-        if self._samples.size < room:
-            self._samples = np.zeros(room, dtype=SAMPLE)
+        max_samples = data.size // SAMPLE_FRAME_BYTES + 2
+        if self._samples.size < max_samples:
+            self._samples = np.zeros(max_samples, dtype=SAMPLE)
         position = count = 0
         while position < data.size:
             position, samples, messages = self._decode(arrivals_s, ends, data, position, count)
@@ -223,7 +228,7 @@ class FrameDecoder:
         position: int,
         count: int,
     ) -> tuple[int, int, int]:
-        """``wire.framing.decode`` from ``position`` on, behind the ``count`` samples that are there."""
+        """Call ``framing.decode`` from ``position`` on; append to the first ``count`` samples."""
         out = self._samples[count:]
         return decode(data, position, ends, arrivals_s, self._state, self._scaling, out, self._messages)
 

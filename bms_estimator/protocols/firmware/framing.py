@@ -33,17 +33,17 @@ SAMPLE_BYTES = 24
 HELLO_BYTES = 62
 ACK_BYTES = 10
 PACKET_BYTES = 64
-"""No packet is longer."""
+"""Maximum length of a packet [bytes]."""
 SAMPLE_FRAME_BYTES = SAMPLE_BYTES + 2
 
 DECODER = np.dtype(
     [
-        ("buffer", "u1", PACKET_BYTES + 2),  # the frame that has begun, in COBS
-        ("packet", "u1", PACKET_BYTES + 2),  # the frame that has ended, out of COBS
+        ("buffer", "u1", PACKET_BYTES + 2),  # incomplete frame, COBS-encoded
+        ("packet", "u1", PACKET_BYTES + 2),  # last complete frame, decoded
         ("length", "i8"),  # bytes in the buffer
-        ("overlong", "i8"),  # 1: the frame is too long, its rest is skipped
+        ("overlong", "i8"),  # 1: the frame is too long and is skipped up to its end
         ("in_step", "i8"),  # 1 once a delimiter was received, because earlier bytes may be half a frame
-        ("started", "i8"),  # a sample was taken
+        ("started", "i8"),  # 1 after the first sample
         ("expected", "i8"),  # sequence of the next sample
         ("boot_id", "i8"),  # of the last hello; -1: none since a reset, or since another board may be there
         ("serial", "i8"),  # of the last hello
@@ -56,16 +56,16 @@ DECODER = np.dtype(
         ("origin_s", "f8"),  # time at which elapsed_us was 0
         ("time_s", "f8"),  # of the last sample
         ("arrival_s", "f8"),  # of the last sample
-        ("least_late_s", "f8"),  # least arrival beyond origin_s and elapsed_us of late
+        ("least_late_s", "f8"),  # smallest recent delay: arrival minus origin_s and elapsed_us
         ("clock_windows", "i8"),  # for the clock's rate, since the first sample or the reset
         ("clock_begin_us", "i8"),  # elapsed_us at the begin of the last window
-        ("clock_origin_s", "f8"),  # arrival from which lateness counts
-        ("clock_at_us", "i8", CLOCK_WINDOWS),  # elapsed_us of each window's least late sample
-        ("clock_late_s", "f8", CLOCK_WINDOWS),  # its arrival beyond origin and elapsed_us
+        ("clock_origin_s", "f8"),  # arrival time that is the origin of the delays
+        ("clock_at_us", "i8", CLOCK_WINDOWS),  # elapsed_us of the sample with the smallest delay in each window
+        ("clock_late_s", "f8", CLOCK_WINDOWS),  # its delay
         ("current_sign", "f8"),  # 1 if the board's positive current is a discharge, otherwise -1
         ("bytes_received", "i8"),
         ("heard_at", "i8"),  # bytes_received at the end of the last frame with a right CRC
-        ("frames_received", "i8"),  # samples taken
+        ("frames_received", "i8"),  # decoded samples
         ("frames_lost", "i8"),
         ("cobs_errors", "i8"),
         ("length_errors", "i8"),
@@ -77,25 +77,26 @@ DECODER = np.dtype(
         ("before_hello", "i8"),
         ("overruns", "i8"),
         ("resets", "i8"),
-        ("implausible", "i8"),  # temperatures that no pack has
-        ("clock_jumps", "i8"),  # times the board's clock was not believed
+        ("implausible", "i8"),  # implausible temperatures
+        ("clock_jumps", "i8"),  # restarts of the board's clock from the arrival time
     ],
     align=True,
 )
 
 _MASK = MODULUS - 1
 _HALF = MODULUS >> 1
-EARLY_S = 2.0
-"""Time by which a sample must precede the others to show that the board's clock is wrong [s]."""
-HASTE_S = 0.3
-"""Time by which the board's clock may advance beyond arrival and sequence numbers from one sample to the next [s]."""
-SLOWEST = 0.01
-"""No board's clock is slower than the host's by more than this, relative."""
+MAX_LEAD_S = 2.0
+"""Maximum time by which a sample's delay may fall below the smallest one [s]. More shows a wrong board clock."""
+MAX_ADVANCE_S = 0.3
+"""Maximum advance of the board's clock between two samples beyond arrival times and sequence numbers [s]."""
+MAX_SLOWNESS = 0.01
+"""Maximum relative amount by which a board's clock is slower than the host's."""
 _REORDER_WINDOW = 64  # a sample further behind belongs to a board whose clock restarted
-_MAX_APART = 0.1  # sequence and clock of one board, relative; beyond this it is another, or has another rate
+_MAX_APART = (
+    0.1  # maximum relative difference between sequence and clock of one board; more shows another board or rate
+)
 MAX_DOUBT_S = 5.0
-"""Maximum time for which samples wait for the hello that identifies their board [s]; then they are accepted as
-before."""
+"""Maximum time for which samples are dropped until a hello identifies their board [s]. Then they are accepted."""
 _US = 1e-6
 _WRAP_S = MODULUS * _US
 
@@ -122,7 +123,7 @@ CRC_TABLE = _crc_table()
 
 @njit(cache=True)
 def crc16(data: Bytes, begin: int, end: int) -> int:
-    """CRC-16/CCITT-FALSE of ``data[begin:end]``."""
+    """Return the CRC-16/CCITT-FALSE of ``data[begin:end]``."""
     crc = 0xFFFF
     for i in range(begin, end):
         crc = ((crc << 8) & 0xFFFF) ^ int(CRC_TABLE[(crc >> 8) ^ int(data[i])])
@@ -131,7 +132,7 @@ def crc16(data: Bytes, begin: int, end: int) -> int:
 
 @njit(cache=True)
 def cobs_decode(frame: Bytes, length: int, packet: Bytes) -> int:
-    """Decode ``frame[:length]``, free of zeros, into ``packet``. Returns its length, -1 when it is not COBS."""
+    """Decode ``frame[:length]``, free of zeros, into ``packet``. Return its length, or -1 if it is not COBS."""
     i = n = 0
     while i < length:
         block_end = i + int(frame[i])
@@ -150,7 +151,7 @@ def cobs_decode(frame: Bytes, length: int, packet: Bytes) -> int:
 
 @njit(cache=True)
 def read_unsigned(packet: Bytes, offset: int, size: int) -> int:
-    """Unsigned little-endian number."""
+    """Read an unsigned little-endian number."""
     value = 0
     for i in range(size):
         value |= int(packet[offset + i]) << (8 * i)
@@ -160,7 +161,7 @@ def read_unsigned(packet: Bytes, offset: int, size: int) -> int:
 @njit(cache=True)
 def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
     """Unpack the buffered frame into ``packet``. Returns its message type, 0 when it is bad; faults are counted by kind."""
-    counted = d.in_step  # before the first delimiter half a frame is no fault
+    counted = d.in_step  # an incomplete frame before the first delimiter is no fault
     if d.overlong:
         d.length_errors += counted
         return 0
@@ -181,15 +182,15 @@ def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
         return 0
     kind = int(packet[1])
     if kind == MESSAGE_SAMPLE:
-        right = SAMPLE_BYTES
+        expected_length = SAMPLE_BYTES
     elif kind == MESSAGE_HELLO:
-        right = HELLO_BYTES
+        expected_length = HELLO_BYTES
     elif kind == MESSAGE_ACK:
-        right = ACK_BYTES
+        expected_length = ACK_BYTES
     else:
         d.type_errors += 1
         return 0
-    if length != right:
+    if length != expected_length:
         d.length_errors += 1
         return 0
     return kind
@@ -200,11 +201,11 @@ def take_hello(d: Record, s: Record) -> None:
     """Store the board's scaling, and detect a reset or another board."""
     p = d.packet
     boot_id, serial = read_unsigned(p, 6, 2), read_unsigned(p, 8, 4)
-    anew = boot_id != d.boot_id or serial != d.serial
+    is_new = boot_id != d.boot_id or serial != d.serial
     behind = (read_unsigned(p, 12, 4) - d.expected) & _MASK >= _HALF
-    if d.started and (behind or (d.boot_id >= 0 and anew)):
+    if d.started and (behind or (d.boot_id >= 0 and is_new)):
         d.reset_pending = 1
-    if anew:
+    if is_new:
         forget_readings(s)
     d.boot_id, d.serial = boot_id, serial
     d.period_us = read_unsigned(p, 22, 4) * 1e-3
@@ -226,25 +227,25 @@ def take_hello(d: Record, s: Record) -> None:
 
 @njit(cache=True)
 def is_early(d: Record, arrival_s: float, time_s: float) -> bool:
-    """Return True if a sample of ``time_s`` would have arrived long before it was measured, by the delays of earlier samples."""
-    return bool(arrival_s - time_s < d.least_late_s - EARLY_S)
+    """Return True if a sample of ``time_s`` arrived much earlier than the delays of earlier samples allow."""
+    return bool(arrival_s - time_s < d.least_late_s - MAX_LEAD_S)
 
 
 @njit(cache=True)
 def is_consistent_with_clock(d: Record, samples: int, step_us: int) -> bool:
-    """Return True if one board can have measured that many samples in that time of its clock."""
+    """Return True if the number of samples fits the time step of the board's clock."""
     apart_us = abs(samples * d.period_us - step_us)
     return apart_us <= max(_MAX_APART * step_us, _REORDER_WINDOW * d.period_us)
 
 
 @njit(cache=True)
 def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
-    """Follow the board's clock. Wraps of its 32 bits, which only an outage can hide, are recognized by arrival.
+    """Advance the time by the board's clock. The arrival time shows wraps of its 32 bits during an outage.
 
     Returns:
-        True if the step is plausible: a sample may arrive late but not early, and the number of lost samples fits the step. Delayed
-        samples arrive together, at most one period apart by the board's clock. A clock that runs steadily too fast, as a
-        simulated one may, is detected by its rate and not here.
+        True if the step is plausible: the sample is not early, and the number of lost samples fits the step. Delayed
+        samples arrive together, at most one period apart by the board's clock. A clock that is steadily too fast, as in
+        simulations, is detected by its rate and not here.
     """
     step_us = (board_us - d.board_us) & _MASK
     if lost > 0:
@@ -253,12 +254,12 @@ def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
     time_s = d.origin_s + (d.elapsed_us + step_us) * _US
     haste_s = (step_us - (lost + 1) * d.period_us) * _US - (arrival_s - d.arrival_s)
     if (
-        haste_s > HASTE_S
+        haste_s > MAX_ADVANCE_S
         or is_early(d, arrival_s, time_s)
         or (lost > 0 and not is_consistent_with_clock(d, lost + 1, step_us))
     ):
         return False
-    d.least_late_s = min(d.least_late_s + SLOWEST * step_us * _US, arrival_s - time_s)
+    d.least_late_s = min(d.least_late_s + MAX_SLOWNESS * step_us * _US, arrival_s - time_s)
     d.elapsed_us += step_us
     d.time_s = time_s
     return True
@@ -276,14 +277,14 @@ def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
 
 @njit(cache=True)
 def require_new_hello(d: Record, arrival_s: float) -> None:
-    """Another board with another scaling may be connected to the open port; only a hello shows it."""
+    """Drop samples until the next hello, because another board with another scaling may be connected."""
     d.boot_id = -1
     d.doubted_s = arrival_s
 
 
 @njit(cache=True)
 def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -> int:
-    """Place a sample in the stream. Returns bits of SampleStatus, -1 for a sample to be dropped."""
+    """Check the sequence number of a sample. Return bits of SampleStatus, or -1 if the sample must be dropped."""
     status = 0
     if not d.started:
         d.started = 1
@@ -293,7 +294,7 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
         behind = MODULUS - ahead if ahead >= _HALF else 0
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
-                require_new_hello(d, arrival_s)  # its hello was lost: the next one is no further reset
+                require_new_hello(d, arrival_s)  # the hello after the reset was lost; the next one is no further reset
             run_s = board_us * _US  # since its reset
             if is_early(d, arrival_s, d.time_s + run_s):
                 run_s = 0.0
@@ -324,7 +325,7 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
 
 @njit(cache=True)
 def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
-    """Decode the packet, a sample, into ``out``. Returns 1, or 0 when it is dropped."""
+    """Decode a sample packet into ``out``. Return 1, or 0 if the sample is dropped."""
     p = d.packet
     if not s.known:
         d.before_hello += 1
@@ -377,15 +378,15 @@ def decode(
     Args:
         data: Bytes of one or more reads of the line.
         begin: Start index, 0 at first.
-        ends: Shape (reads,): where in ``data`` each read ends, increasing; the last is ``data.size``.
+        ends: Shape (reads,): end of each read in ``data``, increasing; the last is ``data.size``.
         arrivals_s: Shape (reads,): arrival time of each read.
         decoder: Shape (1,), dtype DECODER; updated.
         scaling: Shape (1,), dtype SCALING; updated.
         samples: Output, dtype SAMPLE.
-        messages: Output, shape (n, PACKET_BYTES): packets other than samples, whole, filled up with zeros.
+        messages: Output, shape (n, PACKET_BYTES): packets other than samples, padded with zeros.
 
     Returns:
-        Where the next call begins, samples written, messages written.
+        Start index of the next call, number of samples written, number of messages written.
     """
     d, s = decoder[0], scaling[0]
     buffer = d.buffer

@@ -1,6 +1,6 @@
-"""The messages of the serial line, one at a time (firmware/PROTOCOL.md): commands to the board, its hello and its acks.
+"""Codec of single messages of the serial line (firmware/PROTOCOL.md): commands, hello, acknowledgment, sample.
 
-Samples in bulk are decoded by ``wire.framing``; this codec is for rare messages, for the virtual board and for tests.
+The kernels of ``framing`` decode streams of samples. This codec is for rare messages, the virtual board and tests.
 """
 
 import binascii
@@ -23,11 +23,11 @@ MIN_DIVIDER, MAX_DIVIDER = 1.0, 100.0
 MIN_VOLTS_PER_AMPERE, MAX_VOLTS_PER_AMPERE = 0.001, 2.0
 DELIMITER = b"\0"
 MODULUS = 1 << 32
-"""Sequence and microseconds count up to here and begin at 0 again."""
+"""Modulus of sequence numbers and microseconds."""
 
 
 class MessageType(IntEnum):
-    """Second byte of a packet."""
+    """Message type, the second byte of a packet."""
 
     SAMPLE = 0x01
     HELLO = 0x02
@@ -80,7 +80,7 @@ class ResetCause(IntFlag):
 
 
 class ProtocolError(ValueError):
-    """Bytes that are no message of this protocol."""
+    """The bytes are not a message of this protocol."""
 
 
 def seal(packet: bytes) -> bytes:
@@ -92,7 +92,7 @@ def unseal(frame: bytes) -> bytes:
     """Return the packet of a frame, without its CRC; the delimiter is optional.
 
     Raises:
-        ProtocolError: It is not COBS, too short, or its CRC is wrong.
+        ProtocolError: The frame is not COBS, is too short, or has a wrong CRC.
     """
     try:
         packet = bytes(cobs.decode(frame.removesuffix(DELIMITER)))
@@ -106,20 +106,20 @@ def unseal(frame: bytes) -> bytes:
 
 
 def command(kind: MessageType, body: bytes = b"") -> bytes:
-    """Frame of any command."""
+    """Return the frame of a command."""
     return seal(bytes((PROTOCOL_VERSION, kind)) + body)
 
 
 def hello_command() -> bytes:
-    """Ask for the hello."""
+    """Build the command to send the hello."""
     return command(MessageType.COMMAND_HELLO)
 
 
 def set_rate_command(rate_hz: int) -> bytes:
-    """Ask for ``rate_hz`` samples per second.
+    """Build the command to set the sample rate.
 
     Raises:
-        ValueError: Outside 1..1000.
+        ValueError: The rate is outside 1..1000 Hz.
     """
     if rate_hz not in RATE_HZ:
         raise ValueError(f"{rate_hz} samples per second: must be within 1..1000")
@@ -147,7 +147,7 @@ def set_divider_command(divider: float) -> bytes:
 
 
 def set_current_slope_command(volts_per_ampere: float) -> bytes:
-    """Build the command to store the slope of the current sensor [V/A], 0.001..2; of a ratiometric one at 5 V."""
+    """Build the command to store the slope of the current sensor [V/A], 0.001..2; for a ratiometric sensor at 5 V."""
     return command(MessageType.COMMAND_SET_CURRENT_SLOPE, struct.pack("<I", round(volts_per_ampere * 1e6)))
 
 
@@ -162,7 +162,7 @@ MAX_SILENT_S = 3600
 
 
 def set_relay_command(relay: Relay) -> bytes:
-    """Set the relay pin."""
+    """Build the command to set the relay pin."""
     return command(MessageType.COMMAND_SET_RELAY, struct.pack("<I", relay_word(relay)))
 
 
@@ -174,7 +174,7 @@ def relay_word(relay: Relay) -> int:
 
 @dataclass(frozen=True)
 class Hello:
-    """Description that a board sends of itself; units as on the line."""
+    """Hello: description of a board by itself, in the units of the line."""
 
     firmware_major: int
     firmware_minor: int
@@ -201,7 +201,7 @@ class Hello:
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<4BHIIIHIBBIIIIIHIIH")
 
     def encode(self, version: int = PROTOCOL_VERSION) -> bytes:
-        """Frame."""
+        """Return the frame of the message."""
         body = self.LAYOUT.pack(*(getattr(self, field.name) for field in fields(self)))
         return seal(bytes((version, MessageType.HELLO)) + body)
 
@@ -210,18 +210,18 @@ class Hello:
         """Decode a packet without its CRC.
 
         Raises:
-            ProtocolError: Another message.
+            ProtocolError: The packet is another message.
         """
         return cls(*cls.LAYOUT.unpack(body_of(packet, MessageType.HELLO, cls.LAYOUT.size)))
 
     @property
     def firmware(self) -> str:
-        """Version as people write it."""
+        """Firmware version as text."""
         return f"{self.firmware_major}.{self.firmware_minor}.{self.firmware_patch}"
 
     @property
     def reference_v(self) -> float:
-        """Full range of its converter as measured against the bandgap at its reset [V]; NaN when it was not."""
+        """Full range of the converter, measured against the bandgap at the reset [V]; NaN if it was not measured."""
         if self.bandgap_sum == 0:
             return math.nan
         return self.bandgap_uv * 1e-6 * self.bandgap_count * (1 << self.adc_bits) / self.bandgap_sum
@@ -229,7 +229,7 @@ class Hello:
 
 @dataclass(frozen=True)
 class Ack:
-    """The answer to a command."""
+    """Acknowledgment of a command."""
 
     command: int
     result: AckResult
@@ -238,7 +238,7 @@ class Ack:
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BBI")
 
     def encode(self) -> bytes:
-        """Frame."""
+        """Return the frame of the message."""
         body = self.LAYOUT.pack(self.command, self.result, self.value)
         return seal(bytes((PROTOCOL_VERSION, MessageType.ACK)) + body)
 
@@ -247,7 +247,7 @@ class Ack:
         """Decode a packet without its CRC.
 
         Raises:
-            ProtocolError: Another message.
+            ProtocolError: The packet is another message.
         """
         command_type, result, value = cls.LAYOUT.unpack(body_of(packet, MessageType.ACK, cls.LAYOUT.size))
         try:
@@ -258,7 +258,7 @@ class Ack:
 
 @dataclass(frozen=True)
 class SampleMessage:
-    """A sample as it travels: sums of conversions and their counts."""
+    """Sample on the line: sums of conversions and their counts."""
 
     sequence: int
     board_us: int
@@ -274,7 +274,7 @@ class SampleMessage:
     SUM_BYTES: ClassVar[int] = 3
 
     def encode(self, version: int = PROTOCOL_VERSION) -> bytes:
-        """Frame."""
+        """Return the frame of the message."""
         return seal(
             self.HEAD.pack(version, MessageType.SAMPLE, self.sequence, self.board_us)
             + self.voltage_sum.to_bytes(self.SUM_BYTES, "little")
@@ -287,7 +287,7 @@ class SampleMessage:
         """Decode a packet without its CRC.
 
         Raises:
-            ProtocolError: Another message.
+            ProtocolError: The packet is another message.
         """
         body = body_of(packet, MessageType.SAMPLE, cls.HEAD.size - 2 + 2 * cls.SUM_BYTES + cls.TAIL.size)
         sequence, board_us = struct.unpack_from("<II", body)
@@ -296,10 +296,10 @@ class SampleMessage:
 
 
 def body_of(packet: bytes, kind: MessageType, size: int) -> bytes:
-    """Body of a packet without its CRC.
+    """Return the body of a packet without CRC.
 
     Raises:
-        ProtocolError: Another version, another message or another length.
+        ProtocolError: The packet has another version, type or length.
     """
     if packet[0] != PROTOCOL_VERSION:
         raise ProtocolError(f"protocol version {packet[0]}: this is version {PROTOCOL_VERSION}")

@@ -1,4 +1,4 @@
-"""The board of firmware/: frames in, hello, rate and commands out."""
+"""Protocol of the firmware's board: decodes its frames, and sends it commands."""
 
 import math
 from collections.abc import Mapping
@@ -22,40 +22,40 @@ from bms_estimator.protocols.firmware.messages import (
     zero_current_command,
 )
 
-ASK_AGAIN_S = 0.5
+RETRY_S = 0.5
 """Retry interval of an unanswered command [s]."""
 _HELLO = hello_command()
 
 
 @dataclass
-class _Told(Command):
-    """A pending command: sent, acknowledged, and completed by the hello with the new values."""
+class _PendingCommand(Command):
+    """Pending command. It is done when it is acknowledged and, if it changes the hello, a new hello has arrived."""
 
     frame: bytes = b""
-    again_s: float = ASK_AGAIN_S
+    retry_s: float = RETRY_S
     hint: str = ""
     changes_hello: bool = True
     acknowledged: bool = False
 
 
 class BoardProtocol(DeviceProtocol):
-    """The conversation with a board. It samples by itself: nothing is sent before a complete frame has arrived.
+    """Protocol of a board. It samples by itself, and nothing is sent before its first complete frame has arrived.
 
     Args:
-        current_sign: What the board calls positive; samples are positive on discharge.
+        current_sign: Direction of positive current of the board; samples are positive on discharge.
         rate_hz: Sample rate that the board is set to [Hz]; None: unchanged.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive", rate_hz: int | None = None) -> None:
         self._decoder = FrameDecoder(current_sign=current_sign)
         self._rate_hz = rate_hz
-        self._unheard_at = 0
-        self._asked, self._asked_s = b"", -math.inf
-        self._told: _Told | None = None
+        self._opened_at = 0
+        self._last_output, self._output_s = b"", -math.inf
+        self._command: _PendingCommand | None = None
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The decoder's."""
+        """Counters of the decoder."""
         return self._decoder.counters.as_dict()
 
     @property
@@ -65,7 +65,7 @@ class BoardProtocol(DeviceProtocol):
 
     @property
     def hello(self) -> Hello | None:
-        """The board's, since the port was opened, its reset or a command."""
+        """Hello of the board since the last opening of the port, reset or command; None before it."""
         return self._decoder.hello
 
     @property
@@ -75,12 +75,12 @@ class BoardProtocol(DeviceProtocol):
 
     @property
     def clock_ppm(self) -> float | None:
-        """Rate of the board's clock over that of arrivals [1e-6]."""
+        """Rate error of the board's clock relative to the arrival times [1e-6]; None if unknown."""
         return self._decoder.clock_ppm
 
     @property
     def description(self) -> str | None:
-        """Firmware, serial number and rate."""
+        """Firmware, serial number and sample rate; None before a hello."""
         if self.hello is None:
             return None
         serial_number = f", serial {self.hello.serial:08x}" if self.hello.serial else ""
@@ -96,18 +96,18 @@ class BoardProtocol(DeviceProtocol):
         return self._decoder.serial_number_in(data)
 
     def on_port_opened(self) -> None:
-        """Reset: there is no hello until the next one, and no command is repeated; samples keep the last scaling."""
+        """Discard the hello and a pending command. Samples use the last scaling until the next hello."""
         self._decoder.forget_hello()
-        self._unheard_at = self._decoder.heard_at
-        if self._told is not None and not self._told.done:
-            self._told.refusal = "the line was lost before the board answered, and another board may be there now"
-            self._told.done = True
+        self._opened_at = self._decoder.heard_at
+        if self._command is not None and not self._command.done:
+            self._command.refusal = "the line was lost before the board answered, and another board may be there now"
+            self._command.done = True
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is that of ``FrameDecoder.feed``."""
+        """Decode one read of the line; for ``time_s`` see ``FrameDecoder.feed``."""
         block = self._decoder.feed(arrival_s, data)
-        if self._told is not None:
-            self._follow(self._told)
+        if self._command is not None:
+            self._update_command(self._command)
         return block
 
     def feed_reads(
@@ -117,66 +117,66 @@ class BoardProtocol(DeviceProtocol):
         return self._decoder.feed_reads(arrivals_s, ends, data)
 
     def next_output(self, now_s: float) -> bytes:
-        """Ask for the hello, then give the command, then set the rate: each again until it is answered."""
-        wanted, again_s = self._wanted()
-        if wanted == self._asked and now_s - self._asked_s < again_s:
+        """Return a request of the hello, then the pending command, then the rate command. Each is repeated until answered."""
+        wanted, retry_s = self._wanted()
+        if wanted == self._last_output and now_s - self._output_s < retry_s:
             return b""
-        self._asked, self._asked_s = wanted, now_s
+        self._last_output, self._output_s = wanted, now_s
         return wanted
 
     def command(self, name: str) -> Command:
-        """``current_zero``: take the present current as zero, stored permanently.
+        """Queue ``current_zero``, which makes the board store the present current as zero.
 
         Raises:
-            UserError: Any other.
+            UserError: ``name`` is another command.
         """
         if name != "current_zero":
-            raise UserError(f"the board knows no command {name}")
+            raise UserError(f"the board has no command {name}")
         hint = "; is the sensor connected, and no current flowing?"
-        return self._tell(zero_current_command(), again_s=math.inf, hint=hint)  # it measures for a second
+        return self._queue(
+            zero_current_command(), retry_s=math.inf, hint=hint
+        )  # not repeated, because the board measures for a second
 
     def relay(self, relay: Relay) -> Command:
-        """Set the level of the relay pin."""
+        """Queue the command that sets the level of the relay pin."""
         hint = "; firmware before 0.2.0 has no relay pin"
-        return self._tell(set_relay_command(relay), hint=hint, changes_hello=False)
+        return self._queue(set_relay_command(relay), hint=hint, changes_hello=False)
 
-    def tell(self, frame: bytes) -> Command:
-        """Have ``next_output`` send a command that may be given twice."""
-        return self._tell(frame)
+    def send(self, frame: bytes) -> Command:
+        """Queue a command that may be repeated."""
+        return self._queue(frame)
 
-    def _tell(
-        self, frame: bytes, *, again_s: float = ASK_AGAIN_S, hint: str = "", changes_hello: bool = True
-    ) -> Command:
-        self._decoder.take_acks()  # of the previous request
-        self._asked = b""
-        self._told = _Told(frame=frame, again_s=again_s, hint=hint, changes_hello=changes_hello)
-        return self._told
+    def _queue(self, frame: bytes, *, retry_s: float = RETRY_S, hint: str = "", changes_hello: bool = True) -> Command:
+        self._decoder.take_acks()  # discards those of the previous command
+        self._last_output = b""
+        self._command = _PendingCommand(frame=frame, retry_s=retry_s, hint=hint, changes_hello=changes_hello)
+        return self._command
 
     def _wanted(self) -> tuple[bytes, float]:
-        """Return the command that the board still needs, and its retry interval [s]."""
+        """Return the next bytes to send, and their retry interval [s]."""
         hello = self._decoder.hello
         if hello is None:
-            return _HELLO if self._decoder.heard_at > self._unheard_at else b"", ASK_AGAIN_S
-        if self._told is not None and not self._told.done:
-            return self._told.frame, self._told.again_s
+            return _HELLO if self._decoder.heard_at > self._opened_at else b"", RETRY_S
+        if self._command is not None and not self._command.done:
+            return self._command.frame, self._command.retry_s
         if self._rate_hz is not None and self._rate_hz != hello.rate_hz:
-            return set_rate_command(self._rate_hz) + _HELLO, ASK_AGAIN_S
-        return b"", ASK_AGAIN_S
+            return set_rate_command(self._rate_hz) + _HELLO, RETRY_S
+        return b"", RETRY_S
 
-    def _follow(self, told: _Told) -> None:
-        """Match received data to a pending command: its acknowledgment, or the hello after it."""
+    def _update_command(self, command: _PendingCommand) -> None:
+        """Update the pending command from received acknowledgments and hellos."""
         for ack in self._decoder.take_acks():
-            if ack.command != unseal(told.frame)[1]:
+            if ack.command != unseal(command.frame)[1]:
                 continue
             if ack.result == AckResult.OK:
-                told.acknowledged = True
-                if not told.changes_hello:
+                command.acknowledged = True
+                if not command.changes_hello:
                     continue
-                self._decoder.forget_hello()  # the next one contains the new values; a lost one is requested again
+                self._decoder.forget_hello()  # the next hello has the new values; if it is lost, it is requested again
             else:
-                told.refusal = f"the board refuses: {ack.result.name.lower().replace('_', ' ')}{told.hint}"
-                told.done = True
-        if told.acknowledged and self._decoder.hello is not None:
-            told.done = True
-        if told.done:
-            self._told = None
+                command.refusal = f"the board refuses: {ack.result.name.lower().replace('_', ' ')}{command.hint}"
+                command.done = True
+        if command.acknowledged and self._decoder.hello is not None:
+            command.done = True
+        if command.done:
+            self._command = None

@@ -15,7 +15,7 @@ SCALING = np.dtype(
         ("divider", "f8"),  # pack voltage over voltage at the pin
         ("volts_per_ampere", "f8"),  # slope of the current sensor [V/A]
         ("ratiometric", "i8"),  # 1: that slope holds at 5 V, and is proportional to the reference
-        ("current_zero", "f8"),  # its output without current, as a part of the reference
+        ("current_zero", "f8"),  # its output without current, as a fraction of the reference
         ("bandgap_v", "f8"),  # the converter's internal reference [V]
         ("ntc_series_ohm", "f8"),
         ("ntc_r25_ohm", "f8"),
@@ -32,10 +32,10 @@ SCALING = np.dtype(
 )
 
 # At the firmware's own rate these are 512 and 32 readings: 0.5 LSB of noise becomes 0.02 LSB in the bandgap's mean.
-_BANDGAP_US = 5_120_000  # time constant; twice that where NTC and bandgap are read by turns
+_BANDGAP_US = 5_120_000  # time constant; twice that if NTC and bandgap are read alternately
 _NTC_US = 640_000
 _CLOCK_MASK = MODULUS - 1
-_RAIL = 0.01  # an NTC this near to either end of the range is open or shorted
+_RAIL = 0.01  # an NTC within this fraction of either end of the range is open or shorted
 _RATIOMETRIC_V = 5.0  # supply at which the data sheet of a ratiometric sensor gives its slope
 _ZERO_C_K = 273.15
 _R25_K = 298.15
@@ -43,9 +43,10 @@ _R25_K = 298.15
 
 @njit(cache=True)
 def running_mean(mean: float, weight: float, total: float, count: float, part: float) -> float:
-    """Mean with ``count`` readings of sum ``total`` added to the ``weight`` there were: a plain mean at first.
+    """Return the mean after adding ``count`` readings of sum ``total`` to the ``weight`` readings before.
 
-    From then on exponential: ``part`` is the time since the last readings over the time constant.
+    It is an arithmetic mean at first, and an exponential one later. ``part`` is the time since the last readings divided
+    by the time constant.
     """
     weight += count
     if part * weight > count:
@@ -55,7 +56,7 @@ def running_mean(mean: float, weight: float, total: float, count: float, part: f
 
 @njit(cache=True)
 def take_bandgap(s: Record, total: float, count: float, board_us: int) -> None:
-    """Filter readings of the bandgap."""
+    """Update the filtered mean of the bandgap."""
     part = ((board_us - s.bandgap_us) & _CLOCK_MASK) / (_BANDGAP_US * (1 + s.ntc_fitted))
     s.bandgap_mean = running_mean(s.bandgap_mean, s.bandgap_weight, total, count, part)
     s.bandgap_weight += count
@@ -64,7 +65,7 @@ def take_bandgap(s: Record, total: float, count: float, board_us: int) -> None:
 
 @njit(cache=True)
 def take_ntc(s: Record, total: float, count: float, board_us: int) -> None:
-    """Filter readings of the NTC."""
+    """Update the filtered mean of the NTC."""
     part = ((board_us - s.ntc_us) & _CLOCK_MASK) / _NTC_US
     s.ntc_mean = running_mean(s.ntc_mean, s.ntc_weight, total, count, part)
     s.ntc_weight += count
@@ -105,7 +106,7 @@ def voltage(s: Record, total: float, count: float, reference_v: float) -> float:
 
 @njit(cache=True, error_model="numpy")  # a board that scales by zero gives inf or NaN, which the estimator drops
 def current(s: Record, total: float, count: float, reference_v: float) -> float:
-    """Through the sensor [A], positive as the board is wired; NaN without a conversion."""
+    """Return the current through the sensor with the board's sign [A]; NaN without a conversion."""
     if count == 0.0:
         return math.nan
     range_v = _RATIOMETRIC_V if s.ratiometric else reference_v

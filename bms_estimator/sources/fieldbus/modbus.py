@@ -1,4 +1,4 @@
-"""A Modbus device, on the network or on a serial line, polled for its registers."""
+"""``kind = "modbus"``: a Modbus device on the network or on a serial line, whose registers are polled."""
 
 import asyncio
 import logging
@@ -18,9 +18,9 @@ from bms_estimator.sources.line_source import LineProducer, SourceUnavailableErr
 
 Client = AsyncModbusSerialClient | AsyncModbusTcpClient
 
-NO_SUCH_REGISTER = (1, 2, 3)
-"""Exceptions of the protocol, section 7, that asking again does not mend: illegal function, data address, data value."""
-_EXCEPTIONS = {
+PERMANENT_EXCEPTIONS = (1, 2, 3)
+"""Permanent exception codes (Modbus Application Protocol, section 7): illegal function, data address, data value."""
+_EXCEPTION_TEXTS = {
     1: "illegal function: the device has no registers of this table",
     2: "illegal data address: the device has no such register",
     3: "illegal data value: the device does not give so many registers",
@@ -35,28 +35,26 @@ _EXCEPTIONS = {
 log = structlog.get_logger(__name__)
 
 
-class _RefusedError(Exception):
-    """The device answers with an exception: its code."""
+class _ExceptionResponseError(Exception):
+    """The device responded with an exception; ``code`` is its code."""
 
     def __init__(self, code: int) -> None:
-        super().__init__(_EXCEPTIONS.get(code, f"exception {code}"))
+        super().__init__(_EXCEPTION_TEXTS.get(code, f"exception {code}"))
         self.code = code
 
 
 class ModbusProducer(LineProducer):
-    """Polls a device for its registers.
+    """Line producer that polls the registers of a device.
 
-    Quantities that a device rejects are found by separate requests: without voltage or current there are no samples;
-    temperature and cells are left out.
+    If a device rejects a request, its quantities are requested separately. Rejected temperature and cells are omitted;
+    without voltage and current there are no samples.
 
     Args:
         settings: Settings of the device.
     """
 
     def __init__(self, settings: ModbusSource) -> None:
-        logging.getLogger("pymodbus.logging").setLevel(
-            logging.CRITICAL
-        )  # its log lines are replaced by one of this module
+        logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # LineSource logs the reason in one line
         self._settings, self._values = settings, values_of(settings)
         self._requests: Sequence[Request] = ()
         self._refused: set[str] = set()
@@ -70,7 +68,7 @@ class ModbusProducer(LineProducer):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Since start: answers that were exceptions, readings without voltage or current."""
+        """Number of exception responses, and of readings without voltage or current, since start."""
         return self._counters
 
     @property
@@ -81,7 +79,7 @@ class ModbusProducer(LineProducer):
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """Yield one line for each poll.
 
-        After a late or missing response the connection is reopened, so that responses are not mixed up.
+        After a late or missing response the connection is reopened, so that a late response is not assigned to a later request.
         """
         self._requests = plan(self._values)
         client = _client(self._settings)
@@ -94,27 +92,31 @@ class ModbusProducer(LineProducer):
             while True:
                 if line := self._line(words):
                     yield line
-                next_s = max(next_s + self._settings.poll_s, loop.time())  # polls that were missed are not made up for
+                next_s = max(next_s + self._settings.poll_s, loop.time())  # missed polls are not repeated
                 await asyncio.sleep(next_s - loop.time())
                 words = await self._read(client)
         finally:
             client.close()
 
     async def _connect(self, client: Client) -> None:
-        """Connect to the device; raises SourceUnavailableError if that fails."""
-        what = "no connection" if self._settings.port is None else "the port cannot be opened"
+        """Connect to the device.
+
+        Raises:
+            SourceUnavailableError: The connection or the port cannot be opened.
+        """
+        failure = "no connection" if self._settings.port is None else "the port cannot be opened"
         try:
             if not await client.connect():
-                raise SourceUnavailableError(what)
-        except (ValueError, termios.error) as error:  # pyserial, of a baud rate or a device that is no serial port
-            raise SourceUnavailableError(f"{what}: {error}") from None
+                raise SourceUnavailableError(failure)
+        except (ValueError, termios.error) as error:  # from pyserial: invalid baud rate, or not a serial port
+            raise SourceUnavailableError(f"{failure}: {error}") from None
 
     def _line(self, words: Mapping[tuple[Table, int], int]) -> bytes | None:
-        """Return the line of a sample; None without voltage and current."""
+        """Return the line of a sample; None without voltage or current."""
         reading = reading_of(self._values, words)
         if reading is None:
             self._counters["not_measured"] += 1
-            self._fault = "it answers, but measures no voltage or no current (absent, or not a number)"
+            self._fault = "the device responds, but its voltage or current is absent or not a number"
             return None
         self._fault = None
         return sample_json_line(
@@ -122,64 +124,68 @@ class ModbusProducer(LineProducer):
         )
 
     async def _read(self, client: Client) -> Mapping[tuple[Table, int], int]:
-        """Read all wanted registers.
+        """Read the registers of all quantities.
 
         Raises:
-            SourceUnavailableError: No answer, or none with voltage and current.
+            SourceUnavailableError: The device does not respond, or rejects voltage or current.
         """
         words: dict[tuple[Table, int], int] = {}
-        waiting, done = list(self._requests), list[Request]()
-        while waiting:
-            request = waiting.pop(0)
+        pending, answered = list(self._requests), list[Request]()
+        while pending:
+            request = pending.pop(0)
             try:
-                answer = await self._ask(client, request)
-            except _RefusedError as error:
-                waiting = [*self._instead(request, error), *waiting]
+                answer = await self._request(client, request)
+            except _ExceptionResponseError as error:
+                pending = [*self._replacements(request, error), *pending]
                 continue
             words |= {(request.table, request.address + i): word for i, word in enumerate(answer)}
-            done.append(request)
-        self._requests = done
+            answered.append(request)
+        self._requests = answered
         return words
 
-    def _instead(self, request: Request, error: _RefusedError) -> Sequence[Request]:
-        """Return the requests to send instead of one that was refused.
+    def _replacements(self, request: Request, error: _ExceptionResponseError) -> Sequence[Request]:
+        """Return the requests to send in place of one that the device rejected.
 
         Raises:
-            SourceUnavailableError: There is no reading without it.
+            SourceUnavailableError: The exception is temporary, or voltage or current is rejected.
         """
         self._counters["refused"] += 1
-        if error.code in NO_SUCH_REGISTER:
-            parts = split(request)
-            if parts != (request,):
-                return parts
+        if error.code in PERMANENT_EXCEPTIONS:
+            smaller = split(request)
+            if smaller != (request,):
+                return smaller
             if not any(value.needed for value in request.values):
-                self._leave_out(request, error)
+                self._log_omitted(request, error)
                 return ()
         raise SourceUnavailableError(f"{request.described}: {error}")
 
-    def _leave_out(self, request: Request, error: _RefusedError) -> None:
-        """Log this once."""
+    def _log_omitted(self, request: Request, error: _ExceptionResponseError) -> None:
+        """Log an omitted request, once for each."""
         if request.described not in self._refused:
             self._refused.add(request.described)
-            log.warning("left out", source=self.name, what=request.described, reason=str(error))
+            log.warning("quantity omitted", source=self.name, failure=request.described, reason=str(error))
 
-    async def _ask(self, client: Client, request: Request) -> Sequence[int]:
+    async def _request(self, client: Client, request: Request) -> Sequence[int]:
         """Send a request; raises SourceUnavailableError without a response, _RefusedError for an exception response."""
         read = client.read_input_registers if request.table == "input" else client.read_holding_registers
         try:
             answer = await read(request.address, count=request.words, device_id=self._settings.unit)
         except ModbusException:
             timeout_s = self._settings.timeout_s
-            raise SourceUnavailableError(f"no answer within {timeout_s:g} s, asked for {request.described}") from None
+            raise SourceUnavailableError(
+                f"no response within {timeout_s:g} s to a request of {request.described}"
+            ) from None
         if answer.isError():
-            raise _RefusedError(answer.exception_code)
+            raise _ExceptionResponseError(answer.exception_code)
         if len(answer.registers) != request.words:
-            raise SourceUnavailableError(f"{len(answer.registers)} registers came, asked for {request.described}")
+            raise SourceUnavailableError(
+                f"{len(answer.registers)} registers received, {request.words} requested for {request.described}"
+            )
         return answer.registers
 
 
 def _client(settings: ModbusSource) -> Client:
-    """Make an unconnected client without its own retries and reconnects."""
+    """Create an unconnected client. It does not retry or reconnect, because ``LineSource`` does."""
     if settings.port is None:
         return AsyncModbusTcpClient(
             settings.host or "",

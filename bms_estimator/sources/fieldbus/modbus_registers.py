@@ -1,4 +1,4 @@
-"""Registers of a Modbus device to a reading, and the requests that bring them. Does no I/O."""
+"""Decoding of Modbus registers to a reading, and planning of the requests. No I/O."""
 
 import math
 import struct
@@ -9,11 +9,9 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.modbus_source import MAX_WORDS, ModbusSource, Register
 
 GAP_WORDS = 8
-"""Maximum number of unwanted registers in one request, so that the values around them are read at the same moment."""
-
+"""Maximum gap of unused registers in one request. One request reads the values on both sides at the same moment."""
 DECIMALS = 5
-"""Decimals of V, A and C: finer than any register, and 259 times 0.01 is 2.59."""
-
+"""Decimals of rounded values: finer than any register. Rounding makes 259 * 0.01 exactly 2.59."""
 Table = Literal["holding", "input"]
 Words = Mapping[tuple[Table, int], int]
 """Contents of the registers by table and address."""
@@ -35,7 +33,7 @@ class Value(NamedTuple):
 
 
 class Request(NamedTuple):
-    """Registers of one request."""
+    """Request of consecutive registers."""
 
     table: Table
     address: int
@@ -53,22 +51,22 @@ class Request(NamedTuple):
 
 def values_of(settings: ModbusSource) -> tuple[Value, ...]:
     """Return the values to read from the device."""
-    named = {"voltage": settings.voltage, "current": settings.current, "temperature": settings.temperature}
-    values = [Value(quantity, register) for quantity, register in named.items() if register is not None]
+    single_registers = {"voltage": settings.voltage, "current": settings.current, "temperature": settings.temperature}
+    values = [Value(quantity, register) for quantity, register in single_registers.items() if register is not None]
     if settings.cells is not None:
         values += [Value("cells", settings.cells.cell(number)) for number in range(settings.cells.count)]
     return tuple(values)
 
 
 def plan(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
-    """Return the requests that read ``values``: as few as their tables, ``gap`` and ``MAX_WORDS`` allow."""
+    """Return the requests that read ``values``, as few as tables, ``gap`` and ``MAX_WORDS`` allow."""
     requests: list[Request] = []
     for value in sorted(values, key=lambda value: (value.register.table, value.register.address)):
         register, end = value.register, value.register.address + value.register.words
         if requests:
             last = requests[-1]
-            near = last.table == register.table and register.address <= last.address + last.words + gap
-            if near and end - last.address <= MAX_WORDS:
+            is_adjacent = last.table == register.table and register.address <= last.address + last.words + gap
+            if is_adjacent and end - last.address <= MAX_WORDS:
                 words = max(last.words, end - last.address)
                 requests[-1] = last._replace(words=words, values=(*last.values, value))
                 continue
@@ -77,7 +75,10 @@ def plan(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...
 
 
 def split(request: Request) -> tuple[Request, ...]:
-    """Split a request by quantity and without gaps, to show which part a device refuses; return one that cannot be split."""
+    """Split a request by quantity and without gaps, to find the part that a device rejects.
+
+    A request that cannot be split is returned alone.
+    """
     quantities = dict.fromkeys(value.quantity for value in request.values)
     return tuple(
         part
@@ -101,14 +102,14 @@ def decode(register: Register, words: Words) -> float:
 
 
 def reading_of(values: Sequence[Value], words: Words) -> Reading | None:
-    """Return the reading of the registers with the device's sign of current; None without voltage or current."""
-    found: dict[str, list[float]] = {}
+    """Return the reading with the device's sign of current; None without voltage or current."""
+    decoded: dict[str, list[float]] = {}
     for quantity, register in values:
-        found.setdefault(quantity, []).append(decode(register, words))
+        decoded.setdefault(quantity, []).append(decode(register, words))
     (voltage_v,), (current_a,), (temperature_c,) = (
-        found.get(name, [math.nan]) for name in ("voltage", "current", "temperature")
+        decoded.get(name, [math.nan]) for name in ("voltage", "current", "temperature")
     )
     if math.isnan(voltage_v) or math.isnan(current_a):
         return None
-    cells_v = tuple(found.get("cells", ()))
+    cells_v = tuple(decoded.get("cells", ()))
     return Reading(voltage_v, current_a, temperature_c, () if all(map(math.isnan, cells_v)) else cells_v)

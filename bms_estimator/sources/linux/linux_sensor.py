@@ -146,7 +146,7 @@ class LinuxSensor(LineProducer):
             return 1e-6 * read_number(driver_shunt) / shunt_ohm
         except (OSError, NotANumberError) as error:
             raise SourceUnavailableError(
-                f"{driver_shunt}: {_reason(error)}: the shunt that the driver assumes is unknown; set the ratio "
+                f"{driver_shunt}: {_reason(error)}: the shunt that the driver assumes is unknown; set the ratio in "
                 "source.current_scale instead of source.shunt_ohm"
             ) from None
 

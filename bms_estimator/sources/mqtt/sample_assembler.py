@@ -179,7 +179,7 @@ class SampleAssembler:
             self._cells[cell] = _TimestampedValue(read_value(payload, binding.location, binding.path), now_s)
 
     def _remove(self, quantity: str, cell: int | None) -> None:
-        """Remove the stored value of a quantity; for cells that of one cell, or of all if ``cell`` is None."""
+        """Remove the stored value of a quantity; for cells that of ``cell``, by default of all cells."""
         self._values.pop(quantity, None)
         self._unused.pop(quantity, None)
         if quantity == "cells":

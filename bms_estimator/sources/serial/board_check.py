@@ -1,6 +1,6 @@
-"""Check that the board on the line is the pack's: the configured or stored one, or the first one of this run.
+"""Check that the board on the port is the pack's: the configured one, the stored one, or the first one of this run.
 
-Another board has another divider: its voltages would be wrong by several percent, without any other sign.
+Another board has another divider. Its voltages would be wrong by several percent, and nothing else would show it.
 """
 
 import math
@@ -11,99 +11,97 @@ from threading import Thread
 import structlog
 
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
-from bms_estimator.sources.serial.known_board_file import NO_BOARD, REMEMBERED, KnownBoardFile
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, STORED_FIELDS, KnownBoardFile
 from bms_estimator.sources.source import Chunk
 
 MAX_PENDING_READS = 4096
-"""Maximum number of chunks stored for a board without a serial number yet: seconds at any rate."""
-
-RETRY_S = 60.0
-"""Interval at which a board that could not be stored is written again [s]."""
+"""Maximum number of pending chunks of a board whose serial number is not known yet: at least seconds of data."""
+STORE_RETRY_S = 60.0
+"""Minimum interval between two attempts to store the board [s]."""
 
 log = structlog.get_logger(__name__)
 
 
 class OtherBoardError(Exception):
-    """The board's serial number is not that of the pack's."""
+    """The serial number of the board on the port differs from that of the pack's board."""
 
 
 class BoardCheck:
-    """Lets the reads of one board pass; those of a reopened port wait until its serial number is known.
+    """Filter that passes the chunks of one board. Chunks of a reopened port wait until the serial number is known.
 
     Args:
-        make: Creates a decoder for pending chunks.
-        serial: Serial number of the pack's board, as the settings have it; empty: the stored one, otherwise that of the first
-            board.
-        memory: What outlives a restart; None: nothing does.
+        make_decoder: Creates a decoder for pending chunks.
+        serial: Configured serial number; empty: that of the stored board, otherwise of the first board.
+        memory: File of the pack's board; None: the board is not stored.
     """
 
     def __init__(
-        self, make: Callable[[], DeviceProtocol], serial: str = "", memory: KnownBoardFile | None = None
+        self, make_decoder: Callable[[], DeviceProtocol], serial: str = "", memory: KnownBoardFile | None = None
     ) -> None:
-        self._make, self._told, self._memory = make, serial, memory
+        self._make_decoder, self._configured, self._memory = make_decoder, serial, memory
         self._known: Mapping[str, str] = memory.load() if memory else {}
-        self._kept = self._known  # on disk
-        self._nameless = self._looking = self._keeping = self._failed = self._refused = False
-        self._tried_s = -math.inf
+        self._stored = self._known  # content of the file
+        self._logged_without_serial = self._is_reloading = self._is_storing = self._store_failed = self._refused = False
+        self._store_begun_s = -math.inf
         self.pending_protocol: DeviceProtocol | None = None
-        """Decoder of a pending board."""
-        self._held = deque[Chunk]()
+        """Decoder of the pending chunks; None if no chunks are pending."""
+        self._pending = deque[Chunk]()
         self.unadmitted_bytes = 0
-        """Bytes of refused boards, of ports lost before their board was known, and of chunks beyond the limit."""
+        """Number of rejected bytes: of other boards, of ports lost before their board was known, and of chunks beyond the limit."""
 
     @property
     def serial(self) -> str:
         """Serial number of the pack's board; empty if any board is accepted."""
-        return self._told or self._known.get("serial", "")
+        return self._configured or self._known.get("serial", "")
 
-    def opened(self) -> None:
-        """Reset after the port was opened again."""
-        self.pending_protocol = self._make() if self.serial else None
+    def on_port_opened(self) -> None:
+        """Reset after the port was opened; its board is unknown again."""
+        self.pending_protocol = self._make_decoder() if self.serial else None
         self._refused = False
-        self._drop(self._held)
-        self._held.clear()
+        self._drop(self._pending)
+        self._pending.clear()
 
     def reload_known_board(self) -> None:
-        """Check soon whether another board was accepted. A missing file does not mean that."""
-        if self._memory and not self._looking:
-            self._looking = True
-            Thread(target=self._look, args=(self._memory,), daemon=True).start()
+        """Start to check in a thread if a user has accepted another board. A missing file is no acceptance."""
+        if self._memory and not self._is_reloading:
+            self._is_reloading = True
+            Thread(target=self._reload, args=(self._memory,), daemon=True).start()
 
-    def _look(self, memory: KnownBoardFile) -> None:
-        """Check for another board in a thread of its own, so that a hung disk blocks nothing."""
+    def _reload(self, memory: KnownBoardFile) -> None:
+        """Read the file. It runs in its own thread, so that a hung disk does not block samples."""
         try:
             if memory.load() == NO_BOARD:
-                self._known = self._kept = NO_BOARD
+                self._known = self._stored = NO_BOARD
         finally:
-            self._looking = False
+            self._is_reloading = False
 
-    def accept(self, read: Chunk, decoder: DeviceProtocol) -> Sequence[Chunk]:
-        """Return the chunks of the pack's board for ``decoder``.
+    def accept(self, chunk: Chunk, decoder: DeviceProtocol) -> Sequence[Chunk]:
+        """Return the chunks to decode now: none while the board is unknown, then all pending ones.
 
         Raises:
-            OtherBoardError: Neither this one nor those after it, until the port is reopened.
+            OtherBoardError: The chunk is from another board. Later chunks are dropped until the port is reopened.
         """
         if self._refused:
-            self._drop((read,))
+            self._drop((chunk,))
             return ()
         if self.pending_protocol is None:
-            if self.serial and (swapped := decoder.serial_number_in(read[1])) is not None:
-                self._check(swapped, (read,))
-            return (read,)
-        if len(self._held) == MAX_PENDING_READS:
-            self._drop((self._held.popleft(),))
-        self._held.append(read)
-        self.pending_protocol.feed(*read)
+            if self.serial and (new_serial := decoder.serial_number_in(chunk[1])) is not None:
+                self._check(new_serial, (chunk,))
+            return (chunk,)
+        if len(self._pending) == MAX_PENDING_READS:
+            self._drop((self._pending.popleft(),))
+        self._pending.append(chunk)
+        self.pending_protocol.feed(*chunk)
         if not self.pending_protocol.board:
             return ()
-        held = list(self._held)
-        self._held.clear()
-        self._check(self.pending_protocol.board.get("serial", ""), held)
+        pending = list(self._pending)
+        self._pending.clear()
+        self._check(self.pending_protocol.board.get("serial", ""), pending)
         self.pending_protocol = None
-        return held
+        return pending
 
     def remember_board(self, board: Mapping[str, str], now_s: float) -> None:
-        """Accept samples of ``board`` as the pack's from now on; log and store what changed.
+        """Store ``board`` as the pack's, and log changes.
 
         Args:
             board: Reported properties of the board.
@@ -114,70 +112,70 @@ class BoardCheck:
         if not board.get("serial"):
             self._log_without_serial()
             return
-        before, self._known = self._known, {name: board.get(name, "") for name in REMEMBERED}
-        if self._known != before:
-            self._log_new_board(before)
-            self._tried_s = -math.inf
-        self._remember(now_s)
+        previous, self._known = self._known, {name: board.get(name, "") for name in STORED_FIELDS}
+        if self._known != previous:
+            self._log_new_board(previous)
+            self._store_begun_s = -math.inf
+        self._store_board(now_s)
 
-    def _log_new_board(self, before: Mapping[str, str]) -> None:
-        changes = [name for name in REMEMBERED if before.get(name) and before[name] != self._known[name]]
+    def _log_new_board(self, previous: Mapping[str, str]) -> None:
+        changes = [name for name in STORED_FIELDS if previous.get(name) and previous[name] != self._known[name]]
         if changes:
-            changed = {name: f"{before[name]} to {self._known[name]}" for name in changes}
+            changed = {name: f"{previous[name]} to {self._known[name]}" for name in changes}
             log.warning(
                 "the board is calibrated differently" if "serial" not in changes else "another board", **changed
             )
         else:
             log.info("this is the pack's board from now on", **self._known)
 
-    def _remember(self, now_s: float) -> None:
-        """Store the board without blocking on a hung disk; retry a failed write while samples arrive."""
-        if self._memory is None or self._keeping or now_s - self._tried_s < RETRY_S:
+    def _store_board(self, now_s: float) -> None:
+        """Start to store the board in a thread, unless one runs or the last attempt was less than a minute ago."""
+        if self._memory is None or self._is_storing or now_s - self._store_begun_s < STORE_RETRY_S:
             return
-        self._keeping, self._tried_s = True, now_s
+        self._is_storing, self._store_begun_s = True, now_s
         Thread(target=self._store, args=(self._memory, self._known), daemon=True).start()
 
     def _store(self, memory: KnownBoardFile, board: Mapping[str, str]) -> None:
-        """Store the board in a thread of its own."""
+        """Store the board. It runs in its own thread, so that a hung disk does not block samples."""
         try:
-            if board != self._kept or memory.is_gone():
+            if board != self._stored or memory.is_missing():
                 memory.save(board)
-            self._kept, self._failed = board, False
+            self._stored, self._store_failed = board, False
         except OSError as error:
-            if not self._failed:
-                log.warning("the board cannot be remembered yet", file=str(memory.path), reason=str(error))
-            self._failed = True
+            if not self._store_failed:
+                log.warning("the board cannot be stored yet", file=str(memory.path), reason=str(error))
+            self._store_failed = True
         finally:
-            self._keeping = False
+            self._is_storing = False
 
-    def _drop(self, reads: Iterable[Chunk]) -> None:
-        self.unadmitted_bytes += sum(len(data) for _, data in reads)
+    def _drop(self, chunks: Iterable[Chunk]) -> None:
+        self.unadmitted_bytes += sum(len(data) for _, data in chunks)
 
-    def _check(self, found: str, reads: Sequence[Chunk]) -> None:
-        """Let the board that has sent ``reads`` in.
+    def _check(self, serial: str, chunks: Sequence[Chunk]) -> None:
+        """Compare the serial number of the board that sent ``chunks`` with that of the pack's board.
 
         Raises:
-            OtherBoardError: It is another.
+            OtherBoardError: They differ.
         """
-        if found == self.serial:
+        if serial == self.serial:
             return
         self._refused = True
-        self._drop(reads)
-        accept = (
+        self._drop(chunks)
+        remedy = (
             "or set sensor.serial to its number"
-            if self._told
-            else f"or, if it takes its place, run `{self._memory.how_to_forget}` with the pack's settings file"
+            if self._configured
+            else f"or, to use this board instead, run `{self._memory.accept_command}` with the pack's settings file"
             if self._memory
-            else "or start anew"
+            else "or restart the service to use this board"
         )
         raise OtherBoardError(
-            f"board {found or 'without a serial number'} is not the pack's, {self.serial}: plug that in, {accept}"
+            f"board {serial or 'without a serial number'} is not the pack's, {self.serial}: connect that one, {remedy}"
         )
 
     def _log_without_serial(self) -> None:
-        if not self._nameless:
-            self._nameless = True
+        if not self._logged_without_serial:
+            self._logged_without_serial = True
             log.warning(
-                "the board has no serial number: another in its place would not be noticed",
-                hint="give it one with `bms-estimator board --serial`",
+                "the board has no serial number, so that an exchange of boards would not be noticed",
+                hint="set one with `bms-estimator board --serial`",
             )

@@ -1,4 +1,4 @@
-"""Identifies the device on a serial port, and requests a board's hello and settings."""
+"""Detection of the device on a serial port, and a client for a board's settings."""
 
 import itertools
 import time
@@ -11,7 +11,7 @@ from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.protocols.firmware.frame_decoder import FrameFault
 from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command
-from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardProtocol
+from bms_estimator.protocols.firmware.protocol import RETRY_S, BoardProtocol
 from bms_estimator.protocols.registry import PROTOCOLS, make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
     import serial
 
 BOOT_TIMEOUT_S = 3.0
-"""A board that was reset by the opening of its port spends two seconds in its boot loader [s]."""
+"""Timeout for a board [s]. Opening the port may reset it, and its boot loader then takes two seconds."""
 PROTOCOL_TIMEOUT_S = 1.5
-"""Time added to a baud rate for each protocol that is tried at it in turn [s]."""
+"""Timeout for each protocol that is tried at a baud rate [s]."""
 QUERY_INTERVAL_S = 0.3
-"""Time for a response before the next protocol's query [s]."""
-READ_S = 0.1
+"""Interval between the queries of two protocols [s]."""
+READ_TIMEOUT_S = 0.1
 """Timeout of a read [s]."""
 READ_BYTES = 4096
 REFERENCE_RATE_HZ = 100
-"""The firmware's own: the bandgap is measured in every second sample, or in each without an NTC."""
+"""Default sample rate of the firmware [Hz]. It measures the bandgap in every second sample, without an NTC in each."""
 REFERENCE_SAMPLES = 300
-"""Number of bandgap readings: the noise of their mean is 0.03 %."""
-REFERENCE_S = 10.0
-"""Timeout of these readings [s]."""
+"""Number of samples for the mean of the bandgap, whose noise is then 0.03 %."""
+REFERENCE_TIMEOUT_S = 10.0
+"""Timeout of the bandgap measurement [s]."""
 
 Answer = TypeVar("Answer")
 
@@ -50,7 +50,7 @@ class DetectedDevice:
     """Cells in series, if reported."""
 
     def __str__(self) -> str:
-        """Describe the device, and how to reach it unless it is a board at the firmware's own rate."""
+        """Describe the device; add protocol and baud rate unless it is a board at the default rate."""
         usual = self.baud == BAUD and self.protocol in ("binary", "text")
         return self.described if usual else f"{self.described}; protocol {self.protocol}, {self.baud} baud"
 
@@ -58,36 +58,36 @@ class DetectedDevice:
 def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
     """Detect the device on ``port``; return it, or the reason why it is unknown.
 
-    A board of the firmware is looked for first. Then every protocol of ``sensor.protocol`` is tried at its own baud
-    rate, one request at a time. The requests change nothing.
+    The firmware's protocol is tried first. Then every other protocol is tried at its default baud rate, one request at a
+    time. The requests change nothing in any device.
 
     Args:
-        port: Device path; opened for ourselves alone.
-        baud: Try everything at this rate [1/s]; None: each at its own.
+        port: Device path; opened exclusively.
+        baud: Baud rate of all protocols [1/s]; None: the default of each.
     """
     rates = _rates() if baud is None else {baud: list(PROTOCOLS)}
-    silence = "silent"
-    BoardProtocol().feed(0.0, b"\0\n")  # loads its kernel: nothing compiles while an answer is waited for
+    reason = "silent"
+    BoardProtocol().feed(0.0, b"\0\n")  # compiles its kernel before the timeouts begin
     try:
-        with open_port(port, next(iter(rates)), READ_S) as line:
+        with open_port(port, next(iter(rates)), READ_TIMEOUT_S) as line:
             for rate, protocols in rates.items():
                 line.baudrate = rate
                 line.reset_input_buffer()
-                decoders = {name: _prober(name) for name in protocols}
-                patience_s = BOOT_TIMEOUT_S if rate == BAUD and baud is None else PROTOCOL_TIMEOUT_S * len(decoders)
-                if (found := _ask_in_turns(line, decoders, patience_s)) is not None:
+                decoders = {name: _probing_decoder(name) for name in protocols}
+                timeout_s = BOOT_TIMEOUT_S if rate == BAUD and baud is None else PROTOCOL_TIMEOUT_S * len(decoders)
+                if (found := _query_in_turn(line, decoders, timeout_s)) is not None:
                     return DetectedDevice(found, rate, *_described(decoders[found]))
-                if silence == "silent":
-                    silence = _silence(list(decoders.values()))
+                if reason == "silent":
+                    reason = _failure_reason(list(decoders.values()))
     except NoPortError as error:
         return str(error).removeprefix(f"{port}: ")
     except OSError as error:
         return f"lost: {error}"
-    return silence
+    return reason
 
 
 def _rates() -> Mapping[int, Sequence[str]]:
-    """Protocols by baud rate, the firmware's first, then from the fastest down; text is read at any."""
+    """Return the protocols to try at each baud rate: the firmware's rate first, then descending. Text is tried at each."""
     rates: dict[int, list[str]] = {BAUD: []}
     for name in PROTOCOLS:
         rates.setdefault(SensorSettings.model_validate({"protocol": name}).baud, []).append(name)
@@ -97,27 +97,27 @@ def _rates() -> Mapping[int, Sequence[str]]:
     return {rate: rates[rate] for rate in sorted(rates, key=lambda rate: (rate != BAUD, -rate))}
 
 
-def _prober(protocol: str) -> DeviceProtocol:
+def _probing_decoder(protocol: str) -> DeviceProtocol:
     decoder = make_protocol(SensorSettings.model_validate({"protocol": protocol}))
     decoder.probing = True
     return decoder
 
 
-def _ask_in_turns(line: "serial.Serial", decoders: Mapping[str, DeviceProtocol], patience_s: float) -> str | None:
-    """Pass received bytes to all protocols, and let one of them poll at a time.
+def _query_in_turn(line: "serial.Serial", decoders: Mapping[str, DeviceProtocol], timeout_s: float) -> str | None:
+    """Feed received bytes to all protocols, and let one of them poll at a time.
 
-    Returns the first protocol that identifies the device.
+    Return the name of the first protocol that identifies the device; None if none does in time.
 
     Raises:
         OSError: The port is lost.
     """
-    turns, next_s = itertools.cycle(decoders.values()), 0.0
-    end_s = time.monotonic() + patience_s
+    pollers, next_s = itertools.cycle(decoders.values()), 0.0
+    end_s = time.monotonic() + timeout_s
     while (now_s := time.monotonic()) < end_s:
         if now_s >= next_s:
-            questions = (decoder.next_output(now_s) for decoder in itertools.islice(turns, len(decoders)))
-            if question := next(filter(None, questions), b""):
-                line.write(question)
+            queries = (decoder.next_output(now_s) for decoder in itertools.islice(pollers, len(decoders)))
+            if query := next(filter(None, queries), b""):
+                line.write(query)
                 next_s = now_s + QUERY_INTERVAL_S
         data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
         for name, decoder in decoders.items():
@@ -133,10 +133,10 @@ def _described(decoder: DeviceProtocol) -> tuple[str, int | None]:
 
 
 class BoardClient:
-    """A board that does nothing but answer; a context manager.
+    """Client for the commands of a board on a serial port; a context manager.
 
     Args:
-        port: Device path; opened for ourselves alone.
+        port: Device path; opened exclusively.
         baud: Baud rate of the board [1/s].
 
     Raises:
@@ -144,7 +144,7 @@ class BoardClient:
     """
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
-        self._port, self._line = port, open_port(port, baud, ASK_AGAIN_S)
+        self._port, self._line = port, open_port(port, baud, RETRY_S)
         self._board, self._text = BoardProtocol(), TextProtocol()
 
     def __enter__(self) -> Self:
@@ -161,44 +161,45 @@ class BoardClient:
         Raises:
             UserError: No board answers; the message describes the device found.
         """
-        return self._ask([self._board, self._text], lambda: self._board.hello)
+        return self._wait_for([self._board, self._text], lambda: self._board.hello)
 
-    def tell(self, frame: bytes) -> Hello:
-        """Give a command that may be given twice. Returns the hello after it.
+    def send(self, frame: bytes) -> Hello:
+        """Send a command, repeatedly if necessary; return the hello after it.
 
         Raises:
-            UserError: The board refuses, or does not answer.
+            UserError: The board rejects the command, or does not answer.
         """
-        command = self._board.tell(frame)
-        self._ask([self._board, self._text], lambda: command.done or None)
+        command = self._board.send(frame)
+        self._wait_for([self._board, self._text], lambda: command.done or None)
         if command.refusal:
             raise UserError(f"{self._port}: {command.refusal}")
         return self.hello()
 
     def reference_v(self) -> float:
-        """Full range of its converter by the present bandgap reading [V]; the reading at its reset may be old.
+        """Measure the full range of the board's converter against its bandgap [V].
 
-        The board samples at ``REFERENCE_RATE_HZ`` from then on.
+        The value in the hello was measured at the last reset and may be old. The sample rate of the board is changed to
+        ``REFERENCE_RATE_HZ``.
 
         Raises:
-            UserError: As ``tell``.
+            UserError: The board rejects the command, or does not answer.
         """
-        hello = self.tell(set_rate_command(REFERENCE_RATE_HZ))
-        now = BoardProtocol()
-        now.feed(0.0, replace(hello, bandgap_sum=0, bandgap_count=0).encode())
+        hello = self.send(set_rate_command(REFERENCE_RATE_HZ))
+        decoder = BoardProtocol()
+        decoder.feed(0.0, replace(hello, bandgap_sum=0, bandgap_count=0).encode())
 
         def measured() -> float | None:
-            return now.reference_v if now.counters["frames_received"] >= REFERENCE_SAMPLES else None
+            return decoder.reference_v if decoder.counters["frames_received"] >= REFERENCE_SAMPLES else None
 
-        return self._ask([now], measured, REFERENCE_S)
+        return self._wait_for([decoder], measured, REFERENCE_TIMEOUT_S)
 
-    def _ask(
-        self, decoders: Sequence[DeviceProtocol], answer: Callable[[], Answer | None], patience_s: float | None = None
+    def _wait_for(
+        self, decoders: Sequence[DeviceProtocol], answer: Callable[[], Answer | None], timeout_s: float | None = None
     ) -> Answer:
         """Wait for a response.
 
         Raises:
-            UserError: It does not exist.
+            UserError: No response arrives in time, the port is lost, or the device prints text.
         """
 
         def answer_or_text() -> Answer | None:
@@ -207,29 +208,29 @@ class BoardClient:
             return answer()
 
         try:
-            answered = _converse(self._line, decoders, answer_or_text, patience_s)
+            result = _exchange(self._line, decoders, answer_or_text, timeout_s)
         except OSError as error:
             raise UserError(f"{self._port}: lost: {error}") from None
-        if answered is None:
-            raise UserError(f"{self._port}: {_silence(decoders)}")
-        return answered
+        if result is None:
+            raise UserError(f"{self._port}: {_failure_reason(decoders)}")
+        return result
 
 
-def _converse(
+def _exchange(
     line: "serial.Serial",
     decoders: Sequence[DeviceProtocol],
     answer: Callable[[], Answer | None],
-    patience_s: float | None = None,
+    timeout_s: float | None = None,
 ) -> Answer | None:
-    """Let decoders receive and poll until there is an answer; None without one.
+    """Let decoders poll and receive until ``answer`` returns a result; None if it does not in time.
 
     Raises:
         OSError: The port is lost.
     """
-    end_s = time.monotonic() + (BOOT_TIMEOUT_S if patience_s is None else patience_s)
+    end_s = time.monotonic() + (BOOT_TIMEOUT_S if timeout_s is None else timeout_s)
     while (now_s := time.monotonic()) < end_s:
-        if (answered := answer()) is not None:
-            return answered
+        if (result := answer()) is not None:
+            return result
         for decoder in decoders:
             line.write(decoder.next_output(now_s))
         data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
@@ -238,8 +239,8 @@ def _converse(
     return answer()
 
 
-def _silence(decoders: Sequence[DeviceProtocol]) -> str:
-    """Why no protocol identifies the device."""
+def _failure_reason(decoders: Sequence[DeviceProtocol]) -> str:
+    """Return the reason why no protocol identifies the device."""
     if not decoders[0].counters["bytes_received"]:
         return "silent"
     return next((decoder.fault for decoder in decoders if decoder.fault), "no board answers")

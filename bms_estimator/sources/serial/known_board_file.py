@@ -1,4 +1,4 @@
-"""The board that a pack's service remembers from one start to the next: its serial number and its calibration."""
+"""File with the serial number and the calibration of a pack's board, which outlives restarts of the service."""
 
 import json
 import re
@@ -9,22 +9,22 @@ import structlog
 
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 
-REMEMBERED = ("serial", "divider", "volts_per_ampere", "bandgap_v")
-"""Stored fields of a board's hello."""
-NO_BOARD: Mapping[str, str] = dict.fromkeys(REMEMBERED, "")
-"""Content of the file once another board is to be accepted."""
+STORED_FIELDS = ("serial", "divider", "volts_per_ampere", "bandgap_v")
+"""Fields of a board's hello that are stored."""
+NO_BOARD: Mapping[str, str] = dict.fromkeys(STORED_FIELDS, "")
+"""Content of the file that makes the service accept any board as the pack's."""
 _SERIAL = re.compile(r"([0-9a-f]{8})?")
-MAX_FILE = 4096
+MAX_FILE_BYTES = 4096
 """Maximum size of the file [bytes]."""
 
 log = structlog.get_logger(__name__)
 
 
 class KnownBoardFile:
-    """``<pack.name>.board.json`` in the state folder, for its owner alone.
+    """File ``<pack.name>.board.json`` in the state folder, readable by its owner only.
 
-    A separate file, because a checkpoint belongs to one meaning of the state and restarts with another cell, while
-    the board stays the same; a person may read and delete it.
+    It is separate from the checkpoint, because a checkpoint is discarded when the cell changes, and the board stays the
+    same. A person may read and delete it.
 
     Args:
         folder: The state folder.
@@ -35,22 +35,22 @@ class KnownBoardFile:
         self.path = folder / f"{pack}.board.json"
 
     @property
-    def how_to_forget(self) -> str:
-        """The command, for people, but for the pack's settings file at its end."""
+    def accept_command(self) -> str:
+        """Command that makes the service accept another board, as text, without its last argument, the settings file."""
         return f"bms-estimator board --folder {self.path.parent} --accept"
 
     def load(self) -> Mapping[str, str]:
-        """Load the stored board; empty if it is missing or not valid, which is logged."""
+        """Load the stored board; empty if the file is missing or not valid. An invalid file is logged."""
         try:
-            return _checked(json.loads(read_private(self.path, MAX_FILE)))
+            return _checked(json.loads(read_private(self.path, MAX_FILE_BYTES)))
         except FileNotFoundError:
             return {}
         except (OSError, UnsafeFileError, ValueError, RecursionError) as error:
-            log.warning("the board of the last run is not known", file=str(self.path), reason=str(error))
+            log.warning("the stored board cannot be read", file=str(self.path), reason=str(error))
             return {}
 
-    def is_gone(self) -> bool:
-        """Return True if no file has the name.
+    def is_missing(self) -> bool:
+        """Return True if the file does not exist.
 
         Raises:
             OSError: The disk cannot be read.
@@ -62,7 +62,7 @@ class KnownBoardFile:
         return False
 
     def save(self, board: Mapping[str, str]) -> None:
-        """Write atomically. A missing folder is created.
+        """Write the file atomically; create the folder if it is missing.
 
         Raises:
             OSError: The disk cannot be written.
@@ -71,14 +71,14 @@ class KnownBoardFile:
         write_private(self.path, json.dumps(dict(board)).encode() + b"\n")
 
 
-def _checked(found: object) -> Mapping[str, str]:
-    """Check the content of a file.
+def _checked(content: object) -> Mapping[str, str]:
+    """Return the stored fields of a file's content.
 
     Raises:
-        ValueError: It is no board.
+        ValueError: The content is not a board.
     """
-    if not isinstance(found, dict) or not all(isinstance(found.get(name), str) for name in REMEMBERED):
-        raise ValueError("it tells no board")
-    if not _SERIAL.fullmatch(found["serial"]):
-        raise ValueError(f"serial {found['serial'][:20]!r} is none")
-    return {name: found[name] for name in REMEMBERED}
+    if not isinstance(content, dict) or not all(isinstance(content.get(name), str) for name in STORED_FIELDS):
+        raise ValueError("no board in it")
+    if not _SERIAL.fullmatch(content["serial"]):
+        raise ValueError(f"serial {content['serial'][:20]!r} is not valid")
+    return {name: content[name] for name in STORED_FIELDS}

@@ -1,4 +1,4 @@
-"""Serial ports: list, choice of the board's, opening, and the process that holds one."""
+"""Serial ports: list, choice of the board's port, opening, and search for the process that uses one."""
 
 import errno
 import os
@@ -12,10 +12,9 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 BY_ID = Path("/dev/serial/by-id")
-
-WRITE_S = 1.0
-"""Timeout of a write [s]; a serial line takes the longest query in a tenth of it."""
-
+"""Folder of udev's stable names of USB serial ports."""
+WRITE_TIMEOUT_S = 1.0
+"""Timeout of a write [s]. The longest query takes a tenth of this time on a serial line."""
 ANY_PRODUCT = range(0x10000)
 BRIDGE_CHIPS: Mapping[int, Collection[int]] = {
     0x0403: (0x6001, 0x6010, 0x6011, 0x6014, 0x6015),  # FTDI FT232, FT2232, FT4232, FT232H, FT231X
@@ -23,10 +22,10 @@ BRIDGE_CHIPS: Mapping[int, Collection[int]] = {
     0x10C4: (0xEA60, 0xEA70),  # Silicon Labs CP210x
     0x1A86: (0x5523, 0x7522, 0x7523, 0x55D3, 0x55D4),  # WCH CH341, CH340, CH343, CH9102
     0x2341: ANY_PRODUCT,  # Arduino, its ATmega16U2
-    0x2A03: ANY_PRODUCT,  # the other Arduino
+    0x2A03: ANY_PRODUCT,  # Arduino, second vendor id
 }
-"""USB vendor: products that ``auto`` takes."""
-NO_BOARD = re.compile(
+"""USB product ids of boards that ``auto`` selects, by vendor id."""
+RADIO_STICK = re.compile(
     r"zig-?bee|z-?wave|openthread|conbee|raspbee|sky ?connect|nabu casa|sonoff|itead|zbt-|zwa-|hubz|slzb|slae|zooz"
     r"|aeotec|cc(1352|26\d\d)|efr32",
     re.IGNORECASE,
@@ -35,14 +34,14 @@ NO_BOARD = re.compile(
 
 
 class NoPortError(Exception):
-    """The board's port cannot be found or opened; the message is the port and the reason. It may become available later."""
+    """The board's port cannot be found or opened. The message has the port and the reason; a retry may succeed."""
 
 
 class PortBusyError(NoPortError):
     """Another process has the port at ``path`` open.
 
-    Its text names the process that holds the port. The search through all processes takes milliseconds, so it runs
-    only when the text is used.
+    Its text names the process that uses the port. The search through all processes takes milliseconds, so that it runs
+    only when the text is needed.
     """
 
     def __init__(self, path: str) -> None:
@@ -50,14 +49,14 @@ class PortBusyError(NoPortError):
         self.path = path
 
     def __str__(self) -> str:
-        return f"{self.path}: held by {holder(self.path) or 'another process, or another pack of this one'}"
+        return f"{self.path}: in use by {holder(self.path) or 'another process, or another pack of this one'}"
 
 
 def stable_names() -> list[Path]:
-    """Names under /dev/serial/by-id; none where no USB serial port is there."""
+    """Return the names in /dev/serial/by-id; empty without a USB serial port."""
     try:
         return sorted(BY_ID.iterdir())
-    except OSError:  # the folder exists while there are ports
+    except OSError:  # the folder exists only while a port is connected
         return []
 
 
@@ -65,50 +64,52 @@ def resolve_port(port: str) -> str:
     """Return the device path of ``port``, which may be ``auto``.
 
     Raises:
-        NoPortError: No board is there, or with ``auto`` more than one.
+        NoPortError: The port does not exist, or ``auto`` finds no board or more than one.
     """
     if port != "auto":
-        if not os.path.exists(port):  # noqa: PTH110 - raises nothing, be the name too long
+        if not os.path.exists(port):  # noqa: PTH110 - Path.exists raises if the name is too long
             raise NoPortError(f"{port}: it does not exist")
         return port
-    found = board_ports()
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise NoPortError(f"auto: {len(found)} serial ports are there; choose one: {', '.join(found)}")
-    if there := [port for port in list_ports.comports() if port.vid is not None]:
-        others = ", ".join(f"{port.device} ({port.product or port.description})" for port in there)
-        raise NoPortError(f"auto: no port of a known board is there; if it is one of these, name it: {others}")
-    raise NoPortError("auto: no USB serial port is there")
+    candidates = board_ports()
+    if len(candidates) == 1:
+        return candidates[0]
+    if candidates:
+        raise NoPortError(f"auto: {len(candidates)} serial ports are connected; choose one: {', '.join(candidates)}")
+    if usb_ports := [port for port in list_ports.comports() if port.vid is not None]:
+        others = ", ".join(f"{port.device} ({port.product or port.description})" for port in usb_ports)
+        raise NoPortError(
+            f"auto: no port of a known board is connected; if one of these is the board, set sensor.port to it: {others}"
+        )
+    raise NoPortError("auto: no USB serial port is connected")
 
 
 def board_ports() -> list[str]:
-    """Ports that may be a board's, under their stable names where they have one."""
+    """Return the ports that may belong to a board, by their stable names if they have one."""
     names = {os.path.realpath(path): str(path) for path in stable_names()}
-    there = [port.device for port in list_ports.comports() if may_be_board(port)]
-    return sorted(names.get(os.path.realpath(device), device) for device in there)
+    usb_ports = [port.device for port in list_ports.comports() if may_be_board(port)]
+    return sorted(names.get(os.path.realpath(device), device) for device in usb_ports)
 
 
 def may_be_board(port: ListPortInfo) -> bool:
-    """Return True if a port's chip is common on boards and its description does not contradict."""
-    named = " ".join(word for word in (port.manufacturer, port.product, port.description) if word)
-    return port.pid in BRIDGE_CHIPS.get(port.vid or 0, ()) and not NO_BOARD.search(named)
+    """Return True if a port has a USB chip that is common on boards, and is not described as a radio stick."""
+    description = " ".join(word for word in (port.manufacturer, port.product, port.description) if word)
+    return port.pid in BRIDGE_CHIPS.get(port.vid or 0, ()) and not RADIO_STICK.search(description)
 
 
 def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
-    """Open a port for ourselves alone.
+    """Open a port exclusively.
 
     Args:
         path: Path of the device.
-        baud: [1/s].
+        baud: Baud rate [1/s].
         timeout_s: Timeout of a read [s].
 
     Raises:
-        PortBusyError: Another process has it open.
-        NoPortError: It cannot be opened.
+        PortBusyError: Another process has the port open.
+        NoPortError: The port cannot be opened.
     """
     try:
-        return serial.Serial(path, baud, timeout=timeout_s, write_timeout=WRITE_S, exclusive=True)
+        return serial.Serial(path, baud, timeout=timeout_s, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
     except (OSError, termios.error, ValueError, OverflowError) as error:  # a port may die while it is opened
         if isinstance(error, OSError) and error.errno in (errno.EBUSY, errno.EAGAIN):
             raise PortBusyError(path) from None
@@ -116,7 +117,7 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
 
 
 def holder(port: str) -> str | None:
-    """Return the process that has ``port`` open, as ``name (pid n)``; None if there is no other or it is not visible."""
+    """Return the other process that has ``port`` open, as ``name (pid n)``; None without a visible one."""
     device = os.path.realpath(port)
     for process in Path("/proc").glob("[0-9]*"):
         if process.name != str(os.getpid()) and _has_open(process, device):
@@ -131,5 +132,5 @@ def holder(port: str) -> str | None:
 def _has_open(process: Path, device: str) -> bool:
     try:
         return any(str(entry.readlink()) == device for entry in (process / "fd").iterdir())
-    except OSError:  # it has ended, or belongs to another user
+    except OSError:  # the process has ended, or belongs to another user
         return False

@@ -1,7 +1,4 @@
-"""A serial line: opened with pyserial, read when its descriptor has bytes, opened again when it is lost.
-
-Independent of protocols.
-"""
+"""Serial port: opened with pyserial, read by the event loop, and reopened when it is lost. It does not know protocols."""
 
 import asyncio
 import os
@@ -20,48 +17,49 @@ if TYPE_CHECKING:
     import serial
 
 READ_BYTES = 1 << 16
-
+"""Maximum size of one read [bytes]."""
 
 log = structlog.get_logger(__name__)
 
 
 class SerialPort:
-    """A port with its received and sent bytes.
+    """Serial port that queues received bytes with their arrival times.
 
-    Arrival times are the wall clock at start plus a clock that never steps since; it continues during suspend.
+    Arrival times are the wall clock at start plus the time since on a monotonic clock that includes suspend. They never
+    step.
 
     Args:
         open_next: Opens the port: returns its path, and the port.
-        say: Called with the reason why the port is not open.
+        report: Called with the reason why the port is not open.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Delay before a missing or lost port is retried [s].
 
     Attributes:
         openings: Number of times that it was opened.
-        lost: Set when the port has died, or to request its end.
+        lost: Event that is set when the port fails, or by the owner to have it closed.
     """
 
     def __init__(
         self,
         open_next: Callable[[], tuple[str, "serial.Serial"]],
         *,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
         first_retry_s: float = FIRST_RETRY_S,
     ) -> None:
-        self._open_next, self._say = open_next, say
+        self._open_next, self._report = open_next, report
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
-        self._reads: asyncio.Queue[Chunk | None] = asyncio.Queue()
+        self._chunks: asyncio.Queue[Chunk | None] = asyncio.Queue()
         self._port: serial.Serial | None = None
         self.openings = 0
         self.lost = asyncio.Event()
 
     @property
     def now_s(self) -> float:
-        """On the clock of the arrivals [s since 1970]."""
+        """Present time on the clock of the arrival times [s since 1970]."""
         return self._epoch_s + self._monotonic()
 
     @property
@@ -70,51 +68,56 @@ class SerialPort:
         return self._port is not None
 
     @property
-    def waiting(self) -> int:
+    def queued_chunks(self) -> int:
         """Number of chunks waiting to be decoded."""
-        return self._reads.qsize()
+        return self._chunks.qsize()
 
     async def open(self) -> str:
-        """Path of the port as soon as it can be opened; each attempt waits longer until one was ``confirm``."""
+        """Open the port, with retries until it succeeds, and return its path.
+
+        Each attempt waits longer than the one before, until ``confirm`` is called.
+        """
         while True:
             await asyncio.sleep(self._retry_s)
             self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), MAX_RETRY_S)
             try:
                 path, self._port = self._open_next()
-            except PortBusyError as error:  # the search for its holder takes time: samples of other packs must not wait
+            except (
+                PortBusyError
+            ) as error:  # its text needs a slow search through /proc, which must not block other packs
                 reason = await asyncio.to_thread(str, error)
             except (NoPortError, OSError) as error:
                 reason = str(error)
             else:
                 break
-            self._say(f"waiting for {reason}")
+            self._report(f"waiting for {reason}")
         self.openings += 1
         self.lost.clear()
-        self._reads.put_nowait((self.now_s, b""))
+        self._chunks.put_nowait((self.now_s, b""))
         asyncio.get_running_loop().add_reader(self._port.fileno(), self._read, self._port.fileno())
         return path
 
     def confirm(self) -> None:
-        """Mark the device on the line as the wanted one: when it is lost, search for it at once."""
+        """Confirm that the device on the port is the wanted one. If it is lost, the first retry has the minimum delay."""
         self._retry_s = self._first_retry_s
 
     def close(self) -> None:
-        """Close the port; it may be opened again."""
+        """Close the port, which may be reopened."""
         if self._port is not None:
             asyncio.get_running_loop().remove_reader(self._port.fileno())
             self._port.close()
             self._port = None
 
     def finish(self) -> None:
-        """Let the reader come to an end."""
-        self._reads.put_nowait(None)
+        """Make ``read`` return None after the queued chunks."""
+        self._chunks.put_nowait(None)
 
     async def read(self) -> Chunk | None:
-        """Return the next chunk; an empty chunk after the port was opened, None at the end."""
-        return await self._reads.get()
+        """Return the next chunk: an empty one after each opening of the port, and None at the end."""
+        return await self._chunks.get()
 
     def send(self, data: bytes) -> None:
-        """Write. What a dying port does not take is lost."""
+        """Write bytes. They are lost if the port is closed or fails."""
         if self._port is None or not data:
             return
         try:
@@ -135,4 +138,4 @@ class SerialPort:
             asyncio.get_running_loop().remove_reader(descriptor)
             self.lost.set()
             return
-        self._reads.put_nowait((arrival_s, data))
+        self._chunks.put_nowait((arrival_s, data))

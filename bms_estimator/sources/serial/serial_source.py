@@ -1,4 +1,4 @@
-"""The board on a serial port: link and decoder of any protocol."""
+"""Source of samples from a device on a serial port, with any device protocol."""
 
 import asyncio
 import contextlib
@@ -28,34 +28,34 @@ from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
 if TYPE_CHECKING:
     import serial
 
-TALK_S = 0.25
-"""Interval at which due bytes are sent [s]."""
-TALKS = 4
-"""Number of these intervals between two checks for samples."""
+SEND_INTERVAL_S = 0.25
+"""Interval at which pending commands and queries are sent [s]."""
+SENDS_PER_CHECK = 4
+"""Number of send intervals between two checks for samples."""
 SILENT_S = 3.0
-"""Time without a frame that counts as a fault of the line [s]."""
+"""Minimum time without a frame after which the line counts as silent [s]."""
 SILENT_PERIODS = 3.0
-"""Number of sample periods without a frame that counts as a fault, for slower devices."""
-ANSWER_S = 4.0
-"""A board measures for a second before it answers a command [s]."""
+"""Number of sample periods without a frame after which a device with a period above 1 s counts as silent."""
+COMMAND_TIMEOUT_S = 4.0
+"""Timeout of a command [s]. A board may measure for a second before it answers."""
 
 log = structlog.get_logger(__name__)
 
 
 class SerialSource:
-    """Async source of SAMPLE blocks from a board.
+    """Source of sample blocks from a device on a serial port.
 
-    All that makes a sample passes ``decoder.feed(arrival_s, data)``: a capture of these calls replays to the same bits.
-    It stays with the pack's board, and searches other ports for it (``BoardCheck``, ``PortDiscovery``).
+    The samples depend only on the calls of ``decoder.feed(arrival_s, data)``. A capture of these calls therefore replays
+    bit-identically. ``BoardCheck`` rejects other boards, and ``PortDiscovery`` searches other ports for the pack's board.
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
-        memory: Stores the pack's board, if it has a serial number; None: it is known for this run only.
-        tap: Gets the same (arrival time, bytes) as the decoder.
+        memory: File of the pack's board, if it has a serial number; None: the board is not stored.
+        tap: Receives a copy of each arrival time and chunk that the decoder is fed.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Delay before a missing or lost port is retried [s].
-        silent_s: Time without a frame that counts as a fault of the line [s].
+        silent_s: Time without a frame after which the line counts as silent [s].
     """
 
     def __init__(
@@ -73,38 +73,38 @@ class SerialSource:
         slow_s = settings.period_s or 0.0
         self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
         self._monotonic = monotonic
-        make_protocol(settings).feed(0.0, b"\0\n")  # loads its kernel, so that nothing compiles once bytes arrive
+        make_protocol(settings).feed(0.0, b"\0\n")  # compiles its kernel before bytes arrive
         self._decoder = make_protocol(settings)
-        tells_serial = settings.protocol == "binary"  # boards that print text cannot be distinguished
-        self._door = BoardCheck(
-            lambda: make_protocol(settings), settings.serial or "", memory if tells_serial else None
+        has_serial_number = settings.protocol == "binary"  # other devices report no serial number
+        self._board_check = BoardCheck(
+            lambda: make_protocol(settings), settings.serial or "", memory if has_serial_number else None
         )
-        self._where = PortDiscovery(settings.port, monotonic)
-        self._line = SerialPort(
+        self._discovery = PortDiscovery(settings.port, monotonic)
+        self._port = SerialPort(
             self._open_next,
-            say=self._report,
+            report=self._report,
             wall=wall,
             monotonic=monotonic,
             first_retry_s=first_retry_s,
         )
         self._message: str | None = "not opened yet"
-        self._openings = 0  # of the line, as far as its reads have been taken
-        self._refused = False  # the message gives the reason why the device is rejected
+        self._openings = 0  # number of openings of the port whose chunks have been read
+        self._rejected = False  # True while the message is the reason why the device was rejected
         self._path = ""  # of the port that is open
-        self._tended_s = monotonic()  # when the task last turned
-        self._arrived_s = math.nan  # of the last block's bytes, on the line's clock
+        self._last_check_s = monotonic()  # last iteration of the task
+        self._block_arrival_s = math.nan  # arrival time of the last block's bytes
         self._faults = FaultLog()
         self._decoded = asyncio.Event()
-        self._asking = asyncio.Lock()
+        self._command_lock = asyncio.Lock()
         self._task: asyncio.Task[None] | None = None
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Counters of the decoder, ``unadmitted_bytes`` of the board check, ``reconnects``, and ``missed_reads`` of a tap."""
+        """Counters of the decoder, the board check and the tap, and the number of ``reconnects``."""
         counters = {
             **self._decoder.counters,
-            "unadmitted_bytes": self._door.unadmitted_bytes,
-            "reconnects": max(self._line.openings - 1, 0),
+            "unadmitted_bytes": self._board_check.unadmitted_bytes,
+            "reconnects": max(self._port.openings - 1, 0),
         }
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
 
@@ -115,28 +115,30 @@ class SerialSource:
 
     @property
     def board(self) -> Mapping[str, str]:
-        """Hello of the board."""
+        """Properties from the board's hello; empty without one."""
         return self._decoder.board
 
     @property
     def cells(self) -> CellBlock:
-        """Beside the samples of the last block."""
+        """Cell voltages of the last block [V]."""
         return self._decoder.cells
 
     @property
     def clock_ppm(self) -> float | None:
-        """Rate of the board's clock over the monotonic one [1e-6]."""
+        """Rate error of the board's clock relative to the host's [1e-6]; None if unknown."""
         return self._decoder.clock_ppm
 
     def pulse(self) -> SourceHealth:
-        """Health of line and task."""
-        now_s = self._line.now_s
-        return SourceHealth(self._monotonic() - self._tended_s, now_s - self._arrived_s, self._line.waiting)
+        """Return the health of the port and its task."""
+        now_s = self._port.now_s
+        return SourceHealth(
+            self._monotonic() - self._last_check_s, now_s - self._block_arrival_s, self._port.queued_chunks
+        )
 
     async def __aenter__(self) -> Self:
-        """Begin to open the port; it need not be there yet."""
+        """Start the task that opens the port, which may not exist yet."""
         self._task = asyncio.create_task(self._stay_open(), name="serial board")
-        self._task.add_done_callback(lambda _: self._line.finish())
+        self._task.add_done_callback(lambda _: self._port.finish())
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -146,51 +148,51 @@ class SerialSource:
             await asyncio.gather(self._task, return_exceptions=True)
 
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:
-        """Blocks as the descriptor brings them.
+        """Yield blocks as bytes arrive.
 
-        The tap receives the chunks of yielded blocks, so nothing is recorded that the caller has not taken.
+        A chunk goes to the tap when its block is requested, so that nothing is recorded that the caller has not received.
         """
-        while (read := await self._line.read()) is not None:
-            for arrival_s, data in self._admit(read):
+        while (chunk := await self._port.read()) is not None:
+            for arrival_s, data in self._accepted_chunks(chunk):
                 block = self._decode(arrival_s, data)
                 if block.size:
-                    self._arrived_s = arrival_s
+                    self._block_arrival_s = arrival_s
                     if self._message is not None:
-                        self._message, self._refused = None, False
-                        self._line.confirm()
+                        self._message, self._rejected = None, False
+                        self._port.confirm()
                     yield block
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 
-    def _admit(self, read: Chunk) -> Sequence[Chunk]:
+    def _accepted_chunks(self, chunk: Chunk) -> Sequence[Chunk]:
         """Return the chunks to decode now."""
-        if not read[1]:
+        if not chunk[1]:
             self._openings += 1
             self._decoder.on_port_opened()
-            self._door.opened()
+            self._board_check.on_port_opened()
             return ()
         try:
-            return self._door.accept(read, self._decoder)
+            return self._board_check.accept(chunk, self._decoder)
         except OtherBoardError as error:
-            self._leave(f"{self._path}: refused: {error}")
+            self._reject_device(f"{self._path}: refused: {error}")
             return ()
 
-    def _leave(self, message: str) -> None:
+    def _reject_device(self, message: str) -> None:
         """Reject the device on the port and search elsewhere."""
         self._report(message)
-        self._refused = True
-        self._where.skip_port(self._path, WRONG_PORT_RETRY_S)
-        self._line.lost.set()
+        self._rejected = True
+        self._discovery.skip_port(self._path, WRONG_PORT_RETRY_S)
+        self._port.lost.set()
 
     @property
-    def _listener(self) -> DeviceProtocol:
-        """Return the decoder of the device that was received last."""
-        return self._door.pending_protocol or self._decoder
+    def _current_decoder(self) -> DeviceProtocol:
+        """Decoder of the device whose bytes arrived last, which may still be pending."""
+        return self._board_check.pending_protocol or self._decoder
 
     def _send_due(self) -> None:
-        """Send pending commands to the last device, if it is the one on the port now."""
-        if self._openings == self._line.openings and not self._line.lost.is_set():
-            self._line.send(self._listener.next_output(self._line.now_s))
+        """Send the decoder's output, unless chunks from before the last opening of the port are still queued."""
+        if self._openings == self._port.openings and not self._port.lost.is_set():
+            self._port.send(self._current_decoder.next_output(self._port.now_s))
 
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         if self._tap is not None:
@@ -200,120 +202,120 @@ class SerialSource:
         return block
 
     async def current_zero(self) -> None:
-        """Let the board take the present current as zero permanently: disconnect the load first.
+        """Make the board store the present current as zero. The load must be disconnected.
 
-        Samples after it are decoded with the new zero. The blocks must be iterated over meanwhile.
+        Later samples are decoded with the new zero. Another task must iterate over the blocks meanwhile.
 
         Raises:
-            UserError: The board is not connected, takes no commands, does not answer, or refuses.
+            UserError: The board is not connected, has no such command, does not answer, or rejects the command.
         """
-        await self._ask(lambda: self._decoder.command("current_zero"))
+        await self._run_command(lambda: self._decoder.command("current_zero"))
 
     async def relay(self, relay: Relay) -> None:
-        """Have the board set its relay pin; the blocks must be iterated over meanwhile.
+        """Make the board set its relay pin. Another task must iterate over the blocks meanwhile.
 
         Raises:
-            UserError: As ``current_zero``.
+            UserError: The board is not connected, has no relay, does not answer, or rejects the command.
         """
-        await self._ask(lambda: self._decoder.relay(relay))
+        await self._run_command(lambda: self._decoder.relay(relay))
 
-    async def _ask(self, ask: Callable[[], Command]) -> None:
-        """Have a command given, after those before it, and wait for its answer.
+    async def _run_command(self, start: Callable[[], Command]) -> None:
+        """Start a command when earlier ones have ended, and wait for its answer.
 
         Raises:
-            UserError: As ``current_zero``.
+            UserError: The board is not connected, does not answer, or rejects the command.
         """
-        async with self._asking:
-            await self._answer(ask())
+        async with self._command_lock:
+            await self._wait_for_answer(start())
 
-    async def _answer(self, command: Command) -> None:
-        """Wait for the answer to a command.
+    async def _wait_for_answer(self, command: Command) -> None:
+        """Send a command and wait for its answer.
 
         Raises:
-            UserError: As ``current_zero``.
+            UserError: The board is not connected, does not answer, or rejects the command.
         """
         try:
-            if not self._line.is_open:
+            if not self._port.is_open:
                 raise UserError(f"the board is not connected: {self._message}")
             self._send_due()
-            async with asyncio.timeout(ANSWER_S):
+            async with asyncio.timeout(COMMAND_TIMEOUT_S):
                 while not command.done:
                     self._decoded.clear()
                     await self._decoded.wait()
         except TimeoutError:
-            raise UserError(f"the board has not answered within {ANSWER_S:.0f} s") from None
+            raise UserError(f"the board has not answered within {COMMAND_TIMEOUT_S:.0f} s") from None
         finally:
             command.done = True
         if command.refusal:
             raise UserError(command.refusal)
 
     def _open_next(self) -> tuple[str, "serial.Serial"]:
-        """Open the port on which the board may be.
+        """Open the next candidate port.
 
         Raises:
-            NoPortError: No such port, or it cannot be opened.
+            NoPortError: There is no candidate, or it cannot be opened.
         """
-        path = self._where.next(self._door.serial)
+        path = self._discovery.next(self._board_check.serial)
         try:
             return path, open_port(path, self._settings.baud)
         except NoPortError:
-            self._where.skip_port(path, BUSY_PORT_RETRY_S)
+            self._discovery.skip_port(path, BUSY_PORT_RETRY_S)
             raise
 
     async def _stay_open(self) -> None:
-        """Open, attend until lost, and again."""
+        """Keep the port open: open it, supervise it until it is lost, and repeat."""
         while True:
-            if self._refused:
-                self._door.reload_known_board()
-            path = self._path = await self._line.open()
+            if self._rejected:
+                self._board_check.reload_known_board()
+            path = self._path = await self._port.open()
             try:
-                await self._attend(path)
+                await self._supervise(path)
             finally:
-                self._line.close()
-            if not self._refused:
-                self._report(f"{path}: lost, opening it again")
+                self._port.close()
+            if not self._rejected:
+                self._report(f"{path}: lost, reopening it")
 
-    async def _attend(self, path: str) -> None:
-        """Watch the line until it is lost."""
-        if not self._refused:
+    async def _supervise(self, path: str) -> None:
+        """Report silence and faults until the port is lost."""
+        if not self._rejected:
             self._message = f"{path}: open, no frame yet"
             log.info("port opened", port=path, baud=self._settings.baud)
-        heard_s, frames = self._monotonic(), self._decoder.counters["frames_received"]
-        while not self._line.lost.is_set():
-            await self._talk()
+        last_frame_s, frames = self._monotonic(), self._decoder.counters["frames_received"]
+        while not self._port.lost.is_set():
+            await self._send_until_check()
             now_s = self._monotonic()
             counters = self._decoder.counters
             if counters["frames_received"] != frames:
-                heard_s, frames = now_s, counters["frames_received"]
-                self._door.remember_board(self.board, now_s)
-            elif self._refused:
+                last_frame_s, frames = now_s, counters["frames_received"]
+                self._board_check.remember_board(self.board, now_s)
+            elif self._rejected:
                 continue
-            elif fault := self._listener.fault:
-                self._report_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
-            elif now_s - heard_s >= max(self._silent_s, self._listener.allowed_silence_s):
-                self._report_or_leave(f"{path}: open, but silent")
+            elif fault := self._current_decoder.fault:
+                self._report_or_reject(f"{path} at {self._settings.baud} baud: {fault}")
+            elif now_s - last_frame_s >= max(self._silent_s, self._current_decoder.allowed_silence_s):
+                self._report_or_reject(f"{path}: open, but silent")
             self._faults.check(counters, now_s)
 
-    def _report_or_leave(self, message: str) -> None:
-        """Report why no samples arrive, and try other ports if the board may be elsewhere."""
-        if self._where.is_preferred:
+    def _report_or_reject(self, message: str) -> None:
+        """Report why no samples arrive. On a port that is not the preferred one, try other ports."""
+        if self._discovery.is_preferred:
             self._report(message)
         else:
-            self._leave(message)
+            self._reject_device(message)
 
-    async def _talk(self) -> None:
-        """Send due commands until the next check, or until the link is lost."""
-        for _ in range(TALKS):
-            self._tended_s = self._monotonic()
+    async def _send_until_check(self) -> None:
+        """Send due bytes until the next check, or until the port is lost."""
+        for _ in range(SENDS_PER_CHECK):
+            self._last_check_s = self._monotonic()
             self._send_due()
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(TALK_S):
-                    await self._line.lost.wait()
+                async with asyncio.timeout(SEND_INTERVAL_S):
+                    await self._port.lost.wait()
                     return
 
     def _report(self, message: str) -> None:
-        """Report why no samples arrive, once for each reason."""
-        self._tended_s = self._monotonic()
+        """Set the message; log it if it is new."""
+        self._last_check_s = self._monotonic()
         if message != self._message:
             log.warning("no samples", reason=message)
-        self._message, self._refused = message, False
+        self._message, self._rejected = message, False

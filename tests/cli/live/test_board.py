@@ -42,7 +42,7 @@ def virtual(**options):
 def patient(monkeypatch):
     """For boards that answer."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
-    monkeypatch.setattr(device_detection, "REFERENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "REFERENCE_TIMEOUT_S", LONG_S)
 
 
 @pytest.fixture
@@ -123,9 +123,9 @@ def test_a_port_that_is_not_there(capsys, tmp_path, monkeypatch):
     path = tmp_path / "none"
     assert board(capsys, str(path)) == (2, "", f"error: {path}: it does not exist\n")
     monkeypatch.setattr(list_ports, "comports", list)
-    assert board(capsys) == (2, "", "error: auto: no USB serial port is there\n")
+    assert board(capsys) == (2, "", "error: auto: no USB serial port is connected\n")
     monkeypatch.setattr(list_ports, "comports", lambda: [usb_port("/dev/a"), usb_port("/dev/b")])
-    assert board(capsys) == (2, "", "error: auto: 2 serial ports are there; choose one: /dev/a, /dev/b\n")
+    assert board(capsys) == (2, "", "error: auto: 2 serial ports are connected; choose one: /dev/a, /dev/b\n")
 
 
 def test_a_port_that_is_none(capsys, tmp_path):

@@ -30,7 +30,7 @@ from bms_estimator.protocols.base.reading import Reading, read_line
         b' {"name": "pack", "pack_voltage": 13.3, "current_mA": 2e3, "ok": true, "t": 17}\r',
     ],
 )
-def test_volts_and_amperes_in_whatever_form(line: bytes) -> None:
+def test_formats_of_voltage_and_current(line: bytes) -> None:
     reading = read_line(line)
     assert reading is not None
     assert reading[:2] == pytest.approx((13.3, 2.0))
@@ -41,7 +41,7 @@ def test_volts_and_amperes_in_whatever_form(line: bytes) -> None:
 @pytest.mark.parametrize(
     "line", [b"6.6,-2,25.5", b"6,6;-2;25,5", b"V=6.6 I=-2 T=25.5C", b'{"volts": 6.6, "amps": -2, "temperature": 25.5}']
 )
-def test_degrees_where_there_are_any(line: bytes) -> None:
+def test_formats_with_temperature(line: bytes) -> None:
     assert read_line(line) == Reading(6.6, -2.0, 25.5)
 
 
@@ -87,18 +87,18 @@ def test_the_voltages_of_single_cells(line: bytes) -> None:
         b'{"voltage": 1e999, "current": 2}',
     ],
 )
-def test_what_does_not_tell_both_says_nothing(line: bytes) -> None:
+def test_line_without_voltage_or_current_is_no_reading(line: bytes) -> None:
     assert read_line(line) is None
 
 
 @pytest.mark.parametrize("line", [b"13.3,2.0,nan", b"13.3 2.0 NaN", b"13.3;2.0;-inf", b"13.3,2.0,ovf"])
-def test_a_word_for_no_temperature_is_none(line: bytes) -> None:
+def test_word_for_a_missing_temperature_is_nan(line: bytes) -> None:
     reading = read_line(line)
     assert reading is not None
     assert math.isnan(reading.temperature_c)
 
 
-def test_half_a_list_of_cells_is_none() -> None:
+def test_incomplete_list_of_cells_is_no_reading() -> None:
     assert read_line(b"V=6.6 I=2 cells=3.31,3_2") == Reading(6.6, 2.0)
 
 
@@ -129,7 +129,7 @@ fragments = st.sampled_from(
 
 
 @given(st.binary(max_size=300) | st.lists(fragments, max_size=40).map(b"".join))
-def test_no_bytes_make_it_raise_or_tell_of_what_is_not_finite(line: bytes) -> None:
+def test_no_bytes_raise_or_give_infinite_values(line: bytes) -> None:
     reading = read_line(line)
     if reading is not None:
         assert all(map(math.isfinite, (reading.voltage_v, reading.current_a, *reading.cells_v)))

@@ -10,9 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
-from bms_estimator.protocols.base.polled_protocol import GAP_S, PACE_S, UNANSWERED_ROUNDS, PolledProtocol
+from bms_estimator.protocols.base.polled_protocol import (
+    MAX_UNANSWERED_CYCLES,
+    POLL_CYCLE_S,
+    QUERY_INTERVAL_S,
+    PolledProtocol,
+)
 from bms_estimator.protocols.devices import daly, jbd, jk
-from bms_estimator.protocols.devices.daly import sealed
+from bms_estimator.protocols.devices.daly import with_checksum
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from tests.protocols import bms_frames as frames
@@ -59,7 +64,7 @@ def faults(decoder: PolledProtocol) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("published", PUBLISHED.values(), ids=list(PUBLISHED))
-def test_a_published_answer_is_read_as_its_publisher_reads_it(published: Published) -> None:
+def test_published_response_is_decoded_as_by_its_publisher(published: Published) -> None:
     device = decoder(published.protocol)
     (sample,), cells = fed(device, published.frames)
     assert sample["voltage_v"] == published.voltage_v
@@ -73,7 +78,9 @@ def test_a_published_answer_is_read_as_its_publisher_reads_it(published: Publish
 
 @settings(max_examples=200)
 @given(st.sampled_from(PROTOCOLS), streams, st.lists(st.integers(0, 3000), max_size=8))
-def test_no_bytes_make_it_raise_and_cutting_them_changes_no_value(protocol: str, data: bytes, cuts: list[int]) -> None:
+def test_no_bytes_raise_and_the_division_into_reads_changes_no_value(
+    protocol: str, data: bytes, cuts: list[int]
+) -> None:
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     whole, cut = decoder(protocol), decoder(protocol)
     block, cells = fed(whole, data)
@@ -102,7 +109,7 @@ def test_an_answer_with_one_wrong_byte_is_no_sample_and_the_next_one_is(name: st
         assert device.fault is None
 
 
-def test_a_wrong_checksum_is_counted_and_said() -> None:
+def test_wrong_checksum_is_counted_and_reported() -> None:
     device = decoder("jbd")
     fed(device, frames.JBD_BASIC[:-3] + b"\0\0\x77")
     assert device.counters["crc_errors"] == 1
@@ -112,7 +119,7 @@ def test_a_wrong_checksum_is_counted_and_said() -> None:
 
 
 @pytest.mark.parametrize("name", A_ROUND)
-def test_of_an_answer_that_broke_off_nothing_is_left_when_the_next_one_comes(name: str) -> None:
+def test_truncated_response_is_dropped_when_the_next_one_arrives(name: str) -> None:
     good = A_ROUND[name]
     device = decoder(OF[name])
     assert fed(device, good[: len(good) - 20])[0].size == 0
@@ -122,7 +129,7 @@ def test_of_an_answer_that_broke_off_nothing_is_left_when_the_next_one_comes(nam
     assert device.counters["noise_bytes"] > 0
 
 
-def test_an_answer_that_claims_to_be_longer_than_any_holds_up_nothing() -> None:
+def test_response_with_an_invalid_length_blocks_nothing() -> None:
     for protocol, long in (
         ("jbd", b"\xdd\x03\x00\xff"),
         ("daly", b"\xa5\x01\x90\x09"),
@@ -131,7 +138,7 @@ def test_an_answer_that_claims_to_be_longer_than_any_holds_up_nothing() -> None:
         device = decoder(protocol)
         fed(device, long)
         assert device.counters["length_errors"] == 1
-        assert "impossible lengths" in (device.fault or "")
+        assert "invalid lengths" in (device.fault or "")
         assert fed(device, PUBLISHED[protocol if protocol != "jk" else "jk_old"].frames)[0].size == 1
 
 
@@ -144,14 +151,14 @@ def test_noise_between_answers_is_skipped_and_counted(name: str) -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_bytes_of_another_device_are_said_to_be_that(protocol: str) -> None:
+def test_bytes_of_another_device_are_reported(protocol: str) -> None:
     device = decoder(protocol)
     fed(device, 20 * b"V=13.2 I=4.1\r\n")
     assert "wrong baud rate, or another sensor.protocol?" in (device.fault or "")
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_its_own_questions_come_back_on_some_adapters_and_are_no_answers(protocol: str) -> None:
+def test_echoed_requests_are_no_responses(protocol: str) -> None:
     device = decoder(protocol)
     for tick in range(100):
         block = device.feed(0.1 * tick, device.next_output(0.1 * tick))
@@ -160,18 +167,18 @@ def test_its_own_questions_come_back_on_some_adapters_and_are_no_answers(protoco
     assert device.counters["crc_errors"] == 0
 
 
-def test_cells_whose_answer_did_not_come_stand_beside_no_later_sample() -> None:
+def test_old_cells_are_not_attached() -> None:
     device = decoder("jbd")
     assert fed(device, frames.JBD_CELLS, frames.JBD_BASIC)[1] == [frames.JBD.cells_v]
     device.feed(10.0, frames.JBD_BASIC)
     assert device.cells is NO_CELLS or np.isnan(device.cells).all()
 
 
-def test_jbd_refuses_and_says_so() -> None:
+def test_request_rejected_by_jbd_is_reported() -> None:
     device = decoder("jbd")
     fed(device, bytes((0xDD, 0x03, 0x80, 0)) + jbd.checksum(b"\x80\0") + b"\x77")
     assert device.counters["refused"] == 1
-    assert "refuses to tell register 0x03" in (device.fault or "")
+    assert "rejects a request of register 0x03" in (device.fault or "")
 
 
 def test_jbd_without_a_probe_has_no_temperature() -> None:
@@ -180,7 +187,7 @@ def test_jbd_without_a_probe_has_no_temperature() -> None:
     assert sample["voltage_v"] == 0.0
 
 
-def test_daly_loses_three_cells_with_a_frame_and_keeps_the_others_in_their_places() -> None:
+def test_lost_daly_frame_loses_only_its_three_cells() -> None:
     device = decoder("daly")
     lost = frames.DALY_CELLS[:13] + frames.DALY_CELLS[26:]
     device.feed(1.0, frames.DALY_STATUS + lost + frames.DALY_PACK)
@@ -191,14 +198,14 @@ def test_daly_loses_three_cells_with_a_frame_and_keeps_the_others_in_their_place
 def test_daly_that_numbers_its_frames_from_zero_is_understood() -> None:
     device = decoder("daly")
     cells = b"".join(
-        sealed(frames.DALY_CELLS[i : i + 4] + bytes((i // 13,)) + frames.DALY_CELLS[i + 5 : i + 12])
+        with_checksum(frames.DALY_CELLS[i : i + 4] + bytes((i // 13,)) + frames.DALY_CELLS[i + 5 : i + 12])
         for i in range(0, len(frames.DALY_CELLS), 13)
     )
     _, told = fed(device, frames.DALY_STATUS + cells + frames.DALY_PACK)
     assert told == [frames.DALY.cells_v]
 
 
-def test_daly_that_does_not_tell_how_many_cells_it_has_tells_them_all_the_same() -> None:
+def test_daly_without_cell_count_reports_its_cells() -> None:
     assert fed(decoder("daly"), frames.DALY_CELLS + frames.DALY_PACK)[1] == [frames.DALY.cells_v]
 
 
@@ -207,19 +214,19 @@ def test_daly_that_does_not_tell_how_many_cells_it_has_tells_them_all_the_same()
     [(1, 0x07D0, 20.0), (1, 0x87D0, -20.0), (0, 11000, 10.0), (0, 9500, -5.0)],
     ids=["discharge of 20 A", "charge of 20 A", "version 0, discharge of 10 A", "version 0, charge of 5 A"],
 )
-def test_the_older_jk_tells_its_current_in_two_ways(version: int, raw: int, current_a: float) -> None:
+def test_older_jk_current_encodings(version: int, raw: int, current_a: float) -> None:
     """The four examples of JK's document."""
     frame = frames.JK_OLD.frames[:-4].replace(b"\x84\x80\xd0", b"\x84" + raw.to_bytes(2, "big"))
     frame = frame.replace(b"\xc0\x01", bytes((0xC0, version)))
-    (sample,), _ = fed(decoder("jk"), jk.old_sealed(frame))
+    (sample,), _ = fed(decoder("jk"), jk.with_old_checksum(frame))
     assert sample["current_a"] == current_a
 
 
-def test_the_older_jk_tells_temperatures_below_zero_above_a_hundred() -> None:
+def test_older_jk_encodes_negative_temperatures_above_100() -> None:
     frame = (
         frames.JK_OLD.frames[:-4].replace(b"\x81\x00\x1e", b"\x81\x00\x69").replace(b"\x82\x00\x1c", b"\x82\x00\x8c")
     )
-    (sample,), _ = fed(decoder("jk"), jk.old_sealed(frame))
+    (sample,), _ = fed(decoder("jk"), jk.with_old_checksum(frame))
     assert sample["temperature_c"] == -5.0  # the other probe is not there
 
 
@@ -239,7 +246,7 @@ def test_the_newer_jk_is_positive_on_charge() -> None:
     assert sample["current_a"] == 9.241
 
 
-def test_of_several_packs_on_a_line_the_first_or_the_one_that_was_told_is_taken() -> None:
+def test_first_or_configured_pack_of_a_line_is_used() -> None:
     two = newer(0, millivolts=51_000) + newer(2, millivolts=52_000)
     first, told = decoder("jk"), decoder("jk", address=2)
     assert fed(first, two, two)[0]["voltage_v"].tolist() == [51.0, 51.0]
@@ -247,7 +254,7 @@ def test_of_several_packs_on_a_line_the_first_or_the_one_that_was_told_is_taken(
     assert first.counters["other_packs"] == told.counters["other_packs"] == 2
     only = decoder("jk", address=5)
     fed(only, two)
-    assert only.fault == "pack 0 answers, and pack 5 is wanted: see sensor.address"
+    assert only.fault == "pack 0 responds, but pack 5 is selected: see sensor.address"
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -262,7 +269,7 @@ def test_the_sign_of_the_current_is_as_the_settings_say(protocol: str) -> None:
 
 
 @pytest.mark.parametrize(("protocol", "baud"), [("jbd", 9600), ("daly", 9600), ("jk", 115_200), ("binary", 500_000)])
-def test_the_baud_rate_is_the_protocols_unless_it_is_told(protocol: str, baud: int) -> None:
+def test_baud_rate_is_that_of_the_protocol_unless_configured(protocol: str, baud: int) -> None:
     assert SensorSettings.model_validate({"protocol": protocol}).baud == baud
     assert SensorSettings.model_validate({"protocol": protocol, "baud": 19_200}).baud == 19_200
 
@@ -279,55 +286,55 @@ def questions(device: PolledProtocol, seconds: float, answer: bytes = b"") -> li
 
 
 @pytest.mark.parametrize("name", ["jbd", "daly", "jk_old"])
-def test_a_device_that_answers_is_asked_once_a_second_and_one_that_is_silent_again_and_again(name: str) -> None:
+def test_devices_are_polled_each_second_even_if_silent(name: str) -> None:
     asked = questions(decoder(OF[name]), 20.0, A_ROUND[name])
-    assert min(np.diff([at_s for at_s, _ in asked])) >= GAP_S
+    assert min(np.diff([at_s for at_s, _ in asked])) >= QUERY_INTERVAL_S
     assert [question for _, question in asked].count(asked[-1][1]) == 20
     assert len(questions(decoder(OF[name]), 20.0)) >= 20
 
 
-def test_what_is_known_is_not_asked_again() -> None:
+def test_known_properties_are_not_requested_again() -> None:
     asked = [question for _, question in questions(decoder("jbd"), 10.0, A_ROUND["jbd"])]
-    assert asked.count(jbd.question(jbd.NAME)) == 1
-    assert asked.count(jbd.question(jbd.BASIC)) == 10
+    assert asked.count(jbd.request(jbd.NAME)) == 1
+    assert asked.count(jbd.request(jbd.BASIC)) == 10
 
 
-def test_what_may_be_another_pack_is_asked_anew_how_many_cells_it_has() -> None:
+def test_number_of_cells_is_requested_again_after_reopening() -> None:
     device = decoder("daly")
-    status = daly.question(daly.HOSTS[0], daly.STATUS)
+    status = daly.request(daly.HOSTS[0], daly.STATUS)
     assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
     device.on_port_opened()
     assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
 
 
-def test_silence_makes_it_try_the_other_ways_of_asking() -> None:
+def test_silence_selects_the_next_query_variant() -> None:
     asked = [question for _, question in questions(decoder("jk"), 20.0)]
-    assert asked[: UNANSWERED_ROUNDS + 1] == [jk.OLD_QUESTION] * (UNANSWERED_ROUNDS + 1)
-    assert {jk.question(1), jk.question(0)} < set(asked)
+    assert asked[: MAX_UNANSWERED_CYCLES + 1] == [jk.OLD_REQUEST] * (MAX_UNANSWERED_CYCLES + 1)
+    assert {jk.request(1), jk.request(0)} < set(asked)
     assert {question for _, question in questions(decoder("jk", address=7), 20.0)} == {
-        jk.OLD_QUESTION,
-        jk.question(7),
+        jk.OLD_REQUEST,
+        jk.request(7),
     }
     assert {question[1] for _, question in questions(decoder("daly"), 20.0)} == {0x40, 0x80}
 
 
-def test_the_way_that_is_answered_is_kept_to() -> None:
+def test_answered_query_variant_is_kept() -> None:
     device = decoder("jk")
-    questions(device, (UNANSWERED_ROUNDS + 1.5) * PACE_S)
+    questions(device, (MAX_UNANSWERED_CYCLES + 1.5) * POLL_CYCLE_S)
     answered = [device.next_output(100.0 + tick) for tick in range(20) if device.feed(100.0 + tick, newer(1)).size]
-    assert set(answered) == {jk.question(1)}
+    assert set(answered) == {jk.request(1)}
 
 
-def test_who_only_probes_sends_nothing_that_another_device_could_take_for_a_change() -> None:
+def test_probing_sends_no_request_that_changes_a_device() -> None:
     for protocol in PROTOCOLS:
         device = decoder(protocol)
         device.probing = True
         for _, question in questions(device, 60.0):
             assert question[:2] in (b"\xdd\xa5", b"\xa5\x40", b"\xa5\x80", b"NW")
-            assert question[:2] != b"NW" or question == jk.OLD_QUESTION
+            assert question[:2] != b"NW" or question == jk.OLD_REQUEST
 
 
-def test_a_line_on_which_another_asks_is_only_listened_to() -> None:
+def test_line_with_another_master_is_not_polled() -> None:
     device = decoder("jk")
     device.feed(0.0, newer(0))
     asked = []
@@ -338,10 +345,10 @@ def test_a_line_on_which_another_asks_is_only_listened_to() -> None:
             assert device.feed(now_s, newer(0)).size == 1
     assert not any(asked)
     assert device.allowed_silence_s > 6.0
-    assert device.next_output(60.0) == jk.OLD_QUESTION
+    assert device.next_output(60.0) == jk.OLD_REQUEST
 
 
-def test_many_reads_at_once_are_the_same_samples_and_cells() -> None:
+def test_batch_of_reads_gives_the_same_samples_and_cells() -> None:
     for name, data in A_ROUND.items():
         reads = [data[i : i + 50] for i in range(0, len(data), 50)] * 2
         one, many = decoder(OF[name]), decoder(OF[name])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
-from bms_estimator.protocols.devices.junctek import ASK, JunctekProtocol
+from bms_estimator.protocols.devices.junctek import QUERY, JunctekProtocol
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol
 from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
 from bms_estimator.protocols.registry import make_protocol
@@ -115,7 +115,7 @@ def values(block: SampleBlock) -> list[tuple[float, float]]:
         ("pylontech", US2000_PWR, (50.682, -7.893, 13.5)),
     ],
 )
-def test_real_frames_say_what_is_known_of_them(name: str, sent: bytes, told: tuple[float, float, float]) -> None:
+def test_recorded_frames_are_decoded(name: str, sent: bytes, told: tuple[float, float, float]) -> None:
     decoder = make_protocol(SensorSettings.model_validate({"protocol": name}))
     block = decoder.feed(1.0, sent)
     assert [block[name].item() for name in ("voltage_v", "current_a", "temperature_c")] == pytest.approx(
@@ -125,19 +125,19 @@ def test_real_frames_say_what_is_known_of_them(name: str, sent: bytes, told: tup
     assert decoder.description is not None
 
 
-def test_a_shunt_wired_the_other_way_is_turned_by_the_setting() -> None:
+def test_current_sign_setting_corrects_a_reversed_shunt() -> None:
     sensor = SensorSettings.model_validate({"protocol": "vedirect", "current_sign": "discharge_positive"})
     assert make_protocol(sensor).feed(1.0, BMV_NOW)["current_a"].item() == pytest.approx(-7.625)
 
 
-def test_a_protocol_brings_its_baud_rate_sign_and_resolution_which_the_file_may_change() -> None:
+def test_defaults_of_a_protocol_can_be_overridden() -> None:
     shunt = SensorSettings.model_validate({"protocol": "vedirect"})
     assert (shunt.baud, shunt.current_sign, shunt.voltage_resolution_v) == (19_200, "charge_positive", 0.01)
     assert SensorSettings.model_validate({"protocol": "junctek", "baud": 9600}).baud == 9600
     assert SensorSettings().baud == SensorSettings(protocol="text").baud == 500_000
 
 
-def test_history_and_hex_messages_between_blocks_disturb_none() -> None:
+def test_history_and_hex_messages_between_blocks_are_ignored() -> None:
     decoder = VeDirectProtocol()
     cut_in_two = BMV_NEXT.replace(b"\r\nSOC", HEX + b"\r\nSOC")
     block = decoder.feed(1.0, BMV_NOW[9:] + BMV_HISTORY + HEX + BMV_NEXT + BMV_HISTORY + cut_in_two)
@@ -148,26 +148,26 @@ def test_history_and_hex_messages_between_blocks_disturb_none() -> None:
 @pytest.mark.parametrize(
     ("name", "good", "damaged", "counter", "said"),
     [
-        ("vedirect", BMV_NOW, BMV_NOW.replace(b"7625", b"7635"), "checksum_errors", "checksum is wrong"),
+        ("vedirect", BMV_NOW, BMV_NOW.replace(b"7625", b"7635"), "checksum_errors", "wrong checksum"),
         ("vedirect", BMV_NOW, bytes(range(128, 256)) * 20, "length_errors", "19200 baud"),
-        ("junctek", KG_CHARGING, KG_CHARGING.replace(b"5410", b"5411"), "checksum_errors", "checksum is wrong"),
+        ("junctek", KG_CHARGING, KG_CHARGING.replace(b"5410", b"5411"), "checksum_errors", "wrong checksum"),
         ("junctek", KG_CHARGING, KG_CHARGING[:30] + b"\r\n", "length_errors", "cut off"),
         ("junctek", KG_CHARGING, KG_CHARGING.replace(b"=1,", b"=2,"), "other_address", "address 2"),
         ("junctek", KG_CHARGING, b"\xff\x80\x81\n", "text_errors", "noise"),
-        ("junctek", KG_CHARGING, bytes(range(128, 256)) * 3, "length_errors", "115200 baud"),
-        ("pylontech", US2000_PWR, US2000_PWR.replace(b"50673", b"5o673"), "text_errors", "cannot be read"),
+        ("junctek", KG_CHARGING, bytes(range(128, 256)) * 3, "length_errors", "baud rate is 115200"),
+        ("pylontech", US2000_PWR, US2000_PWR.replace(b"50673", b"5o673"), "text_errors", "cannot be parsed"),
         ("pylontech", US2000_PWR, US2000_PWR[:500] + b"pylon>", "length_errors", "cut off"),
         (
             "pylontech",
             US2000_PWR,
             b"pwr\r\nUnknown command 'pwr' - try 'help'\r\npylon>",
             "text_errors",
-            "does not know",
+            "rejects the command",
         ),
-        ("pylontech", US2000_PWR, bytes(range(128, 256)) * 200, "length_errors", "115200 baud"),
+        ("pylontech", US2000_PWR, bytes(range(128, 256)) * 200, "length_errors", "baud rate is 115200"),
     ],
 )
-def test_a_damaged_frame_is_counted_and_said_until_a_good_one_comes(
+def test_damaged_frame_is_reported_until_a_valid_one(
     name: str, good: bytes, damaged: bytes, counter: str, said: str
 ) -> None:
     decoder = DIALECTS[name]()
@@ -186,7 +186,7 @@ def test_a_charger_is_no_battery_monitor() -> None:
     assert "product 0xA042 is no battery monitor" in (decoder.fault or "")
 
 
-def test_cells_of_all_batteries_stand_beside_the_stack_once_all_have_told_them() -> None:
+def test_cells_are_attached_once_all_batteries_reported_them() -> None:
     decoder = PylontechProtocol()
     decoder.feed(1.0, bat(1, US2000_CELLS) + US2000_PWR)
     assert decoder.cells.size == 0
@@ -196,7 +196,7 @@ def test_cells_of_all_batteries_stand_beside_the_stack_once_all_have_told_them()
     assert decoder.cells[0, [0, 4, 15]].tolist() == pytest.approx([3.379, 3.381, 3.378])
 
 
-def test_a_console_is_asked_for_the_stack_and_then_for_the_cells_of_each_in_turn() -> None:
+def test_console_is_polled_for_the_stack_and_each_battery_in_turn() -> None:
     decoder = PylontechProtocol()
     assert [decoder.next_output(now) for now in (0.0, 0.25)] == [b"pwr\n", b""]
     decoder.feed(0.3, US2000_PWR)
@@ -206,14 +206,14 @@ def test_a_console_is_asked_for_the_stack_and_then_for_the_cells_of_each_in_turn
     assert [decoder.next_output(now) for now in (6.0, 7.0)] == [b"", b"pwr\n"]  # no answer: again
 
 
-def test_a_junctek_is_asked_once_a_second_and_after_the_port_was_opened_anew() -> None:
+def test_junctek_is_polled_each_second_and_after_reopening() -> None:
     decoder = JunctekProtocol()
-    assert [decoder.next_output(now) for now in (0.0, 0.5, 1.0)] == [ASK, b"", ASK]
+    assert [decoder.next_output(now) for now in (0.0, 0.5, 1.0)] == [QUERY, b"", QUERY]
     decoder.on_port_opened()
-    assert decoder.next_output(1.1) == ASK
+    assert decoder.next_output(1.1) == QUERY
 
 
-def test_cells_that_a_console_has_not_told_for_long_stand_beside_no_sample() -> None:
+def test_old_cells_are_not_attached() -> None:
     decoder = PylontechProtocol()
     decoder.feed(1.0, bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + US2000_PWR)
     assert decoder.cells.shape == (1, 30)
@@ -231,7 +231,7 @@ def test_cells_that_a_console_has_not_told_for_long_stand_beside_no_sample() -> 
         ("pylontech", bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + b"\rpyl" + US2000_PWR),
     ],
 )
-def test_a_port_that_was_opened_anew_changes_no_sample_since_no_recording_tells_of_it(name: str, data: bytes) -> None:
+def test_reopening_the_port_changes_no_sample(name: str, data: bytes) -> None:
     reads = [(0.01 * n, data[n : n + 7]) for n in range(0, len(data), 7)]
     sensor = SensorSettings.model_validate({"protocol": name})
     live, replayed = make_protocol(sensor), make_protocol(sensor)
@@ -261,7 +261,7 @@ pieces = st.sampled_from(sorted(FRAMES)).flatmap(
 
 @settings(max_examples=300)
 @given(pieces)
-def test_no_bytes_make_a_dialect_raise_and_cutting_them_changes_no_value(
+def test_no_bytes_raise_and_the_division_into_reads_changes_no_value(
     case: tuple[str, bytes, list[int], list[tuple[int, int]]],
 ) -> None:
     name, data, cuts, changes = case
@@ -284,7 +284,7 @@ def test_no_bytes_make_a_dialect_raise_and_cutting_them_changes_no_value(
 
 
 @pytest.mark.parametrize(("name", "cells"), [("vedirect", 0), ("junctek", 0), ("pylontech", 15)])
-async def test_a_device_on_a_line_is_heard_and_asked_as_it_wants(name: str, cells: int) -> None:
+async def test_simulated_device_is_read_over_a_line(name: str, cells: int) -> None:
     with METERS[name](lambda _: Reading(-3.25, 49.87, 21.0), 1.0) as meter:
         sensor = SensorSettings.model_validate({"protocol": name, "port": meter.path})
         running = asyncio.create_task(meter.run())
@@ -300,7 +300,7 @@ async def test_a_device_on_a_line_is_heard_and_asked_as_it_wants(name: str, cell
         assert source.cells.sum() == pytest.approx(49.87 * source.cells.shape[0] * (cells > 0), abs=0.01 * cells)
 
 
-def test_silence_is_no_fault_of_the_dialect() -> None:
+def test_silence_is_no_protocol_fault() -> None:
     for make in DIALECTS.values():
         decoder = make()
         assert decoder.feed(1.0, b"").size == 0

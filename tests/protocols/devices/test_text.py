@@ -9,17 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
-from bms_estimator.protocols.devices.text import LINE_BYTES, TextProtocol
+from bms_estimator.protocols.devices.text import MAX_LINE_BYTES, TextProtocol
 
 lines = (
     st.binary(max_size=40)
-    | st.integers(0, 2 * LINE_BYTES).map(lambda n: n * b" " + b"3.3,0.1")
+    | st.integers(0, 2 * MAX_LINE_BYTES).map(lambda n: n * b" " + b"3.3,0.1")
     | st.tuples(st.floats(0, 60), st.floats(-9, 9)).map(lambda vi: b"%.3f,%.3f" % vi)
     | st.just(b"V=3.3 I=2 cells=3.31,3.29")
     | st.just(b'{"voltage": 3.4, "current": 1}')
 )
 streams = st.lists(lines, max_size=12).map(b"\n".join)
-cuttings = st.lists(st.integers(0, 8 * LINE_BYTES), max_size=12)
+cuttings = st.lists(st.integers(0, 8 * MAX_LINE_BYTES), max_size=12)
 
 
 def fed(data: bytes, cuts: list[int]) -> tuple[TextProtocol, SampleBlock, list[list[float]]]:
@@ -35,7 +35,7 @@ def fed(data: bytes, cuts: list[int]) -> tuple[TextProtocol, SampleBlock, list[l
 
 @settings(max_examples=300)
 @given(streams, cuttings)
-def test_no_bytes_make_it_raise_and_cutting_them_changes_no_value(data: bytes, cuts: list[int]) -> None:
+def test_no_bytes_raise_and_the_division_into_reads_changes_no_value(data: bytes, cuts: list[int]) -> None:
     decoder, whole, cells = fed(data, [])
     cut_decoder, cut, cut_cells = fed(data, cuts)
     for name in ("voltage_v", "current_a", "temperature_c"):
@@ -46,8 +46,8 @@ def test_no_bytes_make_it_raise_and_cutting_them_changes_no_value(data: bytes, c
 
 
 def test_the_end_of_a_line_that_is_too_long_is_no_line_of_its_own() -> None:
-    data = b"\n" + LINE_BYTES * b"x" + b"3.3,0.1\n3.4,0.2\n"
-    _, block, _ = fed(data, [LINE_BYTES + 1])
+    data = b"\n" + MAX_LINE_BYTES * b"x" + b"3.3,0.1\n3.4,0.2\n"
+    _, block, _ = fed(data, [MAX_LINE_BYTES + 1])
     assert block["voltage_v"].tolist() == [3.4]
 
 
@@ -60,7 +60,7 @@ def test_the_end_of_a_line_that_is_too_long_is_no_line_of_its_own() -> None:
         (200 * b"x" + b"\n", f"the first: '{60 * 'x'}'..."),
     ],
 )
-def test_the_first_line_that_says_nothing_is_shown_as_it_came(sent: bytes, shown: str) -> None:
+def test_first_invalid_line_is_reported_verbatim(sent: bytes, shown: str) -> None:
     decoder, _, _ = fed(b"half\n" + sent, [])
     assert decoder.fault is not None
     assert shown in decoder.fault
@@ -69,12 +69,12 @@ def test_the_first_line_that_says_nothing_is_shown_as_it_came(sent: bytes, shown
     assert decoder.fault is None
 
 
-def test_bytes_that_are_no_text_are_called_a_wrong_baud_rate() -> None:
-    decoder, _, _ = fed(bytes(range(128, 256)) * (LINE_BYTES // 100), [])
+def test_binary_bytes_are_reported_as_wrong_baud_rate() -> None:
+    decoder, _, _ = fed(bytes(range(128, 256)) * (MAX_LINE_BYTES // 100), [])
     assert "wrong baud rate" in (decoder.fault or "")
 
 
-def test_cells_stand_beside_their_samples() -> None:
+def test_cells_are_attached_to_their_samples() -> None:
     decoder = TextProtocol()
     block = decoder.feed(1.0, b"V=6.6 I=2 cells=3.31,3.29\n6.6,2\nV=6.6 I=2 cells=3.3\n")
     assert block.size == 3
@@ -84,7 +84,7 @@ def test_cells_stand_beside_their_samples() -> None:
     assert decoder.cells is NO_CELLS
 
 
-def test_many_reads_at_once_are_the_same_samples_and_cells() -> None:
+def test_batch_of_reads_gives_the_same_samples_and_cells() -> None:
     reads = [b"6.6,2,25\nV=6.6 I=2 T=25 ce", b"lls=3.31,3.29\n", b"6.7,2,25\n"]
     one, many = TextProtocol(), TextProtocol()
     blocks = [one.feed(float(i), read) for i, read in enumerate(reads)]

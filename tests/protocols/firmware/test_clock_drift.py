@@ -1,4 +1,4 @@
-"""The rate of the board's clock, found in the times at which its samples come."""
+"""Rate error of the board's clock from the arrival times of its samples."""
 
 import dataclasses
 import itertools
@@ -18,10 +18,10 @@ from tests.protocols.firmware.test_decoder_fuzz import HELLO
 
 START_S = 1_700_000_000.0
 FAST = 1.003
-"""The board counts so many of its seconds in one of the host's."""
+"""Seconds of the board's clock in one second of the host's."""
 TOLERANCE_PPM = 100.0
 BATCH_S = 0.016
-"""An FTDI bridge hands over what has come in so long [s]."""
+"""Interval at which an FTDI bridge delivers received bytes [s]."""
 
 Read = tuple[float, bytes]
 
@@ -56,33 +56,33 @@ def ppm(decoder: FrameDecoder | Replay) -> float:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("seconds", [90.0, 600.0, 1500.0])
-def test_a_resonator_that_runs_fast_is_found_out_whatever_held_the_samples_up(seconds: float, seed: int) -> None:
+def test_fast_clock_is_measured_despite_delays(seconds: float, seed: int) -> None:
     assert ppm(fed(reads(seconds, seed=seed))) == pytest.approx(3000.0, abs=TOLERANCE_PPM)
 
 
-def test_nothing_is_said_of_the_clock_before_a_minute_of_it() -> None:
+def test_rate_is_unknown_in_the_first_minute() -> None:
     assert fed(reads(55.0)).clock_ppm is None
     assert FrameDecoder().clock_ppm is None
 
 
-def test_samples_that_all_came_at_once_tell_nothing_of_the_clock() -> None:
+def test_rate_is_unknown_if_all_samples_arrive_together() -> None:
     decoder = FrameDecoder()
     decoder.feed(START_S, b"".join(data for _, data in reads(90.0)))
     assert decoder.clock_ppm is None
 
 
-def test_a_rate_that_no_resonator_has_is_none() -> None:
+def test_implausible_rate_is_none() -> None:
     slept = ((START_S + 0.9 * (at_s - START_S), data) for at_s, data in reads(120.0))
     assert fed(slept).clock_ppm is None
 
 
-def test_it_begins_anew_after_a_reset_of_the_board() -> None:
+def test_measurement_restarts_after_a_board_reset() -> None:
     before, later_s = reads(120.0), START_S + 300.0
     assert fed(before, reads(50.0, boot_id=2, start_s=later_s)).clock_ppm is None
     assert ppm(fed(reads(120.0), reads(120.0, boot_id=2, start_s=later_s))) == pytest.approx(3000.0, abs=TOLERANCE_PPM)
 
 
-def test_an_outage_of_the_line_spoils_nothing() -> None:
+def test_outage_does_not_change_the_rate() -> None:
     heard = (read for read in reads(300.0) if not 60.0 < read[0] - START_S < 200.0)
     assert ppm(fed(heard)) == pytest.approx(3000.0, abs=TOLERANCE_PPM)
 
@@ -108,7 +108,7 @@ def stamped(board_us: Callable[[int, int], int], seconds: int = 60) -> FrameDeco
     ],
     ids=["one ahead", "ahead from now on", "back", "at random for 3 s"],
 )
-def test_a_clock_that_jumps_is_not_believed(board_us: Callable[[int, int], int], least: int, most: int) -> None:
+def test_jump_of_the_clock_is_rejected(board_us: Callable[[int, int], int], least: int, most: int) -> None:
     """Time goes on by arrival: no charge is counted for time that was none."""
     decoder = stamped(board_us)
     last = decoder.feed(
@@ -118,7 +118,7 @@ def test_a_clock_that_jumps_is_not_believed(board_us: Callable[[int, int], int],
     assert least <= decoder.counters.clock_jumps <= most
 
 
-def test_a_clock_at_random_by_less_than_is_refused_adds_nothing_up() -> None:
+def test_clock_jitter_below_the_limit_does_not_accumulate() -> None:
     """Each step ahead is believed, each back is not: what was believed is taken back."""
     decoder = stamped(lambda i, us: us + (400_000 * (i * 7919 % 5) if 100 <= i < 500 else 0))
     last = decoder.feed(START_S + 60.1, SampleMessage(600, 60_100_000, 34_571, 21_405, 38, 225, 1, 16).encode())
@@ -126,7 +126,7 @@ def test_a_clock_at_random_by_less_than_is_refused_adds_nothing_up() -> None:
     assert last["time_s"][0] == pytest.approx(60.0, abs=2.0)
 
 
-def test_a_clock_that_is_wrong_from_a_reset_on_is_not_believed() -> None:
+def test_wrong_clock_after_a_reset_is_rejected() -> None:
     decoder = stamped(lambda _, us: us)
     decoder.feed(START_S + 70.0, dataclasses.replace(Hello.decode(unseal(HELLO)), boot_id=99).encode())
     ((time_s, *_),) = decoder.feed(
@@ -136,7 +136,7 @@ def test_a_clock_that_is_wrong_from_a_reset_on_is_not_believed() -> None:
     assert decoder.counters.clock_jumps == 1
 
 
-def test_a_clock_that_is_set_back_while_nothing_comes_is_not_believed() -> None:
+def test_clock_set_back_during_an_outage_is_rejected() -> None:
     """For 100 s nothing came, and so many samples are lost, though the board says 20 s; no hello tells whose they are."""
     decoder = FrameDecoder()
     decoder.feed(START_S, dataclasses.replace(Hello.decode(unseal(HELLO)), period_ns=100_000_000).encode())
@@ -149,7 +149,7 @@ def test_a_clock_that_is_set_back_while_nothing_comes_is_not_believed() -> None:
     assert decoder.counters.clock_jumps == 1
 
 
-def test_a_host_that_was_held_up_for_a_minute_believes_the_board() -> None:
+def test_board_clock_is_used_after_a_host_stall() -> None:
     """What waited in the buffer comes at once, then what the buffer had no room for is missing."""
     decoder = FrameDecoder()
     decoder.feed(START_S, dataclasses.replace(Hello.decode(unseal(HELLO)), period_ns=100_000_000).encode())
@@ -162,13 +162,13 @@ def test_a_host_that_was_held_up_for_a_minute_believes_the_board() -> None:
     assert last["time_s"][0] == pytest.approx(90.0)
 
 
-def test_time_stamps_stay_the_boards_own() -> None:
+def test_sample_times_are_those_of_the_board() -> None:
     decoder = FrameDecoder()
     time_s = np.concatenate([decoder.feed(*read)["time_s"] for read in reads(90.0)])
     assert np.array_equal(time_s, 1e-6 * (100_000 * np.arange(900)))
 
 
-async def test_a_replay_finds_the_same_rate_to_the_last_bit(tmp_path: Path) -> None:
+async def test_replay_gives_the_same_rate_bit_for_bit(tmp_path: Path) -> None:
     recorded = list(reads(90.0))
     with CaptureWriter(tmp_path / "line.bms", CaptureHeader()) as writer:
         for read in recorded:
@@ -179,7 +179,7 @@ async def test_a_replay_finds_the_same_rate_to_the_last_bit(tmp_path: Path) -> N
     assert ppm(replay) == ppm(fed(iter(recorded)))
 
 
-def test_nothing_of_the_clock_compiles_once_samples_come() -> None:
+def test_clock_kernels_are_compiled_before_samples_arrive() -> None:
     program = (
         "from bms_estimator.protocols.firmware.clock_drift import clock_ppm; from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder; "
         "FrameDecoder(); assert clock_ppm.signatures"

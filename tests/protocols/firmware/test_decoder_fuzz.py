@@ -1,4 +1,4 @@
-"""The decoder against arbitrary bytes, and against a slow one that shares nothing with it."""
+"""Decoder with arbitrary bytes, compared with a slow independent one."""
 
 import binascii
 import dataclasses
@@ -103,7 +103,7 @@ cuttings = st.lists(st.integers(0, 1000), max_size=12)
 
 @settings(max_examples=300)
 @given(streams, cuttings)
-def test_no_bytes_make_it_raise_and_cutting_them_changes_nothing(data: bytes, cuts: list[int]) -> None:
+def test_no_bytes_raise_and_the_division_into_reads_changes_nothing(data: bytes, cuts: list[int]) -> None:
     whole, counters = decode(data, [])
     cut, cut_counters = decode(data, cuts)
     for name in whole.dtype.names or ():  # not the padding between them
@@ -147,7 +147,7 @@ def test_a_sample_with_one_byte_changed_is_no_sample(at: int, change: int) -> No
 
 
 @pytest.mark.parametrize("field", ["current_uv_per_a", "ntc_r25_ohm", "ntc_beta_k"])
-def test_a_hello_with_a_zero_in_it_does_not_make_it_raise(field: str) -> None:
+def test_hello_with_a_zero_field_does_not_raise(field: str) -> None:
     zeroed = dataclasses.replace(Hello.decode(unseal(HELLO)), **{field: 0}).encode()
     decode(zeroed + sample(0) + NTC_SAMPLE + sample(2), [])
 

@@ -1,4 +1,4 @@
-"""The conversation with a board, without a line: what is due, when, and what an answer means."""
+"""Protocol of the board without a line: requests, retries and answers."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from bms_estimator.protocols.firmware.messages import (
     set_relay_command,
     zero_current_command,
 )
-from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardProtocol
+from bms_estimator.protocols.firmware.protocol import RETRY_S, BoardProtocol
 from tests.service.test_bad_line import HELLO, frames, sample
 
 ZERO = MessageType.COMMAND_ZERO_CURRENT
@@ -32,7 +32,7 @@ def talking(hello: Hello = HELLO, rate_hz: int = 100) -> BoardProtocol:
     return decoder
 
 
-def test_nothing_is_due_before_a_whole_frame_was_heard() -> None:
+def test_nothing_is_sent_before_a_complete_frame() -> None:
     decoder = BoardProtocol(rate_hz=100)
     assert decoder.next_output(0.0) == b""
     decoder.feed(1.0, b"\x1a\xc1\x02\x0b\x0a\x52\x7e" + sample(0).encode()[:-4])
@@ -41,15 +41,15 @@ def test_nothing_is_due_before_a_whole_frame_was_heard() -> None:
     assert decoder.next_output(2.0) == hello_command()
 
 
-def test_what_is_not_answered_is_asked_again_and_no_sooner() -> None:
+def test_unanswered_request_is_repeated_after_the_retry_interval() -> None:
     decoder = BoardProtocol(rate_hz=100)
     decoder.feed(0.0, b"\0" + sample(0).encode())
     assert decoder.next_output(0.0) == hello_command()
-    assert decoder.next_output(0.9 * ASK_AGAIN_S) == b""
-    assert decoder.next_output(1.1 * ASK_AGAIN_S) == hello_command()
+    assert decoder.next_output(0.9 * RETRY_S) == b""
+    assert decoder.next_output(1.1 * RETRY_S) == hello_command()
 
 
-def test_the_rate_is_set_where_the_board_has_another() -> None:
+def test_rate_is_set_if_the_board_has_another() -> None:
     assert talking(rate_hz=100).next_output(0.0) == b""
     decoder = talking(rate_hz=250)
     assert decoder.next_output(0.0) == set_rate_command(250) + hello_command()
@@ -57,7 +57,7 @@ def test_the_rate_is_set_where_the_board_has_another() -> None:
     assert decoder.next_output(10.0) == b""
 
 
-def test_after_the_port_was_opened_anew_the_board_has_to_be_heard_first() -> None:
+def test_nothing_is_sent_after_reopening_before_a_frame() -> None:
     decoder = talking()
     decoder.on_port_opened()
     assert decoder.next_output(1.0) == b""
@@ -79,7 +79,7 @@ def test_a_command_is_done_with_the_hello_that_follows_it() -> None:
     assert (command.done, command.refusal) == (True, None)
 
 
-def test_a_refusal_says_why() -> None:
+def test_rejected_command_has_a_reason() -> None:
     decoder = talking()
     command = decoder.command("current_zero")
     decoder.feed(1.0, Ack(ZERO, AckResult.BAD_VALUE, 0).encode())
@@ -87,7 +87,7 @@ def test_a_refusal_says_why() -> None:
     assert command.refusal == "the board refuses: bad value; is the sensor connected, and no current flowing?"
 
 
-def test_a_command_that_was_given_up_is_not_sent() -> None:
+def test_cancelled_command_is_not_sent() -> None:
     decoder = BoardProtocol()
     command = decoder.command("current_zero")
     command.done = True
@@ -95,7 +95,7 @@ def test_a_command_that_was_given_up_is_not_sent() -> None:
     assert decoder.next_output(0.0) == b""
 
 
-def test_a_command_is_not_given_to_a_board_that_comes_after_the_line_was_lost() -> None:
+def test_command_is_cancelled_when_the_line_is_lost() -> None:
     decoder = talking()
     command = decoder.command("current_zero")
     decoder.next_output(0.0)
@@ -105,7 +105,7 @@ def test_a_command_is_not_given_to_a_board_that_comes_after_the_line_was_lost() 
     assert (command.done, "the line was lost" in (command.refusal or "")) == (True, True)
 
 
-def test_another_command_there_is_not() -> None:
+def test_unknown_command_is_rejected() -> None:
     with pytest.raises(UserError, match="no command fly"):
         BoardProtocol().command("fly")
 
@@ -119,7 +119,7 @@ messages = (
 
 
 @given(st.lists(messages, max_size=20))
-def test_no_bytes_make_it_raise_whatever_was_asked(reads: list[bytes]) -> None:
+def test_no_bytes_raise(reads: list[bytes]) -> None:
     decoder = BoardProtocol(rate_hz=250)
     for at, data in enumerate(reads):
         if at % 5 == 2:
@@ -129,18 +129,18 @@ def test_no_bytes_make_it_raise_whatever_was_asked(reads: list[bytes]) -> None:
     assert decoder.counters["bytes_received"] <= sum(map(len, reads))
 
 
-def test_the_relay_is_told_until_it_is_acknowledged_and_no_hello_is_asked_for() -> None:
+def test_relay_command_is_repeated_until_acknowledged() -> None:
     decoder, relay = talking(), Relay(high=True, high_when_silent=False, silent_s=30)
     command = decoder.relay(relay)
     assert decoder.next_output(0.0) == set_relay_command(relay)
-    assert decoder.next_output(1.1 * ASK_AGAIN_S) == set_relay_command(relay)
+    assert decoder.next_output(1.1 * RETRY_S) == set_relay_command(relay)
     decoder.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
     assert (command.done, command.refusal) == (True, None)
     assert decoder.next_output(2.0) == b""
     assert decoder.hello == HELLO
 
 
-def test_firmware_of_before_the_relay_refuses_it_and_the_reason_says_so() -> None:
+def test_firmware_without_relay_is_reported() -> None:
     decoder = talking()
     command = decoder.relay(Relay(high=True, high_when_silent=None))
     decoder.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.UNKNOWN_COMMAND, 0).encode())

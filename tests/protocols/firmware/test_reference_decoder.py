@@ -1,4 +1,4 @@
-"""The converter's reference, followed by its bandgap and never another board's."""
+"""Tracking of the converter's reference by its bandgap, which never mixes two boards."""
 
 import dataclasses
 

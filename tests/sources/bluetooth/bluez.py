@@ -1,4 +1,4 @@
-"""A Bluetooth stack as BlueZ shows it on D-Bus, with one JBD BMS in reach: what bleak talks to, on a bus of its own.
+"""Simulated BlueZ on D-Bus, with one JBD BMS in reach: what bleak talks to, on a bus of its own.
 
 Interfaces and properties as BlueZ documents them (doc/org.bluez.*.rst); nothing of the radio is simulated.
 """

@@ -35,7 +35,7 @@ async def to_the_end(brought: AsyncGenerator[bytes, None]) -> None:
         pass
 
 
-async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_bms_is_polled_and_reconnected_after_a_loss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async with asyncio.timeout(LONG_S), bluez.system_bus(tmp_path) as bus:
         stack = bluez.BlueZ(bus)
         await bus.request_name("org.bluez")
@@ -56,6 +56,6 @@ async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeyp
             assert json.loads(await anext(brought)) == TOLD
 
 
-def test_a_bms_that_nobody_knows() -> None:
+def test_unsupported_bms_is_rejected() -> None:
     with pytest.raises(UserError, match=r"source\.bms = 'jbdd': aiobmsble supports abc, .*jbd"):
         producer(address=bluez.ADDRESS, bms="jbdd")

@@ -1,4 +1,4 @@
-"""What a BMS says over Bluetooth. Samples are aiobmsble's own: of its tests of JBD and Jikong BMS."""
+"""Samples of a BMS over Bluetooth. They are aiobmsble's own: of its tests of JBD and Jikong BMS."""
 
 import math
 import sys
@@ -47,7 +47,7 @@ def test_a_sample_of_aiobmsble_is_a_reading_with_charge_positive() -> None:
     assert settings.sensor.current_sign == "charge_positive"
 
 
-def test_the_temperature_is_that_of_the_cells_where_sensors_on_them_are_known() -> None:
+def test_temperature_is_the_mean_of_cell_sensors() -> None:
     sensors = [Sensor(18.1, "CELL"), Sensor(18.3, "CELL"), Sensor(31.0, "MOSFET")]
     reading = reading_of(JBD | {"temp_values": sensors})
     assert reading is not None
@@ -55,7 +55,7 @@ def test_the_temperature_is_that_of_the_cells_where_sensors_on_them_are_known() 
 
 
 @pytest.mark.parametrize(("sensors", "mean_c"), [([18.0, 19.0], 18.5), ([], math.nan), ([math.nan, 19.0], 19.0)])
-def test_without_a_temperature_of_the_bms_it_is_the_mean(sensors: list[float], mean_c: float) -> None:
+def test_temperature_without_cell_sensors_and_bms_is_the_mean(sensors: list[float], mean_c: float) -> None:
     reading = reading_of({"voltage": 13.2, "current": 0, "temp_values": sensors})
     assert reading is not None
     assert reading.temperature_c == pytest.approx(mean_c, nan_ok=True)
@@ -70,12 +70,12 @@ def test_without_voltage_or_current_there_is_no_reading(sample: dict[str, object
 
 
 @pytest.mark.parametrize("told", [{}, {"name": "a", "address": "A4:C1:38:00:11:22"}, {"address": "A4C138001122"}])
-def test_settings_that_cannot_be(told: dict[str, object]) -> None:
+def test_invalid_settings_are_rejected(told: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         Settings.model_validate({"source": {"kind": "ble"} | told})
 
 
 @pytest.mark.skipif(sys.hexversion >= MIN_PYTHON_HEX, reason="this Python is new enough")
-def test_an_old_python_is_told_what_is_needed() -> None:
+def test_old_python_is_rejected_with_the_needed_version() -> None:
     with pytest.raises(UserError, match=r"needs Python 3\.12 or newer; this is 3\."):
         open_line_source(Settings.model_validate({"source": {"kind": "ble", "name": "a"}}))

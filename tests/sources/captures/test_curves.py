@@ -17,7 +17,7 @@ def test_a_curve_is_read_in_the_order_of_soc(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["time.csv", "absent.csv", "raw.bms", "broken.csv.gz"])
-def test_what_is_no_curve_is_left_to_the_readers_of_captures(tmp_path, name):
+def test_other_files_are_no_curves(tmp_path, name):
     (tmp_path / "time.csv").write_text("time_s,current_a,voltage_v\n0,1,3.7\n")
     (tmp_path / "raw.bms").write_bytes(b"\x00\xff")
     (tmp_path / "broken.csv.gz").write_bytes(b"soc,ocv_v")

@@ -1,4 +1,4 @@
-"""A recording beside the estimate: it waits for nobody, and nobody waits for its disk."""
+"""Recorder with slow, hung and full disks. It never blocks the source."""
 
 import asyncio
 import errno
@@ -56,7 +56,7 @@ def give(recording: CaptureRecorder) -> None:
         recording.write(*read)
 
 
-def test_a_disk_that_hangs_holds_nobody_up_and_has_all_in_order_at_the_end(tmp_path: Path, disk: Disk) -> None:
+def test_hung_disk_blocks_no_writer_and_loses_nothing(tmp_path: Path, disk: Disk) -> None:
     disk.works.clear()
     with CaptureRecorder(tmp_path / "line.bms", CaptureHeader()) as recording:
         give(recording)
@@ -68,7 +68,7 @@ def test_a_disk_that_hangs_holds_nobody_up_and_has_all_in_order_at_the_end(tmp_p
     assert recording.ended.exception() is None
 
 
-def test_a_disk_that_stays_behind_ends_the_recording_and_what_was_missed_is_counted(tmp_path: Path, disk: Disk) -> None:
+def test_slow_disk_ends_the_recording_and_missed_reads_are_counted(tmp_path: Path, disk: Disk) -> None:
     disk.works.clear()
     with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(), max_queued_chunks=10) as recording:
         give(recording)
@@ -77,7 +77,7 @@ def test_a_disk_that_stays_behind_ends_the_recording_and_what_was_missed_is_coun
     assert 10 <= len(kept) <= 11  # one may be on its way to the disk
     assert kept == READS[: len(kept)]
     assert recording.missed_reads == len(READS) - len(kept)
-    assert "stays behind" in str(recording.ended.exception())
+    assert "is too slow" in str(recording.ended.exception())
 
 
 async def test_a_full_disk_ends_the_recording_and_not_the_samples(tmp_path: Path, disk: Disk, line: Line) -> None:
@@ -100,7 +100,7 @@ async def test_a_full_disk_ends_the_recording_and_not_the_samples(tmp_path: Path
     assert error.errno == errno.ENOSPC
 
 
-def test_the_disk_takes_what_is_recorded_while_it_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_capture_is_synced_while_it_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, fdatasync, synced_reads = tmp_path / "line.bms", os.fdatasync, queue.SimpleQueue[int]()
 
     def watched(descriptor: int) -> None:
@@ -115,7 +115,7 @@ def test_the_disk_takes_what_is_recorded_while_it_grows(tmp_path: Path, monkeypa
                 pass
 
 
-def test_a_disk_that_does_not_take_it_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_sync_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(descriptor: int) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
@@ -126,7 +126,7 @@ def test_a_disk_that_does_not_take_it_ends_the_recording(tmp_path: Path, monkeyp
     assert error.errno == errno.EIO
 
 
-def test_a_disk_that_hangs_does_not_hold_up_the_end_of_the_process(tmp_path: Path) -> None:
+def test_hung_disk_does_not_delay_the_end_of_the_process(tmp_path: Path) -> None:
     script = """
 import sys, threading
 from pathlib import Path

@@ -72,7 +72,7 @@ async def test_a_gateway_that_hands_on_serial_frames() -> None:
         assert (await lines(producer, 1))[0]["voltage_v"] == 52.34
 
 
-async def test_what_a_device_does_not_have_is_named_or_left_out() -> None:
+async def test_missing_registers_are_reported_or_omitted() -> None:
     registers, port = victron(), free_port()
     del registers.holding[260], registers.holding[262]  # the register between two that are wanted, and a temperature
     given = source(profile="victron-gx", host="127.0.0.1", tcp_port=port)
@@ -98,12 +98,12 @@ async def test_a_wrong_unit_on_a_serial_line_is_silence(tmp_path: Path) -> None:
         given = source(profile="victron-gx", unit=9, port=str(path), timeout_s=0.2)
         said = await failure(ModbusProducer(given))
     assert said == (
-        "no answer within 0.2 s, asked for source.voltage, source.current, source.temperature"
+        "no response within 0.2 s to a request of source.voltage, source.current, source.temperature"
         " (holding registers 259 to 262)"
     )
 
 
-async def test_no_device_and_no_port_are_said(tmp_path: Path) -> None:
+async def test_missing_device_and_port_are_reported(tmp_path: Path) -> None:
     there = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=free_port()))
     assert await failure(there) == "no connection"
     assert await failure(ModbusProducer(source(profile="victron-gx", port=str(tmp_path / "none")))) == (
@@ -124,7 +124,7 @@ async def test_no_device_and_no_port_are_said(tmp_path: Path) -> None:
     ],
     ids=["noise", "web", "short", "few", "coils", "exception", "closed"],
 )
-async def test_what_is_no_answer_brings_nothing(answer: bytes) -> None:
+async def test_invalid_response_gives_no_sample(answer: bytes) -> None:
     served = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -151,7 +151,7 @@ async def until(brought: AsyncGenerator[bytes, None], condition: Callable[[], bo
             await anext(brought)
 
 
-async def test_a_device_that_goes_and_comes_back() -> None:
+async def test_device_is_reconnected() -> None:
     registers, port = victron(), free_port()
     producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
     async with aclosing(producer.iter_lines()) as brought:
@@ -164,7 +164,7 @@ async def test_a_device_that_goes_and_comes_back() -> None:
         assert (await lines(producer, 1))[0]["voltage_v"] == 52.34
 
 
-async def test_a_device_that_is_busy_brings_nothing_and_is_not_split() -> None:
+async def test_requests_to_a_busy_device_are_not_split() -> None:
     registers, port = victron(), free_port()
     registers.refusal = ExcCodes.DEVICE_BUSY
     async with tcp_device(registers, UNIT, port):
@@ -173,7 +173,7 @@ async def test_a_device_that_is_busy_brings_nothing_and_is_not_split() -> None:
     assert len(registers.asked) == 1
 
 
-async def test_floats_that_are_no_numbers_are_no_samples_until_they_are() -> None:
+async def test_nan_registers_give_no_sample() -> None:
     port = free_port()
     registers = Registers(dict(enumerate((*float_words(13.25), *float_words(float("nan"))))))
     current = {"address": 2, "type": "float32"}

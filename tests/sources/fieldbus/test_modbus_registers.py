@@ -33,14 +33,14 @@ def words(raw: float, kind: str, *, low_word_first: bool = False, address: int =
 
 
 @given(st.data(), st.sampled_from(list(FORMATS)), st.booleans())
-def test_what_a_device_packs_is_what_is_read(data: st.DataObject, kind: str, low_word_first: bool) -> None:
+def test_packed_values_are_decoded(data: st.DataObject, kind: str, low_word_first: bool) -> None:
     raw = data.draw(RANGES[kind])
     register = Register(address=7, type=kind, low_word_first=low_word_first, scale=0.01, offset=-2.0)
     assert decode(register, words(raw, kind, low_word_first=low_word_first, address=7)) == round(raw * 0.01 - 2.0, 5)
 
 
 @given(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(FORMATS)), st.booleans()), max_size=60))
-def test_requests_bring_every_register_once_and_none_is_too_long(wanted: list[tuple[int, str, bool]]) -> None:
+def test_requests_cover_every_register_once_within_the_maximum_length(wanted: list[tuple[int, str, bool]]) -> None:
     values = [
         Value("cells", Register(address=address, type=kind, table="input" if is_input else "holding"))
         for address, kind, is_input in wanted
@@ -99,12 +99,12 @@ def test_a_float_that_is_no_number_is_not_measured(raw: float) -> None:
     assert reading_of(values_of(given), held | words(raw, "float32", address=2)) is None
 
 
-def test_a_value_beyond_all_numbers_is_not_measured() -> None:
+def test_infinite_value_is_not_measured() -> None:
     register = Register(address=0, type="float32", scale=1e300)
     assert math.isnan(decode(register, words(1e30, "float32")))
 
 
-def test_what_stands_for_nothing_measured_is_nothing_measured() -> None:
+def test_absent_value_is_not_measured() -> None:
     given = source(
         voltage={"address": 0, "scale": 0.01},
         current={"address": 1, "type": "int16"},
@@ -122,7 +122,7 @@ def test_what_stands_for_nothing_measured_is_nothing_measured() -> None:
     assert none.cells_v == ()
 
 
-def test_cells_may_be_apart() -> None:
+def test_cells_may_have_gaps_between_registers() -> None:
     cells = CellRegisters(address=100, count=3, step=4)
     assert [cells.cell(number).address for number in range(3)] == [100, 104, 108]
 
@@ -143,12 +143,12 @@ V, I = {"address": 0}, {"address": 1}  # noqa: E741
         ({"voltage": V, "current": I, "cells": {"address": 65530, "count": 16}}, "behind the last register"),
     ],
 )
-def test_settings_that_cannot_be_say_why(told: dict[str, object], said: str) -> None:
+def test_invalid_settings_are_rejected_with_a_reason(told: dict[str, object], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
         source(**told)
 
 
-def test_what_is_told_goes_before_the_profile() -> None:
+def test_settings_override_the_profile() -> None:
     given = source(profile="victron-gx", unit=3, temperature={"address": 61, "type": "int16", "scale": 0.1})
     assert given.unit == 3
     assert given.temperature is not None
@@ -157,7 +157,7 @@ def test_what_is_told_goes_before_the_profile() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_a_profile_is_whole(profile: str) -> None:
+def test_profile_is_complete(profile: str) -> None:
     assert source(profile=profile).sensor["current_sign"] == "charge_positive"
 
 

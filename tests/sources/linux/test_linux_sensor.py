@@ -1,4 +1,4 @@
-"""Sensors by sysfs: a folder that looks like it, its values in SI, files that fail, vanish, hang or hold junk."""
+"""Linux sensors in a simulated sysfs: values in SI units, and files that fail, vanish, hang or contain no number."""
 
 import os
 import threading
@@ -46,7 +46,7 @@ def _reading(line: bytes) -> Reading:
 
 
 @pytest.mark.parametrize("chip", ["ina226", "1-0040"])
-async def test_an_ina226_is_found_by_its_name_or_place(chip: str, tmp_path: Path):
+async def test_ina226_is_found_by_name_or_bus_address(chip: str, tmp_path: Path):
     hwmon(tmp_path, "cpu_thermal", "thermal", number=0, temp1_input=48312)
     hwmon(tmp_path, **INA226)
     reading = await first(sensor(tmp_path, chip=chip).iter_lines())
@@ -96,11 +96,11 @@ async def test_an_ads1115_over_a_divider_and_a_shunt_and_another_chip_for_the_te
         ({"current": "in0_input"}, "in0_input: a voltage; set source.shunt_ohm to the resistance of its shunt"),
         (
             {"chip": "1-0041", "shunt_ohm": 0.1},
-            "tell the ratio by source.current_scale, without source.shunt_ohm",
+            "set the ratio in source.current_scale instead of source.shunt_ohm",
         ),
     ],
 )
-async def test_what_is_not_there_is_said_with_what_to_do(settings: dict[str, Any], said: str, tmp_path: Path):
+async def test_missing_chip_or_file_is_reported_with_a_remedy(settings: dict[str, Any], said: str, tmp_path: Path):
     hwmon(tmp_path, **INA226)
     for number, place in ((4, "1-0041"), (5, "1-0042")):
         hwmon(tmp_path, "ina219", place, number, in1_input=1, curr1_input=1)
@@ -109,7 +109,7 @@ async def test_what_is_not_there_is_said_with_what_to_do(settings: dict[str, Any
     assert str(caught.value).endswith(said)
 
 
-async def test_a_file_that_fails_or_holds_junk_costs_a_sample_and_is_counted_and_said(tmp_path: Path):
+async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
     folder = hwmon(tmp_path, **INA226)
     ina = sensor(tmp_path)
     voltage, current = folder / "in1_input", folder / "curr1_input"
@@ -125,7 +125,7 @@ async def test_a_file_that_fails_or_holds_junk_costs_a_sample_and_is_counted_and
         await anext(lines)
         for said, spoil in spoilt.items():
             spoil()
-            assert ina._sample(await ina._read(ina._find)) == b""
+            assert ina._sample(await ina._read(ina._find_channels)) == b""
             assert said in (ina.fault or "")
         current.rmdir()
         current.write_text("1500\n")
@@ -141,7 +141,7 @@ async def test_a_file_that_fails_or_holds_junk_costs_a_sample_and_is_counted_and
             await _drain(lines)
 
 
-async def test_a_bus_that_hangs_holds_up_nothing_and_is_left_until_it_answers(tmp_path: Path):
+async def test_hung_bus_blocks_nothing_and_is_not_read_again_until_it_answers(tmp_path: Path):
     folder = hwmon(tmp_path, **INA226)
     (folder / "curr1_input").unlink()
     os.mkfifo(folder / "curr1_input")  # opening it waits for somebody who writes
@@ -155,11 +155,11 @@ async def test_a_bus_that_hangs_holds_up_nothing_and_is_left_until_it_answers(tm
     (folder / "curr1_input").unlink()
     (folder / "curr1_input").write_text("1500\n")
     os.close(writer)  # lets go who waits
-    ina._hung_s = LONG_S
+    ina._read_timeout_s = LONG_S
     assert (await first(ina.iter_lines())).current_a == 1.5
 
 
-async def test_a_temperature_that_fails_costs_no_sample(tmp_path: Path):
+async def test_unreadable_temperature_loses_no_sample(tmp_path: Path):
     hwmon(tmp_path, **INA226, temp1_input="nonsense")
     ina = sensor(tmp_path, temperature="temp1_input")
     reading = await first(ina.iter_lines())
@@ -168,14 +168,12 @@ async def test_a_temperature_that_fails_costs_no_sample(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("update_interval", "interval_s"), [("2", 0.1), ("2253", 2.253), ("none", 1.0)])
-def test_it_is_polled_as_fast_as_the_chip_is_set_but_not_faster_than_anybody_needs(
-    update_interval: str, interval_s: float, tmp_path: Path
-):
+def test_poll_interval_is_that_of_the_chip_within_limits(update_interval: str, interval_s: float, tmp_path: Path):
     hwmon(tmp_path, **INA226 | {"update_interval": update_interval})
-    assert sensor(tmp_path, interval_s=None)._find().interval_s == interval_s
+    assert sensor(tmp_path, interval_s=None)._find_channels().interval_s == interval_s
 
 
-async def test_a_chip_slower_than_it_is_taken_for_says_what_to_set(tmp_path: Path):
+async def test_chip_slower_than_expected_is_reported_with_the_setting(tmp_path: Path):
     hwmon(tmp_path, **INA226 | {"update_interval": "17000"})
     with pytest.raises(SourceUnavailableError, match=r"measures only every 17 s; .*source\.interval_s = 17$"):
         await first(sensor(tmp_path, interval_s=None).iter_lines())

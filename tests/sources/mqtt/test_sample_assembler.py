@@ -150,7 +150,7 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("project", PROJECTS)
-def test_what_a_project_publishes_is_a_sample(project: str) -> None:
+def test_messages_of_a_project_give_one_sample(project: str) -> None:
     table, messages, sample, sign = PROJECTS[project]
     assembly = SampleAssembler(source(**table))
     first = told(assembly, messages)
@@ -162,7 +162,7 @@ def test_what_a_project_publishes_is_a_sample(project: str) -> None:
     assert settings.sensor.current_sign == sign
 
 
-def test_a_batch_that_ends_with_cells_tells_them_with_the_next_sample() -> None:
+def test_cells_at_the_end_of_a_batch_belong_to_the_next_sample() -> None:
     table, messages, _, _ = PROJECTS["batmon-ha"]
     assembly = SampleAssembler(source(**table))
     told(assembly, messages)
@@ -204,7 +204,7 @@ def test_paths_units_scales_and_times(where: dict[str, Any], payload: str, sampl
     assert told(SampleAssembler(own(**where)), [("home/pack", payload)]) == [sample]
 
 
-def test_a_pack_with_as_many_cells_as_are_taken_is_a_sample_of_the_dialect() -> None:
+def test_pack_with_the_maximum_number_of_cells_is_decoded() -> None:
     assembly, decoder = SampleAssembler(own(cells="c")), TextProtocol()
     payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELL_NUMBER})
     assembly.take("home/pack", payload.encode(), 0.0, retained=False)
@@ -212,7 +212,7 @@ def test_a_pack_with_as_many_cells_as_are_taken_is_a_sample_of_the_dialect() -> 
     assert decoder.cells.shape == (1, MAX_CELL_NUMBER)
 
 
-def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ever() -> None:
+def test_unchanged_topic_keeps_its_value_up_to_the_maximum_age() -> None:
     assembly = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
     assert told(assembly, [("v", "52")]) == []
     assert assembly.fault == "current: no message on i"
@@ -237,7 +237,7 @@ def test_temperature_and_cells_may_be_older() -> None:
     assert "temperature_c" not in told(assembly, both, 301.0)[0]
 
 
-def test_what_the_broker_had_kept_is_not_taken() -> None:
+def test_retained_messages_are_ignored() -> None:
     assembly = SampleAssembler(own(availability_topic="home/status"))
     assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
     assert assembly.counters["retained"] == 1
@@ -267,7 +267,7 @@ def test_what_the_broker_had_kept_is_not_taken() -> None:
         (5000 * "[", "no_number", "no JSON: '[[["),
     ],
 )
-def test_a_payload_that_tells_nothing_is_counted_and_said(payload: str, kind: str, said: str) -> None:
+def test_invalid_payload_is_counted_and_reported(payload: str, kind: str, said: str) -> None:
     assembly = SampleAssembler(own())
     assert told(assembly, [("home/pack", payload)]) == []
     assert assembly.counters[kind] >= 1
@@ -276,7 +276,7 @@ def test_a_payload_that_tells_nothing_is_counted_and_said(payload: str, kind: st
 
 
 @given(st.binary() | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode))
-def test_no_payload_makes_it_raise(payload: bytes) -> None:
+def test_no_payload_raises(payload: bytes) -> None:
     settings = own(cells="c.{cell}", temperature={"path": "0.1"}, time={"path": "t", "unit": "iso"})
     assembly = SampleAssembler(settings)
     assembly.take("home/pack", payload, 0.0, retained=False)
@@ -292,14 +292,14 @@ def test_no_payload_makes_it_raise(payload: bytes) -> None:
 @pytest.mark.parametrize(
     ("prefix", "instance", "begin"), [("jk-bms", "", "jk-bms_"), ("jk-bms", "", ""), ("home/bms", "jk-bms", "jk-bms_")]
 )
-def test_a_node_may_have_another_prefix_and_leave_its_name_away(prefix: str, instance: str, begin: str) -> None:
+def test_node_with_another_prefix_or_without_name(prefix: str, instance: str, begin: str) -> None:
     assembly = SampleAssembler(source(profile="esphome-jk", prefix=prefix, instance=instance))
     values = [("total_voltage", "52.98"), ("current", "-12.34"), ("balancing_current", "1")]
     sample = told(assembly, [(f"{prefix}/sensor/{begin}{name}/state", value) for name, value in values])
     assert sample == [{"voltage_v": 52.98, "current_a": -12.34}]
 
 
-def test_it_subscribes_to_nothing_twice() -> None:
+def test_no_topic_is_subscribed_twice() -> None:
     jk = source(profile="esphome-jk", prefix="jk-bms")
     assert SampleAssembler(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
     assert SampleAssembler(own()).topics == ["home/pack"]
@@ -320,13 +320,13 @@ def test_it_subscribes_to_nothing_twice() -> None:
         ({"topic": "t", "voltage": "u", "current": "i", "username": "me"}, "are for a broker at url"),
     ],
 )
-def test_settings_that_cannot_be_are_said(table: dict[str, Any], said: str) -> None:
+def test_invalid_settings_are_rejected_with_a_reason(table: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match="mqtt") as caught:
         Settings.model_validate({"source": {"kind": "mqtt"} | table})
     assert said in str(caught.value)
 
 
-def test_what_is_told_goes_before_the_profile() -> None:
+def test_settings_override_the_profile() -> None:
     told_too = source(profile="battery-emulator", current={"scale": -1}, temperature="temperature_min", interval_s=2)
     assert told_too.current.topics == ("{prefix}/info{instance}",)
     assert (told_too.current.path, told_too.current.scale) == ("battery_current", -1.0)
@@ -355,7 +355,7 @@ def _errors(messages: list[tuple[float, float]]) -> tuple[SampleAssembler, list[
 
 
 @pytest.mark.parametrize("period_s", [0.2, 1.0, 2.7])
-def test_a_second_publisher_of_a_topic_is_counted_and_named_until_it_is_gone(period_s: float) -> None:
+def test_second_publisher_of_a_topic_is_reported_until_it_stops(period_s: float) -> None:
     rival = (period_s, 100.3, 160.0, -80.0)
     assembly, found = _errors(_merged((1.0, 0.0, 160.0, 5.0), rival))
     assert 100.3 < found[0] < 115.0
@@ -367,16 +367,14 @@ def test_a_second_publisher_of_a_topic_is_counted_and_named_until_it_is_gone(per
 
 
 @pytest.mark.parametrize("on_s", [1, 2, 3, 10])
-def test_a_load_that_switches_on_and_off_is_no_second_publisher(on_s: int) -> None:
+def test_switching_load_is_no_second_publisher(on_s: int) -> None:
     messages = [(float(second), 80.0 if second // on_s % 2 else -5.0) for second in range(1000)]
     assembly, found = _errors(messages)
     assert (assembly.conflict, found) == ("", [])
 
 
 @pytest.mark.parametrize(("on_s", "off_s", "spread"), [(3, 60, 0.0), (600, 1800, 0.1), (5, 15, 0.9)])
-def test_a_load_of_which_only_the_changes_are_published_is_no_second_publisher(
-    on_s: int, off_s: int, spread: float
-) -> None:
+def test_load_published_on_change_is_no_second_publisher(on_s: int, off_s: int, spread: float) -> None:
     """A short pulse in each minute, a refrigerator, a load that somebody switches."""
     chance, messages, at_s = random.Random(1), list[tuple[float, float]](), 0.0
     for _ in range(200):
@@ -388,7 +386,7 @@ def test_a_load_of_which_only_the_changes_are_published_is_no_second_publisher(
 
 
 @pytest.mark.parametrize("restarts", [False, True])
-def test_a_publisher_that_reports_changes_beside_its_regular_messages_is_no_second_one(*, restarts: bool) -> None:
+def test_publisher_of_changes_and_regular_messages_is_no_second_publisher(*, restarts: bool) -> None:
     """A message each 10 s, counted from the last change or not, and a load that is on for 3 s of 61 s."""
     messages: list[tuple[float, float]] = []
     for cycle in range(30):
@@ -402,13 +400,13 @@ def test_a_publisher_that_reports_changes_beside_its_regular_messages_is_no_seco
     assert (assembly.conflict, found) == ("", [])
 
 
-def test_a_second_publisher_that_is_slower_is_found() -> None:
+def test_slower_second_publisher_is_detected() -> None:
     _, found = _errors(_merged((1.0, 0.0, 400.0, 5.0), (10.0, 100.3, 400.0, -80.0)))
     assert found
     assert found[0] < 160.0
 
 
-def test_a_publisher_with_a_current_of_its_own_at_random_times_is_a_second_one() -> None:
+def test_second_publisher_at_random_times_is_detected() -> None:
     chance, rival, at_s = random.Random(1), list[tuple[float, float]](), 100.0
     while at_s < 160.0:
         at_s += chance.expovariate(1.0)
@@ -417,7 +415,7 @@ def test_a_publisher_with_a_current_of_its_own_at_random_times_is_a_second_one()
     assert 100.0 < found[0] < 115.0
 
 
-def test_cells_that_are_no_longer_measured_do_not_stay_as_they_were() -> None:
+def test_cells_no_longer_measured_are_removed() -> None:
     together = SampleAssembler(own(cells="cells"))
     payloads = ('{"u": 52.0, "i": 1.0, "cells": [3.3, 3.4]}', '{"u": 52.0, "i": 1.0, "cells": null}')
     first, lost = told(together, [("home/pack", payload) for payload in payloads])

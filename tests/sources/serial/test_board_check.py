@@ -46,7 +46,7 @@ async def taken(source: SerialSource, blocks: list[SampleBlock]):
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_nothing_is_sent_to_a_device_that_speaks_something_else(line: Line) -> None:
+async def test_nothing_is_sent_to_a_device_with_another_protocol(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
     async with taken(source, []):
@@ -57,7 +57,7 @@ async def test_nothing_is_sent_to_a_device_that_speaks_something_else(line: Line
         assert line.heard() == b""
 
 
-async def test_a_board_that_is_heard_is_asked_for_its_hello(line: Line) -> None:
+async def test_hello_is_requested_after_the_first_frame(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
     async with taken(source, []):
@@ -103,12 +103,12 @@ async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -> None:
+async def test_auto_rejects_another_board_and_reopens_its_own(auto: Path) -> None:
     blocks = list[SampleBlock]()
     source = SerialSource(SensorSettings(port="auto", sample_rate_hz=50), first_retry_s=0.05)
     async with taken(source, blocks):
         async with plugged_in(auto, serial=1):
-            await until(lambda: source._door.serial)
+            await until(lambda: source._board_check.serial)
         await until(lambda: source.message)
         async with plugged_in(auto, serial=2, voltage_v=11.1):
             await until(lambda: source.message and "refused" in source.message)
@@ -121,11 +121,11 @@ async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(22.2, abs=0.1)
 
 
-async def test_auto_says_what_comes_in_place_of_its_own_board(auto: Path) -> None:
+async def test_auto_reports_what_replaced_its_board(auto: Path) -> None:
     source = SerialSource(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
     async with taken(source, []):
         async with plugged_in(auto, serial=1):
-            await until(lambda: source._door.serial)
+            await until(lambda: source._board_check.serial)
         await until(lambda: source.message)
         with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, linked(auto, other.path):
             task = asyncio.create_task(other.run())

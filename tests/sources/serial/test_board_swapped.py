@@ -1,4 +1,4 @@
-"""A board that runs is wired to the open port in place of ours: no reset tells, and its scaling is another."""
+"""Exchange of the board on the open port for a running one with another scaling, without a reset."""
 
 import asyncio
 
@@ -62,7 +62,7 @@ def ours() -> FrameDecoder:
     [(50_000, 900.0, 1.0), (101, 900.0, 1.0), (50_000, 2.0, 1.0), (700_000, 3500.0, 3600.0), (3000, 30.0, 3600.0)],
     ids=["ahead", "by its clock alone", "by its sequence alone", "after an hour", "begun within that hour"],
 )
-def test_samples_that_ours_cannot_have_sent_wait_for_a_hello(sequence: int, age_s: float, away_s: float) -> None:
+def test_inconsistent_samples_wait_for_a_hello(sequence: int, age_s: float, away_s: float) -> None:
     decoder, other = ours(), Running(2, 9.0, sequence, age_s)
     begin_s = BEGIN_S + 1.0 + away_s
     assert fed(decoder, begin_s, other.frames(100)).size == 0
@@ -74,7 +74,7 @@ def test_samples_that_ours_cannot_have_sent_wait_for_a_hello(sequence: int, age_
     assert decoder.board["serial"] == "00000002"
 
 
-def test_what_was_lost_is_no_reason_to_doubt_whose_the_samples_are() -> None:
+def test_lost_samples_do_not_require_a_hello() -> None:
     decoder, board = ours(), Running(1, 6.1, 100, 1.0)
     board.frames(12_345)
     taken = fed(decoder, BEGIN_S + 1.0 + 123.46, board.frames(10))
@@ -83,7 +83,7 @@ def test_what_was_lost_is_no_reason_to_doubt_whose_the_samples_are() -> None:
     assert decoder.counters.frames_lost == 12_345
 
 
-def test_a_board_that_tells_nothing_is_taken_after_a_while_and_the_gap_is_told() -> None:
+def test_board_without_hello_is_accepted_after_a_timeout() -> None:
     """Its line may have no way back: it cannot be asked."""
     decoder, board = ours(), Running(1, 6.1, 100, 900.0)
     taken = fed(decoder, BEGIN_S + 2.0, board.frames(1000))
@@ -96,7 +96,7 @@ def test_a_board_that_tells_nothing_is_taken_after_a_while_and_the_gap_is_told()
     assert not taken["status"][1:].any()
 
 
-async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(line: Line) -> None:
+async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
     blocks: list[SampleBlock] = []
@@ -111,7 +111,7 @@ async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(lin
         try:
             await until(lambda: source.message and "no frame yet" in source.message)
             line.write(ours.hello() + b"".join(ours.frames(10)))
-            await until(lambda: source._door.serial)
+            await until(lambda: source._board_check.serial)
             heard = line.heard()
             line.write(b"".join(other.frames(10)))
 
@@ -137,7 +137,7 @@ def door_of_ours() -> tuple[BoardCheck, BoardProtocol]:
     return door, dialect
 
 
-def test_nothing_of_a_board_that_was_refused_passes_before_the_port_is_opened_anew() -> None:
+def test_rejected_board_is_blocked_until_the_port_is_reopened() -> None:
     """Reads that wait behind the one with its hello have none."""
     own, other = Running(1, 6.1), Running(2, 9.0)
     door, dialect = door_of_ours()
@@ -146,20 +146,20 @@ def test_nothing_of_a_board_that_was_refused_passes_before_the_port_is_opened_an
     frame = other.frames(1)[0]
     assert door.accept((BEGIN_S, frame), dialect) == ()
     assert door.unadmitted_bytes == len(other.hello() + frame)
-    door.opened()
+    door.on_port_opened()
     assert len(door.accept((BEGIN_S, own.hello()), dialect)) == 1
 
 
-def test_each_byte_of_a_board_that_is_not_known_yet_passes_once_or_is_counted() -> None:
+def test_each_pending_byte_is_passed_once_or_counted() -> None:
     board = Running(1, 6.1)
     door, dialect = door_of_ours()
     reads = [(BEGIN_S, frame) for frame in board.frames(MAX_PENDING_READS + 5)]
-    door.opened()
+    door.on_port_opened()
     assert not any(door.accept(read, dialect) for read in reads[:7])
-    door.opened()  # the port was lost
+    door.on_port_opened()  # the port was lost
     assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7])
     assert not any(door.accept(read, dialect) for read in reads)
     hello = BEGIN_S, board.hello()
     assert door.accept(hello, dialect) == [*reads[6:], hello]
-    door.opened()
+    door.on_port_opened()
     assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])

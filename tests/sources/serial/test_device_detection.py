@@ -1,4 +1,4 @@
-"""Who is on a port is found without doing harm: devices of all protocols are asked by questions alone."""
+"""Device detection for all protocols, with read requests only."""
 
 import contextlib
 import os
@@ -60,7 +60,7 @@ def test_it_is_found_at_its_own_baud_rate(monkeypatch: pytest.MonkeyPatch) -> No
     assert (found.protocol, found.baud) == ("jk", 115_200)
 
 
-def test_the_newer_jk_that_is_only_asked_by_what_others_take_for_a_write_is_not(
+def test_newer_jk_is_not_detected_because_its_request_is_a_modbus_write(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", 0.1)
@@ -69,7 +69,7 @@ def test_the_newer_jk_that_is_only_asked_by_what_others_take_for_a_write_is_not(
         assert device_detection.probe(path) == "silent"
 
 
-def test_a_silent_device_is_sent_questions_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_device_receives_only_read_requests(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", 0.3)
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)
     master, slave = os.openpty()
@@ -80,21 +80,21 @@ def test_a_silent_device_is_sent_questions_alone(monkeypatch: pytest.MonkeyPatch
     finally:
         os.close(slave)
         os.close(master)
-    assert jk.OLD_QUESTION in sent
+    assert jk.OLD_REQUEST in sent
     questions = [
-        jk.OLD_QUESTION,
-        junctek.ASK,
+        jk.OLD_REQUEST,
+        junctek.QUERY,
         PylontechProtocol().next_output(0.0),
-        *(jbd.question(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
-        *(daly.question(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
+        *(jbd.request(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
+        *(daly.request(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
     ]
     for question in questions:
         sent = sent.replace(question, b"")
     assert sent == b""
 
 
-def test_a_device_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(port_list, "WRITE_S", 0.05)
+def test_device_that_accepts_no_bytes_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(port_list, "WRITE_TIMEOUT_S", 0.05)
     master, slave = os.openpty()
     try:
         tty.setraw(slave)

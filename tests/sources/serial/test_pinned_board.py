@@ -1,4 +1,4 @@
-"""One board belongs to a pack: it is known by its serial number on whatever port, and no other is taken in its place."""
+"""Each pack has one board, which is recognized by its serial number on any port. Other boards are rejected."""
 
 import asyncio
 import contextlib
@@ -49,7 +49,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     there.mkdir()
     monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path)) for path in there.iterdir()])
     monkeypatch.setattr(port_list, "BY_ID", tmp_path / "by-id")
-    monkeypatch.setattr(serial_source, "TALK_S", 0.02)
+    monkeypatch.setattr(serial_source, "SEND_INTERVAL_S", 0.02)
     return there
 
 
@@ -111,9 +111,7 @@ async def test_another_board_on_the_named_port_is_refused_after_a_restart(folder
         await remembered(memory, "00000001")
     async with source(port, memory) as taken, board(port, serial=2, voltage_v=OTHERS_V):
         await until(lambda: taken.message and "refused" in taken.message)
-        said = (
-            f"{port}: refused: board 00000002 is not the pack's, 00000001: plug that in, or, if it takes its place, run"
-        )
+        said = f"{port}: refused: board 00000002 is not the pack's, 00000001: connect that one, or, to use this board instead, run"
         assert said in (taken.message or "")
         assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (taken.message or "")
         await until(lambda: taken.counters["reconnects"] >= 1)
@@ -124,7 +122,7 @@ async def test_another_board_on_the_named_port_is_refused_within_a_run(folder: P
     port = folder / "ttyUSB0"
     async with source(port) as taken:
         async with board(port):
-            await until(lambda: taken._door.serial)
+            await until(lambda: taken._board_check.serial)
         await until(lambda: taken.message)
         async with board(port, serial=2, voltage_v=OTHERS_V):
             await until(lambda: taken.message and "refused" in taken.message)
@@ -134,9 +132,7 @@ async def test_another_board_on_the_named_port_is_refused_within_a_run(folder: P
     assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_the_first_board_is_not_taken_when_the_settings_name_another(
-    folder: Path, memory: KnownBoardFile
-) -> None:
+async def test_first_board_is_rejected_if_another_is_configured(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory, serial="0000002a") as taken:
         async with board(port, voltage_v=OTHERS_V):
@@ -148,7 +144,7 @@ async def test_the_first_board_is_not_taken_when_the_settings_name_another(
         assert taken.voltage_v == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_a_board_without_a_serial_number_is_none_that_is_known(folder: Path, memory: KnownBoardFile) -> None:
+async def test_board_without_serial_number_is_rejected(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     with capture_logs() as logs:
         async with source(port, memory) as taken, board(port, serial=0):
@@ -159,23 +155,23 @@ async def test_a_board_without_a_serial_number_is_none_that_is_known(folder: Pat
         await until(lambda: "board without a serial number is not the pack's" in (taken.message or ""))
 
 
-async def test_a_board_that_takes_the_place_of_another_behind_the_same_adapter_is_refused(folder: Path) -> None:
+async def test_other_board_behind_the_open_adapter_is_rejected(folder: Path) -> None:
     """The port stays: nothing but the hello tells."""
     port = folder / "ttyUSB0"
     async with source(port) as taken, board(port) as virtual:
-        await until(lambda: taken._door.serial)
-        virtual._kept[20] = 2
+        await until(lambda: taken._board_check.serial)
+        virtual._stored[20] = 2
         virtual._converter = VirtualBoard(lambda _: Reading(0.5, 1.0), parts=BoardParts(divider=9.0))._converter
         virtual.reset()
         await until(lambda: taken.message and "board 00000002 is not the pack's, 00000001" in taken.message)
     assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_a_board_back_under_another_name_is_found(folder: Path, memory: KnownBoardFile) -> None:
+async def test_board_is_found_on_another_port(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory) as taken:
         async with board(port):
-            await until(lambda: taken._door.serial)
+            await until(lambda: taken._board_check.serial)
         await until(lambda: taken.message)
         seen = len(taken.blocks)
         async with board(folder / "ttyUSB1", serial=2, voltage_v=OTHERS_V), board(folder / "ttyUSB2"):
@@ -186,7 +182,7 @@ async def test_a_board_back_under_another_name_is_found(folder: Path, memory: Kn
     assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_two_boards_that_were_swapped_are_each_found_by_their_own_pack(folder: Path, tmp_path: Path) -> None:
+async def test_swapped_boards_are_found_by_their_packs(folder: Path, tmp_path: Path) -> None:
     one, two = folder / "ttyUSB0", folder / "ttyUSB1"
     memories = [KnownBoardFile(tmp_path, name) for name in ("house", "shed")]
     async with (
@@ -220,14 +216,14 @@ async def test_two_packs_find_their_boards_among_all_ports(folder: Path) -> None
     assert np.concatenate(shed.blocks)["voltage_v"] == pytest.approx(OTHERS_V, abs=0.1)
 
 
-async def test_the_search_writes_nothing_to_a_silent_device_and_leaves_it(folder: Path) -> None:
+async def test_search_sends_nothing_to_a_silent_device(folder: Path) -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
     (folder / "ttyUSB0").symlink_to(os.ttyname(slave))
     os.set_blocking(master, False)
     try:
         async with source(folder / "gone", serial="00000001") as taken:
-            await until(lambda: taken._where._left)
+            await until(lambda: taken._discovery._skipped)
             async with board(folder / "ttyUSB1"):
                 await until(lambda: taken.blocks)
         with pytest.raises(BlockingIOError):
@@ -237,7 +233,7 @@ async def test_the_search_writes_nothing_to_a_silent_device_and_leaves_it(folder
         os.close(master)
 
 
-async def test_a_changed_calibration_is_taken_and_said(folder: Path, memory: KnownBoardFile) -> None:
+async def test_changed_calibration_is_stored_and_logged(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory), board(port):
         await remembered(memory, "00000001")
@@ -250,7 +246,7 @@ async def test_a_changed_calibration_is_taken_and_said(folder: Path, memory: Kno
     assert "serial" not in said[0]
 
 
-async def test_a_service_that_runs_takes_another_board_once_it_is_accepted(
+async def test_running_service_uses_a_newly_accepted_board(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     memory, port = KnownBoardFile(tmp_path, "house"), folder / "ttyUSB0"
@@ -268,7 +264,7 @@ async def test_a_service_that_runs_takes_another_board_once_it_is_accepted(
             assert taken.voltage_v == pytest.approx(OTHERS_V, abs=0.1)
 
 
-async def test_a_memory_that_was_deleted_lets_no_other_board_in(folder: Path, memory: KnownBoardFile) -> None:
+async def test_deleted_board_file_accepts_no_other_board(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory) as taken:
         async with board(port):
@@ -281,7 +277,7 @@ async def test_a_memory_that_was_deleted_lets_no_other_board_in(folder: Path, me
             assert "refused" in (taken.message or "")
 
 
-async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_health(
+async def test_other_board_after_a_restart_is_reported_in_health(
     folder: Path, tmp_path: Path, memory: KnownBoardFile
 ) -> None:
     port = folder / "ttyUSB0"
@@ -307,20 +303,18 @@ async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_
     assert told.health.samples["samples"] <= 1  # that of the checkpoint
 
 
-async def test_a_board_that_prints_text_is_taken_whatever_board_was_remembered(
-    folder: Path, memory: KnownBoardFile
-) -> None:
+async def test_text_board_is_accepted_regardless_of_the_stored_board(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     memory.save({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
     async with source(port, memory, protocol="text") as taken, board(port, mode="text"):
         await until(lambda: taken.blocks)
 
 
-async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_it_does(
+async def test_storing_the_board_is_retried_after_a_disk_error(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(board_check, "RETRY_S", 0.05, raising=False)
-    memory, said = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be remembered"
+    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05, raising=False)
+    memory, said = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be stored"
     memory.path.parent.touch()  # a file where the folder should be
     with capture_logs() as logs:
         async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
@@ -333,10 +327,8 @@ async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_i
     assert stat.S_IMODE(memory.path.parent.stat().st_mode) == 0o700
 
 
-async def test_a_folder_that_is_deleted_comes_back_with_the_board(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(board_check, "RETRY_S", 0.05)
+async def test_deleted_state_folder_is_recreated(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05)
     memory = KnownBoardFile(tmp_path / "state", "house")
     async with source(folder / "ttyUSB0", memory), board(folder / "ttyUSB0"):
         await remembered(memory, "00000001")
@@ -344,10 +336,10 @@ async def test_a_folder_that_is_deleted_comes_back_with_the_board(
         await remembered(memory, "00000001")
 
 
-async def test_a_board_that_is_to_be_forgotten_is_not_written_down_again(
+async def test_reset_board_file_is_not_overwritten(
     folder: Path, memory: KnownBoardFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(board_check, "RETRY_S", 0.0)
+    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.0)
     async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
         await remembered(memory, "00000001")
         memory.save(NO_BOARD)
@@ -356,7 +348,7 @@ async def test_a_board_that_is_to_be_forgotten_is_not_written_down_again(
         assert memory.load() == NO_BOARD
 
 
-def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memory: KnownBoardFile) -> None:
+def test_board_file_is_private_and_follows_no_link(memory: KnownBoardFile) -> None:
     kept = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
     stranger = memory.path.with_name("stranger")
     stranger.write_text("theirs")
@@ -370,7 +362,7 @@ def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memo
     assert linked.load() == {}
 
 
-def test_a_memory_that_is_a_pipe_is_none(memory: KnownBoardFile) -> None:
+def test_pipe_in_place_of_the_board_file_is_ignored(memory: KnownBoardFile) -> None:
     os.mkfifo(memory.path)
     writer = os.open(memory.path, os.O_RDWR)
     try:
@@ -382,7 +374,7 @@ def test_a_memory_that_is_a_pipe_is_none(memory: KnownBoardFile) -> None:
 @pytest.mark.parametrize(
     "text", ["", "[]", "{", "[" * 4000, '{"serial": 1}', json.dumps({"serial": "x" * 3000}), "\xff", "null"]
 )
-def test_a_memory_that_is_damaged_is_none_and_said(memory: KnownBoardFile, text: str) -> None:
+def test_damaged_board_file_is_ignored_and_logged(memory: KnownBoardFile, text: str) -> None:
     memory.path.write_text(text, encoding="latin-1")
     with capture_logs() as logs:
         assert memory.load() == {}
@@ -424,7 +416,7 @@ def test_a_board_is_accepted_in_the_folder_that_is_named_and_only_where_one_is_k
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for others")
-def test_what_root_writes_is_for_the_owner_of_the_folder(tmp_path: Path) -> None:
+def test_file_written_by_root_belongs_to_the_owner_of_the_folder(tmp_path: Path) -> None:
     theirs = tmp_path / "theirs"
     theirs.mkdir(mode=0o700)
     os.chown(theirs, 65534, 65533)

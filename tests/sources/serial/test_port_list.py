@@ -1,4 +1,4 @@
-"""``port = "auto"``: which of the ports that are there may be a board's."""
+"""``port = "auto"``: choice of the board's port."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[ListPortInfo]
         (0x2A03, 0x0043, "Arduino Uno"),
     ],
 )
-def test_auto_takes_the_chips_that_boards_have(there: list[ListPortInfo], vid: int, pid: int, product: str) -> None:
+def test_auto_selects_usb_chips_of_boards(there: list[ListPortInfo], vid: int, pid: int, product: str) -> None:
     there.append(usb_port("/dev/ttyUSB7", vid, pid, product))
     assert resolve_port("auto") == "/dev/ttyUSB7"
 
@@ -50,18 +50,16 @@ def test_auto_takes_the_chips_that_boards_have(there: list[ListPortInfo], vid: i
         (0x0658, 0x0200, "n/a"),
     ],
 )
-def test_auto_leaves_radio_sticks_and_unknown_chips_alone(
+def test_auto_ignores_radio_sticks_and_unknown_chips(
     there: list[ListPortInfo], vid: int, pid: int, product: str
 ) -> None:
     there.append(usb_port("/dev/ttyUSB0", vid, pid, product))
-    with pytest.raises(NoPortError, match="no port of a known board is there") as refused:
+    with pytest.raises(NoPortError, match="no port of a known board is connected") as refused:
         resolve_port("auto")
     assert f"/dev/ttyUSB0 ({product})" in str(refused.value)
 
 
-def test_auto_takes_the_board_beside_a_radio_stick_by_its_stable_name(
-    there: list[ListPortInfo], tmp_path: Path
-) -> None:
+def test_auto_selects_the_board_next_to_a_radio_stick(there: list[ListPortInfo], tmp_path: Path) -> None:
     there += [usb_port("/dev/ttyUSB0", 0x10C4, 0xEA60, "SkyConnect v1.0"), usb_port("/dev/ttyUSB1")]
     stable = tmp_path / "usb-1a86_USB_Serial-if00-port0"
     stable.symlink_to("/dev/ttyUSB1")

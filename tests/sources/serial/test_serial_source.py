@@ -77,7 +77,7 @@ def count(blocks: list[SampleBlock]) -> int:
     return sum(block.size for block in blocks)
 
 
-async def test_a_missing_port_is_waited_for_and_said(line: Line) -> None:
+async def test_missing_port_is_reported_and_retried(line: Line) -> None:
     async with board(line) as source:
         await until(lambda: source.message and "does not exist" in source.message)
         assert str(line.path) in (source.message or "")
@@ -90,7 +90,7 @@ async def test_a_missing_port_is_waited_for_and_said(line: Line) -> None:
     assert source.counters["reconnects"] == 0
 
 
-async def test_a_board_unplugged_in_mid_run_is_taken_up_again(line: Line) -> None:
+async def test_unplugged_board_is_reopened(line: Line) -> None:
     line.plug()
     async with board(line) as source:
         await until(lambda: source.message and "no frame yet" in source.message)
@@ -106,9 +106,7 @@ async def test_a_board_unplugged_in_mid_run_is_taken_up_again(line: Line) -> Non
     assert source.counters["reconnects"] == 1
 
 
-async def test_a_port_held_by_another_process_names_the_process_which_the_loop_does_not_look_for(
-    line: Line, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_process_that_holds_the_port_is_found_in_a_thread(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     def holder(port: str) -> str | None:
         looked_in.add(threading.current_thread())
         return look(port)
@@ -145,9 +143,7 @@ async def test_a_port_held_by_another_process_names_the_process_which_the_loop_d
         (os, "open", OSError(errno.ENODEV, "No such device")),
     ],
 )
-async def test_a_port_that_dies_while_it_is_opened_is_opened_again(
-    line: Line, part: object, name: str, error: Exception
-) -> None:
+async def test_port_that_fails_while_opened_is_retried(line: Line, part: object, name: str, error: Exception) -> None:
     def die(*_: object, **__: object) -> None:
         raise error
 
@@ -163,16 +159,16 @@ async def test_a_port_that_dies_while_it_is_opened_is_opened_again(
     assert probed.startswith("cannot be opened")
 
 
-async def test_ports_that_all_go_while_they_are_listed_are_waited_for(tmp_path: Path) -> None:
+async def test_ports_that_vanish_while_listed_are_retried(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(port_list, "BY_ID", tmp_path / "by-id")
         patch.setattr(Path, "is_dir", lambda _: True)  # it was there a moment ago
         patch.setattr(list_ports, "comports", list)
         async with SerialSource(SensorSettings(port="auto")) as source:
-            await until(lambda: source.message == "waiting for auto: no USB serial port is there")
+            await until(lambda: source.message == "waiting for auto: no USB serial port is connected")
 
 
-async def test_a_silent_board_and_one_at_another_baud_rate_are_told_apart(line: Line) -> None:
+async def test_silent_board_and_wrong_baud_rate_have_different_messages(line: Line) -> None:
     line.plug()
     async with board(line) as source:
         taking = asyncio.create_task(drain(source))
@@ -188,7 +184,7 @@ async def test_a_silent_board_and_one_at_another_baud_rate_are_told_apart(line: 
     await taking
 
 
-async def test_the_sign_of_the_current_is_turned_once(line: Line) -> None:
+async def test_current_sign_is_applied_once(line: Line) -> None:
     line.plug()
     async with board(line, settings={"current_sign": "charge_positive"}) as source:
         await until(lambda: source.message and "no frame yet" in source.message)
@@ -249,7 +245,7 @@ async def test_the_rate_is_set_again_after_a_reset_whose_hello_was_damaged() -> 
     assert source.counters["resets"] == 1
 
 
-async def test_a_board_that_was_not_heard_from_its_start_tells_of_itself_and_gets_its_rate(tmp_path: Path) -> None:
+async def test_running_board_is_requested_to_send_its_hello_and_set_its_rate(tmp_path: Path) -> None:
     path, blocks = tmp_path / "board", list[SampleBlock]()
     source = SerialSource(SensorSettings(port=str(path), sample_rate_hz=50), first_retry_s=0.05)
     async with source, at_work(keep(source, blocks)):
