@@ -1,4 +1,4 @@
-"""All benchmarks in one table: ``make benchmark``, or ``make benchmark ARGS="kernel live"`` for some."""
+"""Benchmarks in one table: ``make benchmark`` for all, ``make benchmark ARGS="kernel live"`` for some."""
 
 import sys
 from itertools import chain

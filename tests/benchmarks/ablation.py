@@ -56,7 +56,7 @@ def setting(**values: float) -> Change:
 
 
 def known_resistances_of_the_middle(p: np.void) -> None:
-    """The resistances do not change with SOC."""
+    """Make the resistances independent of SOC, with their values at mid SOC."""
     for name in ("weak_ohm", "strong_ohm"):
         p[name] = p[name][GRID // 2]
 
@@ -114,7 +114,7 @@ def scores(group: Group, part: str, folder: Path) -> list[Score]:
 
 
 def judge(part: str, cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float) -> Score | None:
-    """One run without a part."""
+    """Score one run with a part of the filter removed."""
     estimator = Estimator(cell, initial_soc=start_soc)
     PARTS.get(part, setting())(estimator.settings_record[0]["filter"])
     if part == NO_TEMPERATURE:
@@ -129,7 +129,7 @@ def judge(part: str, cell: CellModel, seen: SampleBlock, truth: Floats, start_so
 
 
 def unite_all(s: np.void, p: np.void) -> None:
-    """The one in the middle stays, with the std of all."""
+    """Replace all hypotheses by the middle one, with the standard deviation of all."""
     if s["count"] == HYPOTHESES:
         copy_hypothesis(s, HYPOTHESES // 2, 0)
         s["count"], s["best"] = 1, 0

@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def cycle_table(names: list[str]) -> Table:
-    """Table of simulated full cycles and charges from empty, one row for each generic cell that matches ``names``."""
+    """Return the table of simulated full cycles and charges from empty, one row for each generic cell that matches ``names``."""
     table = Table(title="full cycles and charges from empty, simulated: RMSE/worst, inside/worst, std, score in %")
     for column in ("generic cell", "RMSE", "inside", "std", "score"):
         table.add_column(column)
@@ -88,7 +88,7 @@ def cycle_table(names: list[str]) -> Table:
 
 
 def cells_of(found: list[Outcome]) -> Iterator[str]:
-    """One row of the table."""
+    """Yield the cells of one table row."""
     ours = [o.ours for o in found]
     yield f"{mean([s.rmse for s in ours]):.2f}/{max(s.rmse for s in ours):.2f}"
     yield f"{mean([s.cover for s in ours]):.0f}/{min(s.cover for s in ours):.0f}"
@@ -116,7 +116,7 @@ def outcomes(group: Group, folder: Path) -> Iterator[Outcome]:
 
 
 def compare(cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float) -> Outcome | None:
-    """One run by each method; None where the capture is too short."""
+    """Run each method once; None if the capture is too short."""
     run = run_of(Estimator(cell, initial_soc=start_soc), seen)
     ours = score(seen["time_s"], run.soc, run.soc_std, truth)
     if ours is None:
@@ -135,7 +135,7 @@ def compare(cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float)
 
 
 def textbook(cell: CellModel, seen: SampleBlock, start_soc: float, grid: Floats) -> tuple[Floats, Floats]:
-    """SOC and its std by the EKF with two RC pairs."""
+    """Return SOC and its standard deviation by the EKF with two RC pairs."""
     a = cell.a
     r_s, r1, c1, r2, c2 = (
         f(0.5, a) for f in (chen_mora.r_s, chen_mora.r_ts, chen_mora.c_ts, chen_mora.r_tl, chen_mora.c_tl)
@@ -146,7 +146,7 @@ def textbook(cell: CellModel, seen: SampleBlock, start_soc: float, grid: Floats)
 
 
 def five(cell: CellModel, seen: SampleBlock, start_soc: float, grid: Floats) -> tuple[Floats, Floats]:
-    """The same by the EKF with five time constants."""
+    """Return SOC and its standard deviation by the EKF with five time constants."""
     p = filter_settings(cell, (grid[0], grid[1]), IdentifierSettings(), 1e-3, None)[0]
     ohm, energy_j = five_branches(p["weak_ohm"], p["strong_ohm"])
     columns = [np.ascontiguousarray(seen[n]) for n in ("time_s", "current_a", "voltage_v", "temperature_c")]

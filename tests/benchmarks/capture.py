@@ -22,17 +22,17 @@ from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWri
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOURS = (4, 16)
-"""Short and long: memory must not grow from one to the other."""
+"""Durations of a short and a long capture [h]; both must take equal memory."""
 GROWTH_MIB = 16.0
-"""Memory that an allocator may retain without growth by the input [MiB]."""
+"""Permitted difference of memory, which the allocator may retain [MiB]."""
 PIECE = 1_000_000
 RECORD = np.dtype([("arrival_s", "<f8"), ("length", "<u4"), ("data", "u1", SAMPLE_FRAME_BYTES), ("crc", "<u2")])
-"""A record of the capture that holds one frame, as a live line at 100 Hz brings them."""
+"""Record of a capture with one frame, as received live at 100 Hz."""
 
 
 @dataclass(frozen=True)
 class Replay:
-    """One replay: its summary, and its peak memory."""
+    """Result of a replay: summary and peak memory."""
 
     samples: int
     wall_s: float
@@ -42,7 +42,7 @@ class Replay:
 
 
 def rows() -> Iterator[Row]:
-    """Sixteen hours at 100 Hz, and how much more memory they take than four."""
+    """Measure sixteen hours at 100 Hz, and the additional memory compared with four."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pack.raw"
         samples = [hours * 3600 * RATE_HZ for hours in HOURS]
@@ -67,7 +67,7 @@ def rows() -> Iterator[Row]:
 
 
 def write_capture(path: Path, block: SampleBlock) -> None:
-    """A capture of the frames of ``block``, one frame in each record, each a millisecond after its sample."""
+    """Write a capture of a block, one frame a record, each a millisecond after its sample."""
     with CaptureWriter(path, CaptureHeader()) as writer:
         writer.write(0.0, b"\0" + hello(RATE_HZ))
     with path.open("ab") as file:

@@ -91,7 +91,7 @@ EXPERIMENTS = (
 )
 """The LG M50 has no relaxation test: step 1 cannot be run."""
 CONSTANT_C = 0.01
-"""Above this C-rate a capture charges or discharges [1/h]."""
+"""Minimum C-rate of a charge or discharge [1/h]."""
 VOLTAGE_STEP_V = 1e-3
 ROOM = [experiment.name for experiment in EXPERIMENTS if experiment.room]
 R_S_SOC = (0.98, 0.9, 0.7, 0.5, 0.3, 0.1, 0.05)
@@ -101,7 +101,7 @@ MIDDLE_SOC = 0.5
 
 
 def protocol(experiment: Experiment) -> Procedure:
-    """The protocol on one cell; a constant load is cut to its discharge."""
+    """Return the procedure on one cell; a constant load is cut to its discharge."""
     found = load_cell(experiment.cell, experiment.capacity_ah)
     captures = [
         Capture(name.split("/")[1], kind, _samples(name, kind, experiment)) for name, kind in experiment.captures
@@ -123,7 +123,7 @@ def discharge(rows: SampleBlock, least_a: float) -> SampleBlock:
 
 
 def lines(name: str, p: Procedure) -> Iterator[tuple[str, ...]]:
-    """One row of the table for each load."""
+    """Yield a table row for each load."""
     validating = [capture.name for capture in p.validating]
     for load, run in p.dynamic.items():
         aligned, above = run.aligned, run.above(KNEE_SOC)
@@ -161,7 +161,7 @@ def main() -> None:
 
 
 def errors(protocols: dict[str, Procedure]) -> Table:
-    """Tables 11 and 13."""
+    """Return the errors of Tables 11 and 13."""
     printed_means = ", ".join(f"{load} {value}" for load, value in printed_values.TABLE_11.items())
     table = Table(
         title=f"error of the voltage in %; printed means: {printed_means}; largest {printed_values.MAX_CONSTANT} (constant), "
@@ -210,7 +210,7 @@ def parameters(protocols: dict[str, Procedure]) -> Table:
 
 
 def verdicts(on: str, protocols: list[Procedure]) -> Table:
-    """The claims, each on the captures of several cells."""
+    """Return the verdict on each claim over the captures of several cells."""
     table = Table(title=f"claims on {on}; each must be met on more than half of them")
     for column in ("claim", "where", "criterion", "met", "found", "verdict"):
         table.add_column(column)
@@ -232,15 +232,15 @@ class FastInStep3(Procedure):
 
     @property
     def step_3(self) -> list[Capture]:
-        """All of them."""
+        """Return all loads."""
         return self.of(Kind.CONSTANT, Kind.RELAXATION)
 
 
 class OwnInStep3(FastInStep3):
-    """A load that validates has a part in its own R_s."""
+    """Procedure in which a validating load also contributes to its own R_s."""
 
     def r_s_without(self, name: str) -> SeriesResistanceFit:  # noqa: ARG002 - none is left out
-        """Use it."""
+        """Return the fit that includes the load."""
         return self.r_s_fit
 
 
@@ -249,7 +249,7 @@ class Unweighted(Procedure):
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
-        """Each value of the same weight."""
+        """Return the values with equal weights."""
         return {name: replace(curve, weight=np.ones_like(curve.weight)) for name, curve in super().r_s_curves.items()}
 
 
@@ -258,7 +258,7 @@ class PrintedSign(Unweighted):
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
-        """Each value negated."""
+        """Return the negated values."""
         return {name: replace(curve, r_s_ohm=-curve.r_s_ohm) for name, curve in super().r_s_curves.items()}
 
 
@@ -267,7 +267,7 @@ VARIANTS = {UNWEIGHTED: Unweighted, FAST: FastInStep3, "each load in its own ste
 
 
 def variants(experiment: Experiment, made: Procedure) -> dict[str, Procedure]:
-    """The protocol as ``made``, with step 3 done otherwise, and with other bounds."""
+    """Return variants of a procedure: other ways of step 3, and other bounds."""
     model = load_cell(experiment.cell, experiment.capacity_ah)
     bounds = {f"a{i}": model.bounds(i) for i in range(1, 13)}
     own_bounds = model.model_copy(update={"adaptation": bounds})
@@ -284,11 +284,11 @@ STEP_3 = {
     "(4.2) as printed: its sign, not weighted": PrintedSign,
     FAST: FastInStep3,
 }
-"""Ways of step 3 that the claim of Table 11 for steps is tested with."""
+"""Variants of step 3 for the claim of Table 11 on steps."""
 
 
 def steps_met(protocols: dict[str, Procedure]) -> Iterator[tuple[str, str, str]]:
-    """Each way of step 3 and how often the printed mean error under steps is met, on all captures and at room temperature."""
+    """Yield for each variant of step 3 how often the printed mean error under steps is met, on all captures and at room temperature."""
     for what, variant in STEP_3.items():
         made = {name: variant(p.cell, p.captures, VOLTAGE_STEP_V) for name, p in protocols.items()}
         found = (claim("steps, mean", [made[name] for name in names]) for names in (list(made), ROOM))
@@ -318,7 +318,7 @@ def ablation(name: str, otherwise: dict[str, Procedure]) -> Table:
 
 
 def resistances(name: str, otherwise: dict[str, Procedure]) -> Table:
-    """R_s by (4.2) of each load of one cell, and by the fit to their mean, over SOC."""
+    """Return R_s over SOC by (4.2) for each load of a cell, and by the fit to their mean."""
     table = Table(title=f"{name}: R_s by (4.2) in mohm, by SOC; its fit (2.9)")
     for column in ("load", "its current in A", *map(str, R_S_SOC)):
         table.add_column(column, justify="right")

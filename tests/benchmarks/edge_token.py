@@ -39,7 +39,7 @@ PERIOD_OF_BLOCKS_S = 0.5
 MAX_RATIO = 15.0
 """Target for the longest wait in an attack divided by the longest one without."""
 IN_FLIGHT = 64
-"""Messages of the attacker that wait for an acknowledgement."""
+"""Maximum number of the attacker's unacknowledged messages."""
 ATTACKS = {
     "blocks of 65,535 samples": lambda: heavy_block(65_535, 1.0),
     "blocks of 20,000 samples, 1 Hz": lambda: heavy_block(20_000, 1.0, store=2),
@@ -64,7 +64,7 @@ async def _attack(port: int, token: str, data: bytes) -> None:
 
 @contextlib.contextmanager
 def attacked(tenant: Tenant, name: str) -> Iterator[None]:
-    """Run an attack meanwhile."""
+    """Run an attack while the context lasts."""
     arguments = tenant.cluster.mqtt_port, tenant.token(ATTACKER), name
     process = mp.get_context("spawn").Process(target=attack, args=arguments, daemon=True)
     process.start()
@@ -88,19 +88,19 @@ class Waits:
     waits_s: list[float] = field(default_factory=list)
 
     async def hear(self, message: Msg) -> None:
-        """Take a state."""
+        """Process a published state."""
         key = message.subject.split(".")[1], json.loads(message.data)["board_time_s"]
         if key in self.published_s:
             self.waits_s.append(time.monotonic() - self.published_s.pop(key))
 
     async def all_arrived(self) -> None:
-        """Wait until no block is left."""
+        """Wait until a state has arrived for every block."""
         async with asyncio.timeout(LONG_S):
             while self.published_s:  # noqa: ASYNC110 - states arrive in a callback
                 await asyncio.sleep(0.01)
 
     def take(self) -> tuple[float, float, int]:
-        """Return median, maximum [s] and number of the waits, and begin again."""
+        """Return median [s], maximum [s] and number of the waits, and reset them."""
         waits_s, self.waits_s = self.waits_s, []
         return float(np.median(waits_s)), max(waits_s), len(waits_s)
 
@@ -189,7 +189,7 @@ async def _kept(reader: Client, number: int) -> Row:
 
 
 def rows(seconds: float) -> Iterator[Row]:
-    """Measure for this duration each [s]."""
+    """Measure without and with each attack for ``seconds`` [s]."""
     load_kernels()  # compiled once, not by the worker
     with tempfile.TemporaryDirectory() as folder:
         yield from asyncio.run(measure(Path(folder), seconds))

@@ -46,15 +46,15 @@ from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
 BOARD_RATE_HZ = 1000
-"""Rate in the hello: the protocol has no higher rate, the timestamps show it."""
+"""Rate in the hello message [Hz], the highest of the protocol. The timestamps show the true rate."""
 SEND_S = 0.002
 """Interval at which the board's bytes leave, as on USB [s]."""
 BURST_S = 0.006
-"""No more of them leaves at once [s]."""
+"""Maximum duration of frames sent in one burst [s]."""
 CHUNK_S = 10.0
 """Duration that the sender prepares at a time [s]."""
 WARM_S = 20.0
-"""Before it processor time and memory are not measured [s]."""
+"""Warm-up time before CPU time and memory are measured [s]."""
 HALF_DAY_S = 8.0 * 3600.0
 """Duration of the discharge pulses before the charge pulses [s]."""
 MAX_CPU, MAX_GROWTH_MIB = 0.20, 2.0
@@ -74,7 +74,7 @@ folder = "{folder}"
 
 
 def load(first: int, count: int, rate_hz: int, soc: float) -> tuple[SampleBlock, float]:
-    """Samples ``first`` and after of a pack under pulses, and the SOC at their end; branches begin at rest."""
+    """Return ``count`` samples from ``first`` on of a pack under pulses, and the SOC at their end. The RC pairs start at rest."""
     cell = load_cell(CELL)
     block = np.zeros(count, dtype=SAMPLE)
     time_s = np.arange(first, first + count) / rate_hz
@@ -89,7 +89,7 @@ def load(first: int, count: int, rate_hz: int, soc: float) -> tuple[SampleBlock,
 
 
 def chunks(rate_hz: int, seconds: float, chunk_s: float) -> Iterator[bytes]:
-    """The line's bytes."""
+    """Yield the bytes of the line."""
     soc, first, total = 0.9, 0, round(rate_hz * seconds)
     while first < total:
         count = min(round(rate_hz * chunk_s), total - first)
@@ -129,12 +129,12 @@ class Run:
 
     sent: int
     no_room: int
-    """Frames for which the line had no room: the service had not read for long."""
+    """Number of frames dropped by the full line, because the service did not read."""
     line: dict[str, int]
     samples: dict[str, int]
     cpu: float
     rss_mib: tuple[float, float]
-    """Mean of the first half and of the second."""
+    """Mean resident memory of the first and of the second half [MiB]."""
 
 
 async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> Run:
@@ -175,7 +175,7 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
             service.send_signal(signal.SIGINT)
             await service.wait()
         finally:
-            if service.returncode is None:  # something has failed: nothing is left running
+            if service.returncode is None:  # after an error, no process may remain
                 service.kill()
                 await service.wait()
             os.close(slave)
@@ -190,7 +190,7 @@ def _send_over(master: "mp.reduction.DupFd", *arguments: object) -> None:
 
 
 def fed(rate_hz: int, seconds: float) -> tuple[BoardProtocol, Estimator, float, list[float]]:
-    """All bytes through decoder and estimator in reads of ``READ_BYTES``: both, seconds that took, RSS each hour [MiB]."""
+    """Process all bytes in reads of ``READ_BYTES``. Return decoder, estimator, elapsed time [s] and hourly RSS [MiB]."""
     dialect, estimator, process = BoardProtocol(), Estimator(load_cell(CELL)), psutil.Process()
     dialect.feed(0.0, hello(rate_hz))
     rss, took_s, bytes_fed = list[float](), 0.0, 0
@@ -209,7 +209,7 @@ def fed(rate_hz: int, seconds: float) -> tuple[BoardProtocol, Estimator, float, 
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
-    """Measure."""
+    """Measure the load and the day of serial bytes."""
     if options.idle:
         yield from idle_rows()
     if options.lost:
@@ -240,7 +240,7 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         sent = round(360_000 * options.hours)
         what = f"{options.hours:g} h of 100 Hz as serial bytes"
         yield Row(what, "none lost", f"{samples:,} of {sent:,} in {took_s:.0f} s", sent == taken == samples)
-        begun = math.ceil(len(rss) / 6)  # what grows at first: the allocator's pools
+        begun = math.ceil(len(rss) / 6)  # the allocator's pools grow at first
         growth = f"{rss[begun - 1]:.1f} MiB after {begun} h, {rss[-1]:.1f} at the end"
         yield Row("  resident memory", "flat", growth, rss[-1] - rss[begun - 1] < MAX_GROWTH_MIB)
     if options.attack_s:
@@ -273,7 +273,7 @@ def _idle_row(program: str, attack: Coroutine[None, None, Outcome]) -> Row:
 
 
 def lost_sensor_rows(lost_s: float) -> Iterator[Row]:
-    """Attack by a lost sensor."""
+    """Measure the reaction to a lost sensor."""
     with tempfile.TemporaryDirectory() as folder:
         broker = Broker(Path(folder)).start()
         try:

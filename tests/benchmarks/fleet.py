@@ -32,7 +32,7 @@ from tests.benchmarks.fleet_rig import Rig, cpu_s, make, rig, rss_mib
 from tests.patience import LONG_S
 
 SEED, DAY_S, PARTITIONS = 1, 86_400.0, 64
-LISTENED = 256
+OBSERVED_PACKS = 256
 """Number of packs whose estimates are received, evenly spread."""
 
 
@@ -54,7 +54,7 @@ class Heard:
 
     @property
     def blocks(self) -> int:
-        """Taken by all workers."""
+        """Number of blocks processed by all workers."""
         return sum(worker.blocks for worker in self.workers.values())
 
     def total(self, what: str) -> int:
@@ -63,7 +63,7 @@ class Heard:
 
 
 def main() -> None:
-    """Measure, print a table, and end with 1 where a target was missed."""
+    """Measure, print a table, and exit with 1 if a target was missed."""
     arguments = _arguments()
     load_kernels()  # compiled once, not by each worker
     rows = [asyncio.run(_measured(packs, arguments)) for packs in arguments.packs]
@@ -127,7 +127,7 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     await asyncio.to_thread(fleet_rig.stop_workers)
     stopped_s = time.monotonic() - stopped_s
     raw_bytes, raw_messages, states_bytes = await _stored(fleet_rig)
-    pack_days = max(1, taken) * BLOCK_S / DAY_S  # of what was taken: also where that is not all
+    pack_days = max(1, taken) * BLOCK_S / DAY_S  # of the processed blocks, even if some are missing
     work_s = sum(used_s[name] for name in names)
     a_day = DAY_S / BLOCK_S
     sys.stderr.write((fleet_rig.folder / "edges.log").read_text().splitlines()[-1] + "\n")
@@ -156,7 +156,7 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
 
 
 async def _listen(fleet_rig: Rig, fleet: SimulatedFleet) -> Heard:
-    """Receive heartbeats, and the estimates of some packs."""
+    """Receive heartbeats and the estimates of some packs."""
     heard = Heard()
     nc = await fleet_rig.connected()
     index = {name: i for i, name in enumerate(fleet.names)}
@@ -174,7 +174,7 @@ async def _listen(fleet_rig: Rig, fleet: SimulatedFleet) -> Heard:
         heard.within[bool(abs(truth - estimate["soc"]) <= 2.0 * estimate["soc_std"])] += 1
 
     await nc.subscribe(subjects.worker(), cb=beat)
-    for name in fleet.names[:: max(1, len(fleet.names) // LISTENED)]:
+    for name in fleet.names[:: max(1, len(fleet.names) // OBSERVED_PACKS)]:
         await nc.subscribe(subjects.published(name, "state"), cb=state)
     await nc.flush()
     return heard
@@ -182,7 +182,7 @@ async def _listen(fleet_rig: Rig, fleet: SimulatedFleet) -> Heard:
 
 async def _until(true: Any) -> None:
     async with asyncio.timeout(LONG_S):
-        while not true():  # noqa: ASYNC110 - it has no other way to tell
+        while not true():  # noqa: ASYNC110 - messages arrive in callbacks
             await asyncio.sleep(0.1)
 
 
@@ -193,7 +193,7 @@ def _wire_bytes(fleet_rig: Rig) -> int:
 
 
 async def _stored(fleet_rig: Rig) -> tuple[int, int, int]:
-    """Bytes and messages of the blocks' stream, and bytes of the checkpoints'."""
+    """Return bytes and messages of the stream of blocks, and bytes of that of checkpoints."""
     nc = await fleet_rig.connected()
     js = nc.jetstream()
     raw = (await js.stream_info(subjects.RAW_STREAM)).state

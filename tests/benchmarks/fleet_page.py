@@ -33,7 +33,7 @@ def say(text: str) -> None:
 
 
 async def send(nc: Client, packs: int) -> None:
-    """All packs once a minute, evenly, and two workers, for ever."""
+    """Publish all packs once a minute, evenly, and two workers, until cancelled."""
     fleet, sent, begin_s, beaten_s = make_packs(packs), 0, time.monotonic(), 0.0
     while True:
         now_s = time.monotonic()
@@ -51,7 +51,7 @@ async def send(nc: Client, packs: int) -> None:
 
 
 async def read(url: str, got: dict[str, float]) -> None:
-    """Read as a browser does."""
+    """Read the event stream as a browser does."""
     async with (
         aiohttp.ClientSession(timeout=aiohttp.ClientTimeout()) as session,
         session.get(f"{url}/events") as events,
@@ -66,7 +66,7 @@ async def read(url: str, got: dict[str, float]) -> None:
 
 
 async def measure(packs: int, minutes: float) -> None:
-    """Load the table, send for two minutes, then look at the process for some."""
+    """Load the table, send for two minutes, then measure the process for ``minutes``."""
     with tempfile.TemporaryDirectory() as temporary, running(Path(temporary)) as cluster:
         nc = await nats.connect(cluster.url)
         await make_streams(nc)

@@ -1,4 +1,4 @@
-"""A whole fleet as processes on the loopback: server, workers, simulated edges. What both benches of the fleet begin with."""
+"""Fleet as processes on the loopback for the fleet's benchmarks: server, workers, simulated edges."""
 
 import contextlib
 import signal
@@ -32,7 +32,7 @@ class Rig:
         self._names = 0
 
     def start_worker(self, *, checkpoint_s: float) -> str:
-        """Start one, under a name that none had. Returns it."""
+        """Start a worker under a new name, and return the name."""
         self._names += 1
         name = f"w{self._names}"
         arguments = ["--server", self.server, "--name", name, "--checkpoint-s", str(checkpoint_s)]
@@ -64,7 +64,7 @@ class Rig:
     def simulate(
         self, packs: int, *, seed: int, begin: str, speed: float, blocks: int | None = None
     ) -> subprocess.Popen[bytes]:
-        """Simulate their edges, for a number of blocks each, or until stopped."""
+        """Simulate the edges of a fleet, for a number of blocks each or until stopped."""
         arguments = ["--packs", packs, "--seed", seed, "--begin", begin, "--speed", speed]
         arguments += ["--blocks", blocks] if blocks else []
         return self.run("simulate", "--mqtt", self._mqtt, *map(str, arguments), log="edges")
@@ -75,7 +75,7 @@ class Rig:
             return subprocess.Popen([PROGRAM, "fleet", *arguments], stdout=file, stderr=file)
 
     def end(self) -> None:
-        """Leave none behind."""
+        """Kill all processes."""
         for process in self.workers.values():
             process.kill()
             process.wait(LONG_S)
@@ -87,7 +87,7 @@ class Rig:
 
 @contextlib.contextmanager
 def rig(folder: Path, nodes: int, *, partitions: int) -> Iterator[Rig]:
-    """A server that is ready, and no worker yet."""
+    """Run a server without workers."""
     with running(folder, nodes, partitions=partitions) as engine:
         made = Rig(folder, engine)
         try:
@@ -97,7 +97,7 @@ def rig(folder: Path, nodes: int, *, partitions: int) -> Iterator[Rig]:
 
 
 async def make(rig: Rig, *, partitions: int) -> None:
-    """The streams, with as many replicas as there are nodes."""
+    """Create the streams, with a replica on each node."""
     nc = await rig.connected()
     await make_streams(nc, partitions=partitions, replicas=len(rig.engine.nodes))
     await nc.close()
@@ -110,5 +110,5 @@ def cpu_s(pid: int) -> float:
 
 
 def rss_mib(pid: int) -> float:
-    """Memory of a process [MiB]."""
+    """Return the resident memory of a process [MiB]."""
     return float(psutil.Process(pid).memory_info().rss / 2**20)

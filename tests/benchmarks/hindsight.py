@@ -42,7 +42,7 @@ def limits(slot_s: float = SLOT_S) -> Limits:
 
 
 class Known(NamedTuple):
-    """At the end of a slot."""
+    """Estimate at the end of a slot, with its true error."""
 
     hour: Hour
     error: float
@@ -74,7 +74,7 @@ def _outcome(group: Group, folder: Path) -> list[str]:
 
 
 def judged(pack: list[Known]) -> list[float]:
-    """Error over std of those with a surer one later."""
+    """Return error over standard deviation of the estimates that have a more certain later one."""
     std = np.array([known.hour.soc_mean_std or np.nan for known in pack])
     return [
         known.error / std[n]

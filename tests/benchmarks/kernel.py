@@ -27,7 +27,7 @@ AT_1_HZ, APART, AGREED = 20_000, 50, 10_000
 
 
 def rows() -> Iterator[Row]:
-    """Kernel and C on the same block in turn, the best of all rounds for each; then calls from Python."""
+    """Measure kernel and C alternately on one block (best of all rounds), then calls from Python."""
     block = pulses(BLOCK)
     ours, theirs = kernel_and_c(block)
     printed, learning = both_laws(block)
@@ -55,7 +55,7 @@ def rows() -> Iterator[Row]:
 
 
 def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
-    """Time per sample of ``run`` and of its twin in C [ns]."""
+    """Return the time per sample of ``run`` and of its C version [ns]."""
     estimator, twin = (Estimator(load_cell(CELL), identifier=None) for _ in range(2))
     trace = np.zeros(BLOCK, dtype=TRACE)
     with tempfile.TemporaryDirectory() as folder:
@@ -75,7 +75,7 @@ def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
 
 
 def both_laws(block: SampleBlock) -> tuple[float, float]:
-    """Time per sample of ``run`` with the printed and with the learning law, in turn [ns]."""
+    """Return the time per sample of ``run`` with the printed and the learning law, measured alternately [ns]."""
     laws = [Estimator(load_cell(CELL), ObserverSettings(law=law), identifier=None) for law in ("improved", "learning")]
     best = np.full(2, np.inf)
     for estimator in laws:
@@ -88,7 +88,7 @@ def both_laws(block: SampleBlock) -> tuple[float, float]:
 
 
 def whole_step(block: SampleBlock) -> float:
-    """Time per sample of ``run`` with the filter [ns], its updates and the fits included."""
+    """Return the time per sample of ``run`` with the filter, including updates and fits [ns]."""
     estimator = Estimator(load_cell(CELL), identifier=IdentifierSettings())
     estimator.run(block)
     best = np.inf
@@ -99,7 +99,7 @@ def whole_step(block: SampleBlock) -> float:
 
 
 def learning_at_1_hz() -> float:
-    """Time per sample of ``run`` with the learning law on a counted SOC, at the samples of ``steps_at_1_hz`` [ns]."""
+    """Return the time per sample of ``run`` with the learning law on a counted SOC, with the samples of ``steps_at_1_hz`` [ns]."""
     block = pulses(AT_1_HZ, rate_hz=1)
     estimator = Estimator(load_cell(CELL), ObserverSettings(law="learning"), identifier=None)
     estimator.run(block)
@@ -112,7 +112,7 @@ def learning_at_1_hz() -> float:
 
 
 def steps_at_1_hz() -> tuple[float, float]:
-    """Time per sample of ``run`` right after switch-on, and once one hypothesis is left [ns]."""
+    """Return the time per sample of ``run`` after switch-on, and with one remaining hypothesis [ns]."""
     block = pulses(AT_1_HZ, rate_hz=1)
     estimator = Estimator(load_cell(CELL), identifier=IdentifierSettings())
     estimator.run(block)
@@ -126,7 +126,7 @@ def steps_at_1_hz() -> tuple[float, float]:
 
 
 def calls_from_python(block: SampleBlock) -> tuple[float, float]:
-    """Time of one ``Estimator.step``, and of the kernel's own ``step``, called sample by sample [ns]."""
+    """Return the time of ``Estimator.step`` and of the kernel's ``step``, called for single samples [ns]."""
     estimator = Estimator(load_cell(CELL), identifier=None)
     state, settings = estimator.record, estimator.settings_record
     samples = [(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), 0, math.nan) for x in block[:CALLS]]
@@ -148,7 +148,7 @@ def calls_from_python(block: SampleBlock) -> tuple[float, float]:
 
 
 def elapsed_ns(run: Callable[[], None]) -> int:
-    """Processor time of a call [ns]: others on the machine do not count."""
+    """Return the CPU time of a call [ns], independent of other processes."""
     start = time.thread_time_ns()
     run()
     return time.thread_time_ns() - start

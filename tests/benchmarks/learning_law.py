@@ -50,17 +50,17 @@ STARTS = [factors for factors in itertools.product((0.5, 2.0), repeat=5) if fact
 HOURS = (0.5, 1.0, 3.0, 10.0)
 NOISES_V = (0.0, 1e-3, 5e-3)
 CONVERGING = [0, 2, 4]
-K_STILL_V = 9.0
-"""A dead zone that nothing gets out of [V]."""
+INFINITE_DEAD_ZONE_V = 9.0
+"""Dead zone that no error exceeds [V]."""
 K_BOUND = learning_law.MAX_RATE_HZ / RATE_HZ
-OF_OBSERVER = ("dead_zone_v", "k0")
+OBSERVER_SETTINGS = ("dead_zone_v", "k0")
 LEAK = 1e-4
-"""Gain of the law without a memory: ten times as much already diverges."""
+"""Gain of the law without a memory. It diverges at ten times this value."""
 HIGH_OHM = 10.0
-SOC_OFF = 0.05
-NO_N: dict[str, Any] = {"nussbaum": "k2-cos", "k0": 0.0, "dead_zone_v": K_STILL_V}
-"""N(k) = k^2 cos k with a k that stays 0."""
-NO_WATCH = {"lock_error_v": 100.0}
+SOC_ERROR = 0.05
+NO_N: dict[str, Any] = {"nussbaum": "k2-cos", "k0": 0.0, "dead_zone_v": INFINITE_DEAD_ZONE_V}
+"""Settings of N(k) = k^2 cos k with constant k = 0."""
+NO_LOCK_DETECTION = {"lock_error_v": 100.0}
 CAPTURES = ("cell5_relaxation_c2", "cell1_random_steps", "cell1_dst")
 Run = Callable[[Any, Any, Any, Any], int]
 
@@ -72,7 +72,7 @@ def learned(
     settings: Mapping[str, float] | None = None,
     ohms: float = 1.0,
 ) -> np.ndarray:
-    """Relative errors after each of ``HOURS`` from each start, of a cell of ``ohms`` times the resistances; shape (starts, hours, 5)."""
+    """Return the relative errors after each of ``HOURS`` from each start, for a cell with ``ohms`` times the resistances; shape (starts, hours, 5)."""
     found = np.empty((len(STARTS), len(HOURS), 5))
     trace = np.zeros(block.size, dtype=TRACE)
     for n, factors in enumerate(STARTS):
@@ -80,7 +80,7 @@ def learned(
         estimator = learner(file_off_by(ohms * r_s, ohms * r_ts, tau_ts, ohms * r_tl, tau_tl), soc)
         before = 0
         for name, value in (settings or {}).items():
-            estimator.settings_record["observer" if name in OF_OBSERVER else "learning"][name] = value
+            estimator.settings_record["observer" if name in OBSERVER_SETTINGS else "learning"][name] = value
         for h, hours in enumerate(HOURS):
             until = int(3600 * hours)
             run(estimator.record, estimator.settings_record, block[before:until], trace)
@@ -89,34 +89,34 @@ def learned(
 
 
 def percent(found: np.ndarray) -> list[str]:
-    """Median over the starts of the largest error of R_s and both products, and of all five [%], for each hour."""
+    """Return for each hour the median over the starts of the largest error of R_s and both RC products, and of all five [%]."""
     converging = 100.0 * np.median(found[:, :, CONVERGING].max(axis=2), axis=0)
     every = 100.0 * np.median(found.max(axis=2), axis=0)
     return [f"{one:.1f} / {other:.1f}" for one, other in zip(converging, every, strict=True)]
 
 
 def printed(block: SampleBlock, *, gain: float | None) -> tuple[str, str]:
-    """The printed law on the same data: largest error of R_s and both products [%]; e, RMS [mV]."""
+    """Return the results of the printed law: largest error of R_s and both RC products [%], and RMS of e [mV]."""
     found, e = [], []
     for factors in STARTS:
         estimator = of_printed_law(file_off_by(*factors))
         estimator.run(block[:1])
         if gain is not None:
             estimator.state["gain"] = gain
-            estimator.settings["dead_zone_v"] = K_STILL_V
+            estimator.settings["dead_zone_v"] = INFINITE_DEAD_ZONE_V
         e.append(estimator.run(block[1:])["tracking_error_v"])
         found.append(max(products(estimator)))
     return f"{100.0 * np.median(found):.1f}", f"{1e3 * float(np.sqrt(np.mean(np.square(e)))):.2f}"
 
 
 def of_printed_law(file: CellModel) -> Estimator:
-    """Algorithm 1; its gain does not start again and lock is not watched, so that N stays as it is."""
+    """Return an estimator with Algorithm 1 without gain reset and lock detection, so that N is unchanged."""
     settings = ObserverSettings(rearm_gain=None, lock_error_v=100.0)
     return Estimator(file, settings, identifier=None, initial_soc=FIRST_SOC, voltage_resolution_v=RESOLUTION_V)
 
 
 def products(estimator: Estimator) -> tuple[float, float, float]:
-    """Errors of R_s, R_ts C_ts and R_tl C_tl at SOC 0.5, relative."""
+    """Return the relative errors of R_s, R_ts C_ts and R_tl C_tl at SOC 0.5."""
     a, true = estimator.state[0]["a"], TRUTH.a
     of = (
         lambda p: elements.r_s(0.5, p),
@@ -134,7 +134,7 @@ def put_in(kernel: Any, **others: Any) -> Any:
 
 
 def run_with(**others: Any) -> Run:
-    """The kernels' ``run`` with other parts of the learning law."""
+    """Return the kernels' ``run`` with replaced parts of the learning law."""
     law = put_in(learning_law.learning_step, **others)
     run: Run = put_in(step.run, step=put_in(step.step, learning_step=law))
     return run
@@ -142,7 +142,7 @@ def run_with(**others: Any) -> Run:
 
 @njit
 def step_alone(m: Record, q: Record, share: float) -> None:
-    """Theta moves; states and offset stay as the former theta made them."""
+    """Change theta without correcting states and offset."""
     way = 0.0
     for j in range(q.count):
         way += m.step[j] * m.step[j]
@@ -152,7 +152,7 @@ def step_alone(m: Record, q: Record, share: float) -> None:
 
 @njit
 def gradient(m: Record, q: Record) -> bool:
-    """Return the gradient on the memory, over its trace, in place of Newton's step."""
+    """Compute the gradient on the memory divided by its trace, in place of Newton's step."""
     total = 0.0
     for j in range(q.count):
         total += m.information[j, j] + q.leak_v2s[j]
@@ -166,7 +166,7 @@ def gradient(m: Record, q: Record) -> bool:
 
 @njit
 def remember_nothing(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """This sample alone: sensitivity times e, normalised."""
+    """Use only the present sample: normalized product of sensitivity and e."""
     told = 0.0
     for j in range(q.count):
         told += m.psi[j] * m.psi[j]
@@ -176,7 +176,7 @@ def remember_nothing(m: Record, q: Record, dt_s: float, e: float) -> None:
 
 @njit
 def along_pull(m: Record, q: Record) -> bool:
-    """With ``remember_nothing``: theta' = gamma k (psi e / (eps2^2 + psi^2) - LEAK (theta - theta_m))."""
+    """Compute the step for ``remember_nothing``: theta' = gamma k (psi e / (eps2^2 + psi^2) - LEAK (theta - theta_m))."""
     for j in range(q.count):
         m.step[j] = m.pull[j] - LEAK * (m.theta[j] - q.middle[j])
     return True
@@ -205,7 +205,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "no leakage": {"settings": {"leak_v2s": 1e-14}},
     "no injection": {"settings": NO_INJECTION},
     "injection u = -N e into both branches, N = 1/s": {"others": {"inject": inject_as_printed}},
-    "k = 1": {"settings": {"dead_zone_v": K_STILL_V}},
+    "k = 1": {"settings": {"dead_zone_v": INFINITE_DEAD_ZONE_V}},
     "k at its bound from the start": {"settings": {"k0": K_BOUND}},
     "ten times this bound, k there from the start": {
         "others": {"MAX_RATE_HZ": 10.0 * learning_law.MAX_RATE_HZ},
@@ -215,7 +215,7 @@ PARTS: dict[str, dict[str, Any]] = {
 
 
 def ablation(blocks: Mapping[str, tuple[SampleBlock, float]]) -> Iterator[tuple[str, ...]]:
-    """A row for each part: without it, errors at 1 h and 10 h for each of the blocks."""
+    """Yield a row for each removed part: errors at 1 h and 10 h for each block."""
     for name, changed in PARTS.items():
         run = run_with(**changed["others"]) if "others" in changed else step.run
         cells = []
@@ -226,23 +226,23 @@ def ablation(blocks: Mapping[str, tuple[SampleBlock, float]]) -> Iterator[tuple[
 
 
 def gains() -> Iterator[tuple[str, ...]]:
-    """Print the value of k on a cell with ten times the resistances, whose errors are ten times as large."""
+    """Yield the effect of k on a cell with ten times the resistances, whose errors are ten times as large."""
     block = random_steps(3.0, 1e-3, cell=file_off_by(HIGH_OHM, HIGH_OHM, 1.0, HIGH_OHM, 1.0))
     for period_s, still in itertools.product((60.0, 1000.0), (False, True)):
-        settings = {"rate": 1.0 / period_s} | ({"dead_zone_v": K_STILL_V} if still else {})
+        settings = {"rate": 1.0 / period_s} | ({"dead_zone_v": INFINITE_DEAD_ZONE_V} if still else {})
         found = 100.0 * np.median(learned(block, settings=settings, ohms=HIGH_OHM)[:, :3, 0], axis=0)
         yield f"1/{period_s:g} s", "1" if still else "as it grows", *(f"{one:.1f}" for one in found)
 
 
 def each_element(block: SampleBlock) -> Iterator[tuple[str, ...]]:
-    """Median error of each of the five [%] with a counted SOC that is too low."""
-    found = 100.0 * np.median(learned(block, FIRST_SOC - SOC_OFF), axis=0)
+    """Yield the median error of each element [%] with a counted SOC that is too low."""
+    found = 100.0 * np.median(learned(block, FIRST_SOC - SOC_ERROR), axis=0)
     for hours, of_five in zip(HOURS, found, strict=True):
         yield f"{hours:g} h", *(f"{one:.1f}" for one in of_five)
 
 
 def without_n() -> Iterator[tuple[str, ...]]:
-    """On each real capture, the identifier beside it: how far N = 0 takes a1..a15 from where N(k) leaves them."""
+    """Yield for each real capture, with the identifier, how much a1..a15 with N = 0 differ from those with N(k)."""
     for name in CAPTURES:
         path = SHARED_DATA / "ncr18650" / f"{name}.csv.gz"
         if not path.is_file():
@@ -250,7 +250,7 @@ def without_n() -> Iterator[tuple[str, ...]]:
             continue
         rows = load_capture(path).rows
         as_printed, with_n = ended(rows, {})
-        for watch, settings in (("as it is", NO_N), ("off", NO_N | NO_WATCH)):
+        for watch, settings in (("as it is", NO_N), ("off", NO_N | NO_LOCK_DETECTION)):
             estimator, trace = ended(rows, settings)
             same = all(np.array_equal(trace[f], with_n[f], equal_nan=True) for f in ("soc", "soc_std", "innovation_v"))
             same &= estimator.record["elements"].tobytes() == as_printed.record["elements"].tobytes()
@@ -265,13 +265,13 @@ def without_n() -> Iterator[tuple[str, ...]]:
 
 
 def ended(rows: SampleBlock, observer: Mapping[str, Any]) -> tuple[Estimator, SampleBlock]:
-    """The estimator after a capture, and its trace."""
+    """Return the estimator after a capture, and its trace."""
     estimator = Estimator(load_cell("ncr18650"), ObserverSettings.model_validate(observer))
     return estimator, estimator.run(rows).copy()
 
 
 def guarantees() -> Iterator[tuple[str, str]]:
-    """A row for each promise of docs/theory/observer.md that is not one of convergence."""
+    """Yield a row for each guarantee of docs/theory/observer.md except convergence."""
     noisy = learner(TRUTH)
     q, theta = noisy.settings_record[0]["learning"], noisy.record[0]["learning"]["theta"]
     inside, estimate_v = True, []
@@ -300,12 +300,12 @@ def guarantees() -> Iterator[tuple[str, str]]:
 
 
 def ratio_of_r_s(estimator: Estimator) -> float:
-    """R_s as learned over the file's."""
+    """Return the learned R_s divided by the file's."""
     return float(np.exp(estimator.record[0]["learning"]["theta"][0]))
 
 
 def jump() -> Iterator[tuple[int, float]]:
-    """Minutes after R_s has jumped to 1.5 times, and its error then."""
+    """Yield times after a step of R_s to 1.5 times [min], and the errors then."""
     grown = 1.5
     current_a = held_currents(6.0, np.random.default_rng(2))
     block, after = (
@@ -323,7 +323,7 @@ def jump() -> Iterator[tuple[int, float]]:
 
 
 def table(title: str, columns: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> None:
-    """Print as it is done."""
+    """Print a table row by row."""
     shown = Table(title=title)
     for column in columns:
         shown.add_column(column)
@@ -355,7 +355,7 @@ def main() -> None:
             {
                 "1 mV": (blocks[1e-3], FIRST_SOC),
                 "5 mV": (blocks[5e-3], FIRST_SOC),
-                "SOC": (blocks[1e-3], FIRST_SOC - SOC_OFF),
+                "SOC": (blocks[1e-3], FIRST_SOC - SOC_ERROR),
             }
         ),
     )

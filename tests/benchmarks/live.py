@@ -1,4 +1,4 @@
-"""The real service between a board on a pseudo-terminal and a subscriber of Mosquitto, each a process of its own."""
+"""Real service between a board on a pseudo-terminal and a Mosquitto subscriber, all as processes."""
 
 import asyncio
 import json
@@ -26,10 +26,10 @@ from tests.mosquitto import MOSQUITTO, Broker
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 PUBLISH_RATE_HZ = 10
-"""The highest that the settings allow: each message holds the newest sample of its window."""
+"""Highest permitted publish rate [Hz]. Each message has the newest sample of its window."""
 SETTLE_S, MEASURE_S, PATIENCE_S = 2.0, 20.0, 30.0
 BARE_MESSAGES, BARE_BYTES = 100, 945
-"""Messages of the bare publish, and their size: that of a state."""
+"""Number and size of the messages of the bare publish; the size is that of a state."""
 MAX_S = 120
 """Duration of a prepared signal [s]."""
 
@@ -55,7 +55,7 @@ folder = "{folder}"
 
 @dataclass(frozen=True)
 class State:
-    """One message on the state topic, and its arrival on the monotonic clock [s]."""
+    """Message on the state topic, with the monotonic clock of its arrival [s]."""
 
     arrival_s: float
     board_time_s: float
@@ -71,7 +71,7 @@ class Run:
     first_s: float
     """Time from the start of the service to its first estimate [s]."""
     cpu: float
-    """Part of one core that the service took while measured."""
+    """CPU time of the service as a fraction of one core."""
     latency_s: NDArray[np.float64]
     """Time from a sample taken to the reception of its estimate [s]."""
     sent: int
@@ -96,7 +96,7 @@ class Signal:
 
 
 def rows() -> Iterator[Row]:
-    """A fast board, a usual board, and the start."""
+    """Measure a fast board, a usual board, and the start."""
     if MOSQUITTO is None:
         yield Row("live over a PTY", "-", "mosquitto is not installed", None)
         return
@@ -146,7 +146,7 @@ async def _bare_publish(server: Broker) -> float:
 
 @contextmanager
 def broker(folder: Path) -> Iterator[Broker]:
-    """Mosquitto on a free port."""
+    """Run Mosquitto on a free port."""
     server = Broker(folder).start()
     try:
         yield server
@@ -155,7 +155,7 @@ def broker(folder: Path) -> Iterator[Broker]:
 
 
 def pack_file(folder: Path, name: str, port: str, rate_hz: int, server: Broker, publish_rate_hz: float) -> Path:
-    """Settings of a pack behind the board on ``port``."""
+    """Write the settings of a pack behind the board on ``port``."""
     values = {"name": name, "cell": CELL, "port": port, "rate_hz": rate_hz, "url": server.url}
     path = folder / f"{name}.toml"
     path.write_text(PACK.format(**values, publish_rate_hz=publish_rate_hz, folder=folder))

@@ -73,7 +73,7 @@ class Loss:
 
 
 async def attack(broker: Broker, folder: Path, lost_s: float) -> list[Loss]:
-    """Run the service, take one quantity after the other from it, and give each back."""
+    """Run the service; remove and restore one quantity after the other."""
     out, program = folder / "ran", folder / "hook"
     out.touch()
     program.write_text(f'#!/bin/sh\necho "$BMS_NAME $BMS_STATE" >> {out}\n')
@@ -87,7 +87,7 @@ async def attack(broker: Broker, folder: Path, lost_s: float) -> list[Loss]:
 
 
 async def _lose(live: Listener, out: Path, values: dict[str, object], quantity: str, alarm: str) -> Loss:
-    """Let a quantity become null until its alarm's hook has run, and give it back."""
+    """Publish null for a quantity until its alarm's hook has run; then restore the quantity."""
     fault, topic, ran = "bms/attack/alarm/sensor_fault", f"bms/attack/alarm/{alarm}", len(_lines(out))
     await live.wait_json(topic, lambda told: told["watched"] and not told["active"])
     before, lost_at_s, begin = values[quantity], time.monotonic(), len(live.messages)
@@ -142,7 +142,7 @@ def _lines(out: Path) -> list[str]:
 
 
 def rows(broker: Broker, folder: Path, lost_s: float) -> Iterator[Row]:
-    """Measure."""
+    """Measure the reaction to each lost quantity."""
     latest_s = lost_s + LATE_S
     for loss in asyncio.run(attack(broker, folder, lost_s)):
         in_time = lost_s <= loss.fault_s <= latest_s and lost_s <= loss.hook_s <= latest_s

@@ -1,4 +1,4 @@
-"""The observer's step in C: compiled from uas_step.c and called on the very records of the kernels."""
+"""Observer step in C: compiled from uas_step.c and called on the kernels' records."""
 
 import ctypes
 import subprocess
@@ -15,7 +15,7 @@ from bms_estimator.model.sample import SAMPLE
 
 SOURCE = Path(__file__).with_name("uas_step.c")
 COMPILER = ["cc", "-O3", "-march=native", "-std=gnu11", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared"]
-"""numba compiles for the very processor too."""
+"""Like numba, optimize for this processor."""
 C_TYPES = {"f8": "double", "i8": "int64_t", "u4": "uint32_t"}
 
 
@@ -38,13 +38,13 @@ class ObserverInC:
         self._run.argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_int64]
 
     def run(self, state: Records, settings: Records, samples: Records, trace: Records) -> int:
-        """Run as ``kernels.step.run``."""
+        """Run a block as ``kernels.step.run`` does."""
         pointers = [array.ctypes.data for array in (state, settings, samples, trace)]
         return int(self._run(*pointers, samples.size))
 
 
 def header() -> str:
-    """The record types as C structures: numpy aligned them as C does."""
+    """Return the record types as C structures, which have the alignment of numpy's."""
     constants = {
         "OCV_POINTS": OCV_POINTS,
         "INVERSE_ERROR_V": INVERSE_ERROR_V,
@@ -58,7 +58,7 @@ def header() -> str:
 
 
 def structure(name: str, record: np.dtype[np.void]) -> str:
-    """One record type in C, and the compiler's oath that it has the same size."""
+    """Return a record type in C, with a static assertion of its size."""
     members = []
     for field in record.names or ():
         base, shape = record[field].subdtype or (record[field], ())

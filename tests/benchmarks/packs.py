@@ -22,7 +22,7 @@ MAX_CPU, MAX_MIB = 0.25, 400.0
 
 
 def rows() -> Iterator[Row]:
-    """Processor time and memory of one process that serves twenty packs."""
+    """Measure CPU time and memory of a process that serves twenty packs."""
     if MOSQUITTO is None:
         yield Row(f"{PACKS} packs", "-", "mosquitto is not installed", None)
         return
@@ -40,7 +40,7 @@ def rows() -> Iterator[Row]:
 
 
 async def _measure(folder: Path, boards: list[VirtualBoard], server: Broker) -> tuple[float, dict[str, Any]]:
-    """Part of one core that the service takes once all packs are live, and the last health of each."""
+    """Return the CPU time of the service as a fraction of a core once all packs are live, and the last health of each."""
     packs = [
         pack_file(folder, f"pack{i}", board.path, RATE_HZ, server, PUBLISH_RATE_HZ) for i, board in enumerate(boards)
     ]

@@ -24,13 +24,13 @@ FIRST_PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.
 
 
 def processes(of: int) -> list[psutil.Process]:
-    """A process and all below it."""
+    """Return a process and all its descendants."""
     parent = psutil.Process(of)
     return [parent, *parent.children(recursive=True)]
 
 
 def cpu_s(of: list[psutil.Process]) -> float:
-    """Processor time that they have taken together [s]."""
+    """Return the total CPU time of processes [s]."""
     total = 0.0
     for process in of:
         try:
@@ -47,7 +47,7 @@ def say(text: str) -> None:
 
 
 async def measure(service: Service, minutes: float) -> None:
-    """Watch one page for this duration."""
+    """Measure one page for ``minutes``."""
     async with chromium() as browser, tab(browser, service.url) as opened:
         await opened.until_status("live")
         await opened.until("() => performance.getEntriesByName('first-contentful-paint').length")

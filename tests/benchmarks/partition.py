@@ -27,7 +27,7 @@ SETTINGS, PACK = Settings(), load_cell(CELL)
 
 
 def rows() -> Iterator[Row]:
-    """Processor time; of parts the least of some rounds."""
+    """Measure CPU time in total and by part; each part is the minimum of some rounds."""
     samples = pulses(MINUTES * SAMPLES, rate_hz=1)
     blocks = [_block(samples, minute) for minute in range(MINUTES)]
     partition = Partition(0, lambda _: (SETTINGS, PACK))
@@ -36,14 +36,14 @@ def rows() -> Iterator[Row]:
     for what, us in _parts(partition, samples, blocks):
         yield Row(f"  {what}", "-", f"{us:.1f} us", None)
     packs = partition.snapshot().packs
-    kept = sum(map(sys.getsizeof, packs.values())) / PACKS
+    bytes_per_pack = sum(map(sys.getsizeof, packs.values())) / PACKS
     begin_s = time.process_time()
     data = b"".join(partition.snapshot().chunks())
     written_s = time.process_time() - begin_s
     begin_s = time.process_time()
     Partition.restore(0, lambda _: None, data)
     read_s = time.process_time() - begin_s
-    yield Row("a pack in memory", "-", f"{kept / 1e3:.1f} kB", None)
+    yield Row("a pack in memory", "-", f"{bytes_per_pack / 1e3:.1f} kB", None)
     yield Row("a pack in the checkpoint", "-", f"{len(data) / PACKS / 1e3:.1f} kB", None)
     yield Row("  to write it", "-", f"{1e6 * written_s / PACKS:.0f} us", None)
     yield Row("  to read it", "-", f"{1e6 * read_s / PACKS:.0f} us", None)
@@ -70,11 +70,11 @@ def _whole(partition: Partition, blocks: list[bytes]) -> float:
 
 
 def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
-    """Each part on the state that the last block found."""
-    bench, of_type = partition._work, partition._type_by_pack["pack0"]
-    estimator, wall_s = of_type.estimator, STORE / 1e9 + samples.size
+    """Yield the time of each part, on the state before the last block [us]."""
+    work_record, pack_type = partition._work, partition._type_by_pack["pack0"]
+    estimator, wall_s = pack_type.estimator, STORE / 1e9 + samples.size
     packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
-    bench.put(packed)
+    work_record.put(packed)
     before, trace = estimator.record.copy(), estimator.run(block.samples).copy()
 
     def state() -> bytes:
@@ -82,7 +82,7 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
         summary = window.take()
         assert summary is not None
         remaining = remaining_charge(estimator, summary.current_a)
-        return make_state_payload(summary, remaining, {}, wall_s, of_type.meter.flow, 3.0).model_dump_json().encode()
+        return make_state_payload(summary, remaining, {}, wall_s, pack_type.meter.flow, 3.0).model_dump_json().encode()
 
     def step() -> None:
         estimator.record[...] = before
@@ -90,14 +90,16 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
 
     put_back_us = _us(lambda: estimator.record.__setitem__(..., before))
     yield "its bytes", _us(lambda: decode(blocks[-1]))
-    yield "the state unpacked", _us(lambda: bench.put(packed))
+    yield "the state unpacked", _us(lambda: work_record.put(packed))
     yield "the estimator", _us(step) - put_back_us
-    yield "the hour's sums", _us(lambda: hour_summary.add(bench.record["hour"], trace, block, estimator))
-    yield "what has flowed", _us(lambda: (of_type.meter.add(trace), of_type.meter.flow))
+    yield "the hour's sums", _us(lambda: hour_summary.add(work_record.record["hour"], trace, block, estimator))
+    yield "what has flowed", _us(lambda: (pack_type.meter.add(trace), pack_type.meter.flow))
     yield "topic state", _us(state)
-    yield "the state packed", _us(bench.take)
+    yield "the state packed", _us(work_record.take)
     parameters_us = _us(lambda: make_parameters_payload(estimator, wall_s).model_dump_json())
-    row_us = _us(lambda: hour_summary.row(of_type.settings, 480_000, bench.record["hour"], estimator).model_dump_json())
+    row_us = _us(
+        lambda: hour_summary.row(pack_type.settings, 480_000, work_record.record["hour"], estimator).model_dump_json()
+    )
     yield "topic parameters and the row of an hour, a 60th of it", (parameters_us + row_us) / 60
 
 

@@ -37,7 +37,7 @@ def pulse_table(folder: Path, wanted: list[str]) -> Table:
 
 
 def cells_of(group: Group, folder: Path) -> Iterator[str]:
-    """One row of the table."""
+    """Yield the cells of one table row."""
     cell, shown, said, std, step_s = cell_file(group.recipe, folder), [], [], [], 0.0
     for name, capacity_ah, initial_soc in group.captures:
         samples = load(name, capacity_ah, initial_soc)[0]

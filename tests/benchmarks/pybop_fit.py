@@ -1,4 +1,4 @@
-"""Two RC pairs of constant elements fitted by PyBOP, as its own examples do it."""
+"""Fit of two RC pairs with constant elements by PyBOP, as in its examples."""
 
 import numpy as np
 import pybamm
@@ -10,20 +10,20 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 
 LOWEST_SOC = 0.1
-FULL = 1.0 - 1e-3  # nearer to 1 the noise of a current at rest ends the simulation before it begins
+FULL = 1.0 - 1e-3  # closer to 1 the current noise at rest would end the simulation at once
 SPAN = 4.0
-"""Bounds are a quarter and four times the start, as those of the observer's parameters."""
+"""Factor of the bounds around the start, as for the observer's parameters."""
 
 
 NEVER_V = 1e3
 """Cut-off that no simulation reaches, because the optimizer tries extreme values."""
 CHANGE_C, EVERY_S = 0.02, 10.0
-"""Rows that are kept: both ends of a larger change of the current, and one after this time."""
+"""Maximum interval between kept rows; both ends of a larger current change are kept too."""
 MAX_ROWS = 7_000
 
 
 def thinned(samples: SampleBlock, change_a: float) -> SampleBlock:
-    """A tenth of the rows of a test at 1 Hz, without losing a step: a fit takes a minute in place of five."""
+    """Return about a tenth of the rows of a test at 1 Hz, with all current steps, so that a fit takes one minute instead of five."""
     changed = np.abs(np.diff(samples["current_a"])) > change_a
     kept = np.concatenate([[True], changed]) | np.concatenate([changed, [True]])
     kept |= np.diff(samples["time_s"] // EVERY_S, prepend=-1.0) > 0.0

@@ -1,4 +1,4 @@
-"""Real captures, in groups of a kind, and the cell files that our own commands make for them."""
+"""Groups of real captures, and their cell files made by this project's commands."""
 
 import subprocess
 import sys
@@ -18,9 +18,9 @@ DATA = Path(__file__).parents[3] / "shared" / "data"
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 WRONG = (-0.2, 0.2)
 IN_MID_LOAD, FROM_START = 0.35, 0.0
-"""Part of the charge that is moved before the cut."""
+"""Fraction of the charge before the first used sample."""
 LOWEST_V, HIGHEST_V = 1.5, 4.5
-"""Voltages outside are no cell voltages."""
+"""Range of valid cell voltages [V]."""
 PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
 
 
@@ -34,7 +34,7 @@ class Recipe:
     identify: tuple[str, ...] = ()
     generic: str = ""
     measured: bool = False
-    """`ocv` measures the capacity."""
+    """True if `ocv` measures the capacity."""
 
 
 PF_HPPC = tuple(PF + f"{t}_hppc" for t in ("25", "10", "0", "n10"))
@@ -60,7 +60,7 @@ LFP_WITHOUT_5 = replace(LFP_CELL, identify=(LFP + "dyn_p25", LFP + "dyn_n15"))
 
 @dataclass(frozen=True)
 class Group:
-    """Captures of one kind: name, capacity that the truth is counted with [Ah], SOC at its first sample."""
+    """Captures of one kind: name, capacity for the true SOC [Ah], SOC at the first sample."""
 
     name: str
     recipe: Recipe
@@ -69,7 +69,7 @@ class Group:
     gain: float = 1.0
     offset_a: float = 0.0
     capacity: float = 1.0
-    """Declared relative to true value."""
+    """Declared divided by true capacity."""
     charging: bool = False
     """Fraction of the charge after the lowest SOC."""
 
@@ -96,15 +96,15 @@ LFP_FILES = (
     ("5", "", LFP_WITHOUT_5),
     ("-15", " (its own file)", LFP_CELL),
 )
-"""The capture at 5 C is not in its file."""
+"""The capture at 5 C is not used for the file."""
 LFP_CHARGES = {
     t: ((LFP + name, 2.05, soc),)
     for t, name, soc in (("25", "c30_chg_p25", -0.006), ("5", "c30_chg_p05", 0.011), ("-15", "c30_chg_n15", 0.061))
 }
 NCR_CHARGE = ((NCR + "cell1_charge_c20", 3.064, 0.0),)
-"""Charges end full."""
+"""Charges to full."""
 LG_CHARGES = (("lgm50/rate_0p1c_25c", 4.945, 1.0), ("lgm50/rate_1c_25c", 4.945, 1.0))
-"""Discharge, then charge at C/3."""
+"""Captures of a discharge followed by a charge at C/3."""
 LG_DISCHARGES = (("lgm50/rate_0p5c_25c", 4.945, 1.0), ("lgm50/rate_1c_25c", 4.945, 1.0))
 LEAF_CAPTURES = (("leaf/hppc_25c_from_full", 30.5, 1.0),)
 
@@ -203,7 +203,7 @@ def cell_file(recipe: Recipe, folder: Path) -> CellModel:
 
 
 def command(*arguments: object) -> str:
-    """Run the program; why it refused, or nothing."""
+    """Run the program; return its error text, empty if it succeeded."""
     done = subprocess.run([PROGRAM, *map(str, arguments)], capture_output=True, text=True, check=False)
     if done.returncode:
         sys.stderr.write(f"{arguments[0]} gave no file: {done.stderr.strip().splitlines()[-1]}\n")
@@ -228,6 +228,6 @@ def load(name: str, capacity_ah: float, initial_soc: float) -> tuple[SampleBlock
 
 
 def charge_ah(samples: SampleBlock) -> Floats:
-    """Drawn before each sample, shape (n,) [Ah]; the current holds until the next."""
+    """Return the charge drawn before each sample [Ah], shape (n,); the current is constant between samples."""
     moved_as = samples["current_a"][:-1] * np.clip(np.diff(samples["time_s"]), 0.0, None)
     return np.concatenate([[0.0], np.cumsum(moved_as)]) / 3600.0

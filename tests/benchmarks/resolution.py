@@ -37,23 +37,23 @@ SEEDS = range(1, 9)
 KELVIN_STEP = 1.0
 NOISE_V = 5e-4
 LATE = 0.02
-"""A sample comes so much early or late [periods]."""
+"""Jitter of the sample times [periods]."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A kind of source at a pack, and what the pack is used for."""
+    """Kind of source and use of a pack."""
 
     rate_hz: float = 1.0
     ampere_step: float = 0.01
     dead_band_a: float = 0.0
     delay_s: float = 0.0
-    """The current of a sample is so much older than its voltage; below 0: the voltage is."""
+    """Age of a sample's current minus that of its voltage [s]."""
     volt_step: float = 1e-3
-    """Of one cell."""
+    """Capacity of one cell [Ah]."""
     capacity_ah: float = 3.0
     house: bool = False
-    """Hours of small loads and a night of standby, in place of a drive."""
+    """True: hours of small loads and a night of standby; False: a drive."""
     standby_a: float = 0.0
 
     @property
@@ -109,7 +109,7 @@ def main() -> None:
 
 
 def cells_of(found: list[Score]) -> Iterator[str]:
-    """One row of the table."""
+    """Yield the cells of one table row."""
     rmse, cover = [s.rmse for s in found], [s.cover for s in found]
     yield f"{np.sqrt(np.mean(np.square(rmse))):.2f}/{max(rmse):.2f}"
     yield f"{np.mean(cover):.1f}/{min(cover):.0f}"
@@ -136,7 +136,7 @@ def scores(source: Source, *, told: bool = True, seeds: Iterable[int] = SEEDS) -
 
 
 def cases_of(source: Source, seeds: Iterable[int]) -> Iterator[Case]:
-    """Cells and loads: oxide and phosphate in turn."""
+    """Yield cells and loads, alternating between oxide and phosphate."""
     for seed in seeds:
         truth, file_c = (OXIDE, (25.0, 10.0, 0.0, -10.0)) if seed % 2 else (PHOSPHATE, (25.0, 5.0, -15.0))
         scaled = replace(truth, capacity_ah=source.capacity_ah, ohm=truth.ohm * truth.capacity_ah / source.capacity_ah)
@@ -145,7 +145,7 @@ def cases_of(source: Source, seeds: Iterable[int]) -> Iterator[Case]:
 
 
 def current_of(case: Case, source: Source, rate_hz: int) -> Floats:
-    """The true current at ``rate_hz`` [A]; levels change at any time, not on the second."""
+    """Return the true current at ``rate_hz`` [A]; its levels change at arbitrary times."""
     seconds = round(3600 * (case.unseen_h + case.hours))
     if not source.house:
         return np.repeat(load_a(case, seconds), rate_hz)

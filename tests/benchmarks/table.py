@@ -10,7 +10,7 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Row:
-    """One line: what, how good it has to be, how good it was, and whether that is enough (None: no target)."""
+    """Row: quantity, target, measured value, and whether the target is met (None: no target)."""
 
     what: str
     target: str
@@ -19,7 +19,7 @@ class Row:
 
 
 def show(rows: Iterable[Row], title: str = "bms_estimator benchmarks") -> bool:
-    """Print the rows as they arrive. Returns whether all targets were met."""
+    """Print the rows as they arrive; return True if all targets were met."""
     table = Table(title=title)
     for column in ("what", "target", "measured", "met"):
         table.add_column(column)

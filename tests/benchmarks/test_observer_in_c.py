@@ -1,4 +1,4 @@
-"""The C yardstick measures the same work: it gives the kernel's numbers."""
+"""Equal results of the C version and the kernel."""
 
 import shutil
 import sys

@@ -1,4 +1,4 @@
-"""References of the comparison on a cell with known elements."""
+"""References of the comparison, tested on a cell with known elements."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ R_S, R_TS, TAU_TS, R_TL, TAU_TL = 0.08, 0.02, 20.0, 0.03, 300.0
 
 
 def elements() -> Floats:
-    """a1..a21 of two branches that do not depend on SOC."""
+    """Return a1..a21 of two RC pairs that do not depend on SOC."""
     a = np.zeros(22)
     a[[3, 6, 9, 12, 15]] = R_TS, R_TL, TAU_TS / R_TS, TAU_TL / R_TL, R_S
     a[[16, 17, 18, 19]] = 0.5, 20.0, 3.4, 0.7
@@ -28,7 +28,7 @@ def elements() -> Floats:
 
 
 def relaxation_test(rest_s: int = 900, resolution_v: float = 1e-3) -> Block:
-    """C/2 for six minutes, then a rest, seventeen times, at 1 Hz, as a converter of ``resolution_v`` sees it."""
+    """Return seventeen discharges at C/2 for six minutes, each followed by a rest, at 1 Hz and with ``resolution_v``."""
     current_a = np.tile(np.r_[np.full(360, 1.5), np.zeros(rest_s)], 17)
     time_s = np.arange(float(current_a.size))
     voltage_v, soc = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, 3600.0 * CAPACITY_AH, elements())
@@ -39,34 +39,34 @@ def relaxation_test(rest_s: int = 900, resolution_v: float = 1e-3) -> Block:
     return Block(samples, soc)
 
 
-def test_rests_show_both_rc_products_within_five_percent():
+def test_rc_products_from_rests_within_five_percent():
     found = relaxations(relaxation_test(), CAPACITY_AH)
     assert found.soc.size >= 15
     assert np.median(found.tau_ts_s) == pytest.approx(TAU_TS, rel=0.05)
     assert np.median(found.tau_tl_s) == pytest.approx(TAU_TL, rel=0.05)
 
 
-def test_without_noise_each_rest_shows_them_within_one_percent():
+def test_rc_products_without_noise_within_one_percent():
     found = relaxations(relaxation_test(resolution_v=1e-7), CAPACITY_AH)
     assert found.soc.size == 17
     assert found.tau_ts_s == pytest.approx(TAU_TS, rel=0.01)
     assert found.tau_tl_s == pytest.approx(TAU_TL, rel=0.01)
 
 
-def test_a_short_rest_and_one_exponential_show_nothing():
+def test_short_rest_and_single_exponential_give_nothing():
     assert relaxations(relaxation_test(rest_s=500), CAPACITY_AH).soc.size == 0
     time_s = np.arange(1.0, 900.0)
     assert two_exponentials(time_s, 3.7 - 0.02 * np.exp(-time_s / 100.0)) is None
 
 
-def test_pulses_show_the_series_resistance_within_two_percent():
+def test_series_resistance_from_pulses_within_two_percent():
     found = pulse_resistance(relaxation_test(), CAPACITY_AH)
     assert found.ohm.size >= 30
     ohmic = R_S + R_TS * (1.0 - np.exp(-1.0 / TAU_TS)) + R_TL * (1.0 - np.exp(-1.0 / TAU_TL))  # at 1 Hz
     assert np.median(found.ohm) == pytest.approx(ohmic, rel=0.02)
 
 
-def test_pulses_of_a_capture_at_one_and_ten_hertz_whose_voltage_is_a_row_late():
+def test_pulses_with_a_voltage_one_row_late():
     time_s, current_a = [], []
     for n in range(12):  # as an HPPC is logged
         rest_s, pulse_s = np.arange(0.0, 600.0), np.arange(600.0, 610.0, 0.1)
@@ -82,7 +82,7 @@ def test_pulses_of_a_capture_at_one_and_ten_hertz_whose_voltage_is_a_row_late():
     assert found.ohm == pytest.approx(R_S, rel=0.02)
 
 
-def test_a_jump_shows_in_the_pulses_from_half_way_on():
+def test_step_of_resistance_is_visible_in_later_pulses():
     block = relaxation_test()
     jumped, jump_s = with_jump(block, 0.04)
     before, after = (pulse_resistance(b, CAPACITY_AH) for b in (block, jumped))
@@ -94,7 +94,7 @@ def test_a_jump_shows_in_the_pulses_from_half_way_on():
     assert np.array_equal(after.ohm[early], before.ohm[early])
 
 
-def test_settled_is_what_stays():
+def test_settling_time_ends_only_when_the_value_stays():
     time_s = np.arange(0.0, 4000.0, 10.0)
     ratio = np.where(time_s < 1000.0, 1.0, 1.0 - 0.5 * np.exp(-(time_s - 1000.0) / 200.0))
     settled_s = settled_after(time_s, ratio, 1000.0)

@@ -49,7 +49,7 @@ DISTURBANCES = (
 
 
 def disturbed(estimator: Estimator, seen: SampleBlock, what: Disturbance) -> NDArray[np.void]:
-    """The trace through it."""
+    """Return the trace of a disturbed run."""
     random, time_s, traces, i = np.random.default_rng(SEED), seen["time_s"], [], 0
     while i < seen.size:
         end_s = time_s[i] + what.every_s * random.uniform(0.67, 1.33)
@@ -66,7 +66,7 @@ def disturbed(estimator: Estimator, seen: SampleBlock, what: Disturbance) -> NDA
 
 
 def row(tried: Iterable[tuple[CellModel, SampleBlock, Floats, float]], what: Disturbance) -> str:
-    """Means over the runs of a group."""
+    """Return the means over the runs of a group as text."""
     found = []
     for cell, seen, truth, told in tried:
         trace = disturbed(Estimator(cell, initial_soc=told), seen, what)

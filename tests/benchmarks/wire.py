@@ -1,4 +1,4 @@
-"""A board's bytes for given samples, fast enough for millions."""
+"""Fast encoder of a board's bytes for millions of samples."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +10,11 @@ from bms_estimator.protocols.firmware.messages import PROTOCOL_VERSION, Hello
 
 REFERENCE_V, FULL_SCALE, DIVIDER, VOLTS_PER_AMPERE, BANDGAP_V = 5.0, 1024, 5.0, 0.1, 1.1
 CONVERSIONS = 16
-"""Pairs in the window of a sample."""
+"""Number of conversion pairs in the window of a sample."""
 
 
 def hello(rate_hz: int) -> bytes:
-    """The hello of a board that sends ``sample_frames``."""
+    """Return the hello message of a board that sends ``sample_frames``."""
     return Hello(
         firmware_major=1,
         firmware_minor=0,

@@ -17,7 +17,9 @@ from bms_estimator.process.signals import stop_on_signal
 
 def demo(
     packs: Annotated[int, typer.Option(parser=whole(1, 100_000), help="number of simulated packs")] = 1000,
-    seconds: Annotated[float, typer.Option(parser=decimal(3.0), help="duration for which edges send [s]")] = 45.0,
+    seconds: Annotated[
+        float, typer.Option(parser=decimal(3.0), help="duration in seconds for which edges send")
+    ] = 45.0,
     page_port: Annotated[
         int | None,
         typer.Option(parser=whole(1, 65535), help="port of the page; default: a free port", show_default=False),

@@ -27,7 +27,9 @@ def collect(
     creds: Creds = None,
     ca: Ca = None,
     folder: Annotated[Path, typer.Option(help="folder of the Parquet files")] = FOLDER,
-    period: Annotated[float, typer.Option(min=0.0, help="maximum time that a row waits for its file [s]")] = 300.0,
+    period: Annotated[
+        float, typer.Option(min=0.0, help="maximum time in seconds that a row waits for its file")
+    ] = 300.0,
 ) -> None:
     """Write hourly summaries to Parquet, until SIGINT or SIGTERM."""
     from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
@@ -70,7 +72,9 @@ def ask(
     days: Annotated[
         int | None, typer.Option(min=1, help="number of most recent days; default: all", show_default=False)
     ] = None,
-    within: Annotated[float, typer.Option(min=0.0, help="forecast of `failing` [days]")] = 90.0,
+    within: Annotated[
+        float, typer.Option(min=0.0, help="query failing: maximum number of days until a limit is reached")
+    ] = 90.0,
     json: Annotated[bool, typer.Option("--json", help="print a JSON list of objects")] = False,
     csv: Annotated[bool, typer.Option("--csv", help="print CSV")] = False,
 ) -> None:

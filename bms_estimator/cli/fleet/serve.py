@@ -55,17 +55,17 @@ def serve(
 
 
 def user(
-    tenant: Annotated[str, typer.Argument(help="name in the settings of the fleet", show_default=False)],
-    pack: Annotated[str, typer.Argument(help="device that the token is for", show_default=False)],
+    tenant: Annotated[str, typer.Argument(help="name of the tenant in the settings", show_default=False)],
+    pack: Annotated[str, typer.Argument(help="name of the pack", show_default=False)],
     settings_file: Annotated[Path | None, typer.Option("--settings", help="fleet.toml")] = None,
     folder: Folder = None,
     days: Annotated[
-        float | None, typer.Option(min=0.0, max=36_600.0, help="validity of the token [days]; default: unlimited")
+        float | None, typer.Option(min=0.0, max=36_600.0, help="validity of the token in days; default: unlimited")
     ] = None,
 ) -> None:
     """Print the token of a pack's edge, which is its MQTT password.
 
-    The token permits only blocks of this pack and their confirmations. Keep it secret.
+    The token permits only sending blocks of this pack and receiving the replies. Keep it secret.
     """
     try:
         TypeAdapter(DeviceName).validate_python(pack)

@@ -28,10 +28,10 @@ def worker(
         str | None, typer.Option(help="name of the worker; must be unique", show_default="host and process number")
     ] = None,
     checkpoint_s: Annotated[
-        float, typer.Option(min=1.0, help="interval between checkpoints of a partition [s]")
+        float, typer.Option(min=1.0, help="interval in seconds between checkpoints of a partition")
     ] = CHECKPOINT_S,
 ) -> None:
-    """Estimate the packs of some partitions, until SIGINT or SIGTERM.
+    """Run a worker, which estimates the packs of some partitions, until SIGINT or SIGTERM.
 
     All workers of a tenant share its partitions.
     """
