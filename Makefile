@@ -10,6 +10,8 @@ AUDIT   := .venv-audit
 NODE    := .node
 ARGS    ?=
 INPUTS  ?= 20000
+KILLS   ?= 100
+NODES   ?= 1 3
 HOME_ASSISTANT ?= 2025.2.5
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
@@ -55,8 +57,9 @@ demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of whic
 fleet: venv ## what a fleet costs, in processes on this machine, e.g. make fleet ARGS="--packs 10000 --minutes 5"
 	@$(BIN)/python -m tests.benchmarks.fleet $(ARGS)
 
-fleet-kills: venv ## workers and servers of a fleet killed 100 times, one node and three, states compared bit by bit: 15 minutes
-	@$(BIN)/python -m tests.benchmarks.fleet_kills $(ARGS)
+fleet-kills: venv ## workers and server nodes killed 100 times, with one node and with three, states compared bit by bit: 15 minutes
+	for nodes in $(NODES); do KILLS=$(KILLS) NODES=$$nodes $(BIN)/python -m pytest -s --timeout=7200 \
+		tests/fleet/worker/test_worker.py -k kills $(ARGS) || exit 1; done
 
 nats: venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/mqtt/test_nats_server.py $(ARGS)

@@ -114,7 +114,7 @@ class Heartbeats:
     """The last heartbeat of each worker."""
 
     def __init__(self, nc: Client) -> None:
-        self._nc, self._last = nc, dict[str, Heartbeat]()
+        self._nc, self.last = nc, dict[str, Heartbeat]()
 
     async def __aenter__(self) -> Self:
         await self._nc.subscribe(subjects.worker(), cb=self._hear)
@@ -125,13 +125,13 @@ class Heartbeats:
 
     async def _hear(self, message: Any) -> None:
         heard = Heartbeat.model_validate_json(message.data)
-        self._last[heard.id] = heard
+        self.last[heard.id] = heard
 
     def forget(self) -> None:
-        self._last.clear()
+        self.last.clear()
 
     async def until(self, wanted: Callable[[Mapping[str, Heartbeat]], object]) -> None:
-        await until(lambda: wanted(self._last), lambda: self._last)
+        await until(lambda: wanted(self.last), lambda: self.last)
 
     async def until_held(self, partitions: int, *workers: str) -> None:
         """Until these workers, and no others, have all partitions, each some."""
