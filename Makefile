@@ -148,5 +148,7 @@ payloads: venv ## remember what is published now; refuses what readers would mis
 kernels: venv
 	$(BIN)/python -c 'from bms_estimator.service.kernel_warm_up import load_kernels; load_kernels()'
 
-lock: ## write requirements.lock anew after a change of dependencies (needs uv)
+lock: venv ## write requirements.lock anew after a change of dependencies, and the SBOM of those of the wheel (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --universal pyproject.toml -o requirements.lock
+	uv pip compile --quiet --generate-hashes --no-header --universal --constraints requirements.lock pyproject.toml | \
+		$(BIN)/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible -o bms_estimator.cdx.json -
