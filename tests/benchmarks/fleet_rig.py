@@ -1,4 +1,4 @@
-"""A whole fleet as processes on the loopback: server, workers, simulated edges. What both benches of the fleet begin with."""
+"""A whole fleet as processes on the loopback: server, workers, simulated edges."""
 
 import contextlib
 import signal
@@ -38,12 +38,6 @@ class Rig:
         arguments = ["--server", self.server, "--name", name, "--checkpoint-s", str(checkpoint_s)]
         self.workers[name] = self.run("worker", *arguments, log=name)
         return name
-
-    def kill_worker(self, name: str) -> None:
-        """Kill a worker by SIGKILL."""
-        process = self.workers.pop(name)
-        process.kill()
-        process.wait(LONG_S)
 
     def stop_workers(self) -> None:
         """Stop workers as an operator does: each writes its checkpoints."""
