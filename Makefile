@@ -10,6 +10,8 @@ AUDIT   := .venv-audit
 NODE    := .node
 ARGS    ?=
 INPUTS  ?= 20000
+KILLS   ?= 100
+NODES   ?= 1 3
 HOME_ASSISTANT ?= 2025.2.5
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
@@ -55,8 +57,9 @@ demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of whic
 fleet: venv ## cost of a fleet, in processes on this machine, e.g. make fleet ARGS="--packs 10000 --minutes 5"
 	@$(BIN)/python -m tests.benchmarks.fleet $(ARGS)
 
-fleet-kills: venv ## workers and servers of a fleet killed 100 times, one node and three, states compared bit by bit: 15 minutes
-	@$(BIN)/python -m tests.benchmarks.fleet_kills $(ARGS)
+fleet-kills: venv ## workers and server nodes killed 100 times, with one node and with three, states compared bit by bit: 15 minutes
+	for nodes in $(NODES); do KILLS=$(KILLS) NODES=$$nodes $(BIN)/python -m pytest -s --timeout=7200 \
+		tests/fleet/worker/test_worker.py -k kills $(ARGS) || exit 1; done
 
 nats: venv ## a node of a NATS cluster killed while messages arrive, in each of its roles: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/mqtt/test_nats_server.py $(ARGS)
@@ -145,5 +148,7 @@ payloads: venv ## record the published payloads; rejects an incompatible change 
 kernels: venv
 	$(BIN)/python -c 'from bms_estimator.service.kernel_warm_up import load_kernels; load_kernels()'
 
-lock: ## update requirements.lock after a change of dependencies (needs uv)
+lock: venv ## update requirements.lock and the SBOM of the wheel after a change of dependencies (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --universal pyproject.toml -o requirements.lock
+	uv pip compile --quiet --generate-hashes --no-header --universal --constraints requirements.lock pyproject.toml | \
+		$(BIN)/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible -o bms_estimator.cdx.json -

@@ -39,12 +39,6 @@ class Rig:
         self.workers[name] = self.run("worker", *arguments, log=name)
         return name
 
-    def kill_worker(self, name: str) -> None:
-        """Kill a worker by SIGKILL."""
-        process = self.workers.pop(name)
-        process.kill()
-        process.wait(LONG_S)
-
     def stop_workers(self) -> None:
         """Stop workers as an operator does: each writes its checkpoints."""
         for process in self.workers.values():

@@ -114,7 +114,7 @@ class Heartbeats:
     """The last heartbeat of each worker."""
 
     def __init__(self, nc: Client) -> None:
-        self._nc, self._last = nc, dict[str, Heartbeat]()
+        self._nc, self.last = nc, dict[str, Heartbeat]()
 
     async def __aenter__(self) -> Self:
         await self._nc.subscribe(subjects.worker(), cb=self._receive)
@@ -125,13 +125,13 @@ class Heartbeats:
 
     async def _receive(self, message: Any) -> None:
         heartbeat = Heartbeat.model_validate_json(message.data)
-        self._last[heartbeat.id] = heartbeat
+        self.last[heartbeat.id] = heartbeat
 
     def clear(self) -> None:
-        self._last.clear()
+        self.last.clear()
 
     async def until(self, condition: Callable[[Mapping[str, Heartbeat]], object]) -> None:
-        await until(lambda: condition(self._last), lambda: self._last)
+        await until(lambda: condition(self.last), lambda: self.last)
 
     async def until_held(self, partitions: int, *workers: str) -> None:
         """Wait until these workers together have all partitions, each at least one."""

@@ -28,10 +28,11 @@ class SimulatedEdges:
     Args:
         fleet: Simulated packs.
         start_s: Wall clock at which the first block began [s since 1970].
-        speed: Simulated seconds per second.
-        last: Number of the last block; None: unlimited.
+        speed: The packs' seconds per second.
+        last: Initial value of the attribute.
 
     Attributes:
+        last: Number of the last block of each edge; None without end.
         next: Number of the block that each edge sends next, shape (packs,).
         safe: Number before which all blocks are safe, as workers reported.
         resends: Number of requests to resend.
@@ -40,7 +41,7 @@ class SimulatedEdges:
     """
 
     def __init__(self, fleet: SimulatedFleet, *, start_s: float, speed: float, last: int | None = None) -> None:
-        self._fleet, self._start_s, self._speed, self._last = fleet, start_s, speed, last
+        self._fleet, self._start_s, self._speed, self.last = fleet, start_s, speed, last
         self._index = {name: i for i, name in enumerate(fleet.names)}
         self._store_offset_s = (fleet.store - fleet.begin_ns) / 1e9
         self.next: Whole = np.ones(len(fleet.names), dtype=np.int64)
@@ -52,8 +53,8 @@ class SimulatedEdges:
     def due(self, now_s: float, most: int) -> Due:
         """Return the blocks complete at ``now_s`` [s since 1970] and not sent yet; beyond ``most`` only the oldest."""
         ready_s = self._ready_s(self.next)
-        is_due = ready_s <= now_s if self._last is None else (ready_s <= now_s) & (self.next <= self._last)
-        packs = np.flatnonzero(is_due)
+        open_ = ready_s <= now_s if self.last is None else (ready_s <= now_s) & (self.next <= self.last)
+        packs = np.flatnonzero(open_)
         if packs.size > most:
             packs = packs[np.argpartition(ready_s[packs], most)[:most]]
         numbers = self.next[packs]
@@ -83,7 +84,7 @@ class SimulatedEdges:
     @property
     def done(self) -> bool:
         """True if every edge has sent its last block."""
-        return self._last is not None and bool((self.next > self._last).all())
+        return self.last is not None and bool((self.next > self.last).all())
 
     def lag_s(self, now_s: float) -> float:
         """Return the age of the oldest due block that was not sent [s]; 0 without one."""

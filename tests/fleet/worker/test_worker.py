@@ -1,77 +1,138 @@
-"""Workers on the real server, killed, suspended and added while blocks arrive: none is lost or counted twice."""
+"""Workers and server nodes killed while simulated edges send: no block is lost or counted twice.
+
+``make fleet-kills`` sets the numbers of kills, nodes and packs by ``KILLS``, ``NODES`` and ``PACKS``.
+"""
 
 import asyncio
+import itertools
+import os
+import random
 import signal
+import sys
+import time
 from collections import Counter
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
+from nats.aio.client import Client
+
 from bms_estimator.edge import subjects
+from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.packs.csv_table import read_table
+from bms_estimator.fleet.packs.pack_bucket import PackBucket, write_bucket
+from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.simulation.block_publisher import run_edges
+from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
+from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker.membership import assign_partitions
 from bms_estimator.fleet.worker.partition import Partition
-from tests.fleet.nats_cluster import connected, running
-from tests.fleet.workers import Heartbeats, Process, block, end_states, estimated, load_packs, send
+from bms_estimator.settings.mqtt import MqttSettings
+from tests.fleet.nats_cluster import NatsCluster, connected, running
+from tests.fleet.workers import Heartbeats, Process, end_states
 from tests.patience import LONG_S
 
+KILLS, NODES, PACKS, SEED = (
+    int(os.environ.get(name, default)) for name, default in (("KILLS", 2), ("NODES", 1), ("PACKS", 8), ("SEED", 1))
+)
 PARTITIONS = 4
-PACKS = [f"p{i}" for i in range(8)]
+BLOCKS_PER_S = 40.0
+"""Blocks of all edges [1/s]: eight edges send an hour in 12 s."""
+MEAN_S = 1.0
+"""Mean time from the restart after a kill to the next kill [s]."""
+MAX_AWAY_S = 2.0
+"""Maximum delay of the restart after a kill [s]."""
+BLOCKS_AFTER = 5
+"""Blocks of each edge after the last kill: a worker requests a missing block when the next one arrives."""
 
 
-async def test_states_equal_those_of_one_run_after_kills_and_a_suspension(tmp_path: Path) -> None:
-    with running(tmp_path, partitions=PARTITIONS) as cluster, ExitStack() as stack:
-        nc = await connected(cluster.url)
-        await make_streams(nc, partitions=PARTITIONS)
-        registry = await load_packs(nc, PACKS)
-        assert {subjects.partition_of(pack, PARTITIONS) for pack in PACKS} == set(range(PARTITIONS))
-        done = asyncio.Event()
+async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path) -> None:
+    with running(tmp_path, NODES, partitions=PARTITIONS) as cluster, ExitStack() as stack:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=PARTITIONS, replicas=NODES)
+        fleet = SimulatedFleet(PACKS, seed=SEED, begin_ns=time.time_ns())
+        await write_bucket(nc, subjects.PACKS_BUCKET, pack_rows(fleet, tmp_path / "packs.csv"))
+        bucket = PackBucket(nc)
+        await bucket.refresh()
+        workers, names = dict[str, Process](), (f"w{number}" for number in itertools.count(1))
 
-        async def feed() -> int:
-            number = 0
-            while not done.is_set():
-                number += 1
-                for pack in PACKS:
-                    await send(nc, pack, block(pack, number))
-                await asyncio.sleep(0.1)
-            return number
+        def start() -> None:
+            name = next(names)
+            workers[name] = Process(tmp_path, ",".join(cluster.urls), name, "--checkpoint-s", 1)
+            stack.callback(workers[name].kill)
 
-        def start(name: str) -> Process:
-            process = Process(tmp_path, cluster.url, name, "--checkpoint-s", 1)
-            stack.callback(process.kill)
-            return process
+        def blocks(last: Mapping[str, Heartbeat]) -> int:
+            return sum(last[name].counters.get("blocks", 0) for name in workers if name in last)
 
-        a, b = start("a"), start("b")
-        feeder = asyncio.create_task(feed())
+        start()
+        start()
+        speed = BLOCKS_PER_S * BLOCK_S / PACKS
+        edges, stop = SimulatedEdges(fleet, start_s=time.time(), speed=speed), asyncio.Event()
+        settings = MqttSettings(url=tuple(f"mqtt://127.0.0.1:{port}" for port in cluster.mqtt_ports))
+        sending = asyncio.create_task(run_edges(fleet, edges, settings, connections=2, stop=stop, report=lambda _: None))
         async with Heartbeats(nc) as heartbeats:
-            await heartbeats.until_held(PARTITIONS, "a", "b")
-            a.kill()
-            cluster.kill(0)
-            c = start("c")
-            cluster.start(0)
-            await heartbeats.until_held(PARTITIONS, "b", "c")
-            b.signal(signal.SIGSTOP)
-            await heartbeats.until_held(PARTITIONS, "c")
-            b.signal(signal.SIGCONT)
-            await b.logged("fenced out")
-            await heartbeats.until_held(PARTITIONS, "b", "c")
-            done.set()
-            sent = await feeder
-            await heartbeats.until(
-                lambda last: sum(last[name].counters.get("blocks", 0) for name in ("b", "c")) == sent * len(PACKS)
-            )
-        assert [await b.end(), await c.end()] == [0, 0]
-        states = await end_states(nc, registry, PARTITIONS)
-        for pack in PACKS:
+            await heartbeats.until_held(PARTITIONS, *workers)
+            await heartbeats.until(blocks)
+            dice, killed = random.Random(SEED), Counter[str]()
+            for kill in range(KILLS):
+                await asyncio.sleep(dice.expovariate(1.0 / MEAN_S))
+                if kill % 2:
+                    killed[await kill_node(cluster, dice)] += 1
+                else:
+                    workers.pop(dice.choice(sorted(workers))).kill()
+                    await asyncio.sleep(dice.uniform(0.0, MAX_AWAY_S))
+                    start()
+                    killed["worker"] += 1
+            await heartbeats.until_held(PARTITIONS, *workers)
+            suspended, other = workers
+            workers[suspended].signal(signal.SIGSTOP)
+            await heartbeats.until_held(PARTITIONS, other)
+            workers[suspended].signal(signal.SIGCONT)
+            await workers[suspended].logged("fenced out")
+            await heartbeats.until_held(PARTITIONS, *workers)
+            edges.last = int(edges.next.max()) + BLOCKS_AFTER
+            taken = 0
+            while taken < edges.last * PACKS:  # a busy machine may take longer than the limit of one wait
+                await heartbeats.until(lambda last, before=taken: blocks(last) > before)
+                taken = blocks(heartbeats.last)
+        assert taken == edges.last * PACKS
+        stop.set()
+        sys.stdout.write(f"{NODES} nodes, kills: {dict(killed)}; {await sending}\n")
+        assert [await worker.end() for worker in workers.values()] == [0, 0]
+        states = await end_states(nc, bucket.packs, PARTITIONS)
+        for i, pack in enumerate(fleet.names):
             state = states[subjects.partition_of(pack, PARTITIONS)].state(pack)
             assert state is not None
-            assert state["delivery"]["awaited"][0] == sent + 1
-            assert state["estimator"].tobytes() == estimated(registry, pack, sent)
-        assert await _hours(nc) == _expected_hours(registry, sent)
+            assert (state["delivery"]["awaited"][0], state["delivery"]["lost_blocks"][0]) == (edges.last + 1, 0)
+            estimator = make_estimator(*bucket.packs(pack))
+            for samples in fleet.samples(np.full(edges.last, i), np.arange(1, edges.last + 1)):
+                estimator.run(samples)
+            assert state["estimator"].tobytes() == estimator.record.tobytes()
+        assert await hours(nc) == expected_hours(bucket.packs, fleet, edges)
         await nc.close()
 
 
-async def _hours(nc) -> dict[str, bytes]:
-    """Return all rows by their ids, without duplicates."""
+def pack_rows(fleet: SimulatedFleet, path: Path) -> dict[str, bytes]:
+    """Return the rows of a fleet's table, which is written to ``path``."""
+    path.write_text(fleet.table())
+    return {pack: row.data for pack, row in read_table(path).packs.items()}
+
+
+async def kill_node(cluster: NatsCluster, dice: random.Random) -> str:
+    """Kill and restart a node, half of the times the leader of the blocks' stream. Returns its role."""
+    leader = cluster.leader(subjects.RAW_STREAM)
+    node = leader if leader >= 0 and dice.random() < 0.5 else dice.randrange(NODES)
+    cluster.kill(node)
+    await asyncio.sleep(dice.uniform(0.0, MAX_AWAY_S))
+    await asyncio.to_thread(cluster.start, node)
+    return "leader" if node == leader else "node"
+
+
+async def hours(nc: Client) -> dict[str, bytes]:
+    """Return all hour rows by their ids, without duplicates."""
     js = nc.jetstream(timeout=LONG_S)
     rows = {}
     state = (await js.stream_info(subjects.HOURS_STREAM)).state
@@ -82,12 +143,14 @@ async def _hours(nc) -> dict[str, bytes]:
     return rows
 
 
-def _expected_hours(registry, sent: int) -> dict[str, bytes]:
-    partition = Partition(0, registry)
+def expected_hours(known: PackRegistry, fleet: SimulatedFleet, edges: SimulatedEdges) -> dict[str, bytes]:
+    """Return the hour rows of one partition that takes all blocks in order."""
+    partition, packs = Partition(0, known), np.arange(PACKS)
     rows = {}
-    for number in range(1, sent + 1):
-        for pack in PACKS:
-            rows |= dict(partition.take(pack, block(pack, number), partition.sequence + 1).hours)
+    for number in range(1, edges.last + 1):
+        numbers = np.full(PACKS, number)
+        for i, data in enumerate(fleet.blocks(packs, numbers, edges._ready_s(numbers))):
+            rows |= dict(partition.take(fleet.names[i], data, partition.sequence + 1).hours)
     return rows
 
 
