@@ -48,7 +48,7 @@ def in_use(case: Case, count: int) -> Capture:
     return capture(case, days(rng, case.truth.capacity_ah, count, case.soc))
 
 
-@pytest.mark.parametrize("told_wrong", [0.0, -0.2])
+@pytest.mark.parametrize("told_wrong", [pytest.param(0.0, marks=pytest.mark.thorough), -0.2])
 def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(told_wrong: float) -> None:
     errors, ratios = [], []
     for seed in SEEDS:

@@ -3,6 +3,7 @@
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -69,6 +70,14 @@ def test_a_kernel_runs_for_a_user_without_a_home() -> None:
     assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in crc16_with_cache_in(Path("~"))
 
 
+@pytest.fixture(scope="module")
+def kept_kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with a compiled kernel."""
+    folder = tmp_path_factory.mktemp("kernel")
+    assert crc16_with_cache_in(folder) == ""
+    return folder
+
+
 def cut(content: bytes) -> bytes:
     return content[:20]
 
@@ -94,9 +103,9 @@ def zeros_in_its_code(content: bytes) -> bytes:
     ],
 )
 def test_a_damaged_kernel_in_the_cache_is_compiled_again(
-    tmp_path: Path, kind: str, damaged: Callable[[bytes], bytes]
+    tmp_path: Path, kept_kernel: Path, kind: str, damaged: Callable[[bytes], bytes]
 ) -> None:
-    assert crc16_with_cache_in(tmp_path) == ""
+    shutil.copytree(kept_kernel, tmp_path, dirs_exist_ok=True)
     (kept,) = tmp_path.rglob(f"*.{kind}")
     whole = kept.stat().st_size
     kept.write_bytes(damaged(kept.read_bytes()))

@@ -217,7 +217,15 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
     board.cancel()
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGHUP,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.thorough),  # ends the service of most tests in this file
+        signal.SIGINT,
+    ],
+    ids=lambda number: number.name,
+)
 async def test_hangup_ends_the_service_cleanly(
     tmp_path: Path, line: Line, broker: Broker, number: signal.Signals
 ) -> None:

@@ -9,7 +9,7 @@ from tests.world.faults import Fault
 from tests.world.mutants import board_clock_believed, no_fsync, no_rewind, no_second_try, no_sensor_availability
 from tests.world.world import World
 
-SEEDS = range(3)
+SEEDS = [0, 1, pytest.param(2, marks=pytest.mark.thorough)]
 WORLD_S = 1000.0
 """Duration of a world [s]; the last seven minutes are without faults."""
 SILENCE_S = 21.0

@@ -11,7 +11,8 @@ import numpy as np
 
 from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, averaging_window
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell_model.chen_mora import crossing, delta
+from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, crossing, delta
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
@@ -20,6 +21,18 @@ SNAPSHOTS = 3000
 """Maximum number of equidistant snapshots of a_i(t) over a run, in addition to ``FIRST_SAMPLES``."""
 FIRST_SAMPLES = 200
 """Number of first samples that are all recorded, because a_i(t) moves from its initial value to its limit there."""
+
+SNAPSHOT_FIELDS = (
+    "time_s",
+    "soc",
+    "current_a",
+    "voltage_v",
+    "voltage_estimate_v",
+    "k",
+    "nussbaum_gain",
+    "stability_margin",
+)
+"""Fields of the trace that each snapshot holds."""
 
 
 @dataclass(frozen=True)
@@ -103,22 +116,22 @@ def adaptive_run(
             np.linspace(0, samples.size, min(SNAPSHOTS, samples.size) + 1).astype(int),
         ]
     )
-    names = ("time_s", "soc", "current_a", "voltage_v", "voltage_estimate_v", "k", "nussbaum_gain", "stability_margin")
-    columns: dict[str, list[float]] = {name: [] for name in names}
-    error_v, a = [], []
-    for first, last in itertools.pairwise(edges):
+    snapshots = np.zeros(edges.size - 1, dtype=TRACE)
+    error_v, parameters = np.zeros(edges.size - 1), np.zeros((edges.size - 1, PARAMETERS))
+    taken, a = 0, estimator.state["a"][0]
+    for first, last in itertools.pairwise(edges.tolist()):
         rows = estimator.run(samples[first:last])
         if rows.size == 0:
             continue
-        for name in names:
-            columns[name].append(float(rows[name][-1]))
+        snapshots[taken] = rows[-1]
         tracking_v = rows["tracking_error_v"]
-        error_v.append(float(tracking_v[int(np.argmax(np.abs(tracking_v)))]))
-        a.append(estimator.state["a"][0].copy())
-    if not a:
+        error_v[taken] = tracking_v[0 if rows.size == 1 else int(np.argmax(np.abs(tracking_v)))]
+        parameters[taken] = a
+        taken += 1
+    if taken == 0:
         raise UserError(f"none of {samples.size} samples is within the cell's limits")
-    found = {name: np.array(values) for name, values in columns.items()}
-    error, parameters = np.array(error_v), np.array(a)
+    found = {name: snapshots[name][:taken].copy() for name in SNAPSHOT_FIELDS}
+    error, parameters = error_v[:taken], parameters[:taken]
     epsilon_v = float(estimator.settings["epsilon_v"][0])
     margin = found["stability_margin"] - float(estimator.settings["margin_guard"][0])
     window = averaging_window(

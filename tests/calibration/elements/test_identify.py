@@ -38,6 +38,16 @@ def identified(warm, cold):
     return identify([warm, cold], wrong_start())
 
 
+@pytest.fixture(scope="module")
+def from_warm(warm):
+    return identify([warm], wrong_start())
+
+
+@pytest.fixture(scope="module")
+def from_warm_with_given_ocv(warm):
+    return identify([warm], wrong_start(), refine_ocv=False)
+
+
 def errors_mv(cell, samples):
     return 1e3 * validate(Columns(samples, "other"), cell).above.voltage_rms_v
 
@@ -49,13 +59,12 @@ def test_identified_resistances_at_25_c_are_within_their_errors(identified):
         assert abs(value - ohm) < 2.0 * std < 0.6 * ohm
 
 
-def test_captures_at_two_temperatures_predict_a_temperature_between(identified, warm):
+def test_captures_at_two_temperatures_predict_a_temperature_between(identified, from_warm):
     between = ladder_capture(steps(7), 10.0)
     assert identified.cell.ladder.temperature_c == (COLD_C, WARM_C)
     assert errors_mv(identified.cell, between) < 6.0
-    from_warm = identify([warm], wrong_start()).cell
-    assert from_warm.ladder.temperature_c == (WARM_C, WARM_C)
-    assert errors_mv(from_warm, between) > 1.5 * errors_mv(identified.cell, between)
+    assert from_warm.cell.ladder.temperature_c == (WARM_C, WARM_C)
+    assert errors_mv(from_warm.cell, between) > 1.5 * errors_mv(identified.cell, between)
 
 
 def test_at_one_temperature_the_weak_share_is_that_of_the_given_file(identified, warm):
@@ -91,9 +100,9 @@ def test_growth_near_empty_without_data_is_between_constant_and_that_of_the_file
     assert 1.5 * found["level"] < found["growing"] < 3.0
 
 
-def test_a_capture_with_little_information_gives_a_larger_std(warm):
-    short = Columns(warm.rows[:700], "short")
-    stds = [identify([capture], wrong_start(), refine_ocv=False).cell.ladder.std for capture in (warm, short)]
+def test_a_capture_with_little_information_gives_a_larger_std(warm, from_warm_with_given_ocv):
+    from_short = identify([Columns(warm.rows[:700], "short")], wrong_start(), refine_ocv=False)
+    stds = [found.cell.ladder.std for found in (from_warm_with_given_ocv, from_short)]
     assert module.LADDER_STD < stds[0] < 1.3 * module.LADDER_STD < 1.5 * stds[0] < stds[1]
 
 
@@ -201,15 +210,12 @@ def test_a_possible_error_of_hysteresis_does_not_change_the_curve(warm):
     assert abs(moved_v["branches"]) < 0.5 * abs(moved_v["one"])
 
 
-def test_the_miscount_of_a_capture_is_identified(warm):
-    lacking = warm.rows.copy()
-    lacking["current_a"] *= 0.98
-    found = {
-        name: identify([Columns(rows, name)], wrong_start(), refine_ocv=False).captures[0].miscount
-        for name, rows in (("whole", warm.rows), ("lacking", lacking))
-    }
-    assert abs(found["whole"]) < 0.001
-    assert 0.005 < found["lacking"] < 0.02  # true value 0.02, reduced by the prior, whose std is 0.004
+def test_the_miscount_of_a_capture_is_identified(warm, from_warm_with_given_ocv):
+    rows = warm.rows.copy()
+    rows["current_a"] *= 0.98
+    lacking = identify([Columns(rows, "lacking")], wrong_start(), refine_ocv=False)
+    assert abs(from_warm_with_given_ocv.captures[0].miscount) < 0.001
+    assert 0.005 < lacking.captures[0].miscount < 0.02  # true value 0.02, reduced by the prior, whose std is 0.004
 
 
 def test_refine_ocv_false_keeps_the_ocv_and_its_temperature_coefficient(warm, cold):
@@ -226,7 +232,7 @@ def test_a_pack_is_identified_with_the_accuracy_of_a_cell():
     assert errors_mv(found.cell, samples) < 36.0
 
 
-def test_glitches_do_not_change_the_result(warm):
+def test_glitches_do_not_change_the_result(warm, from_warm):
     samples = warm.rows.copy()
     rng = np.random.default_rng(5)
     places = rng.choice(np.arange(100, samples.size - 100), 60, replace=False)
@@ -236,10 +242,10 @@ def test_glitches_do_not_change_the_result(warm):
     resting = places[45:][samples["current_a"][places[45:]] == 0.0]
     samples["current_a"][resting] = 4.6
     samples["time_s"][50:52] = samples["time_s"][49]
-    found, clean = (identify([Columns(rows, "glitches")], wrong_start()) for rows in (samples, warm.rows))
+    found = identify([Columns(samples, "glitches")], wrong_start())
     assert found.captures[0].glitches >= 45
     for name in OHM:
-        assert found.elements[0.5][name][0] == pytest.approx(clean.elements[0.5][name][0], rel=0.05)
+        assert found.elements[0.5][name][0] == pytest.approx(from_warm.elements[0.5][name][0], rel=0.05)
 
 
 def test_a_gap_at_rest_is_accepted():

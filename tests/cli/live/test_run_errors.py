@@ -11,6 +11,16 @@ from bms_estimator.cli.main import COMMANDS
 from tests.command_line import PROGRAM, run
 from tests.patience import LONG_S
 
+OUTPUTS = [
+    (("config", "show"), ""),
+    (("--version",), ""),
+    (("ports", "/dev/null"), ""),
+    (("config", "show"), "1"),
+    pytest.param(("--version",), "1", marks=pytest.mark.thorough),
+    pytest.param(("ports", "/dev/null"), "1", marks=pytest.mark.thorough),
+]
+"""Commands by the way in which they write, and PYTHONUNBUFFERED."""
+
 
 def program(*arguments):
     """Run the program until it ends."""
@@ -86,8 +96,7 @@ def test_every_command_can_be_imported_and_has_help(command, capsys):
     assert f"bms-estimator {command} " in out
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("arguments", [("config", "show"), ("--version",), ("ports", "/dev/null")])
+@pytest.mark.parametrize(("arguments", "unbuffered"), OUTPUTS)
 def test_unwritable_stdout_is_reported(arguments, unbuffered):
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     with Path("/dev/full").open("w") as full:
@@ -98,8 +107,7 @@ def test_unwritable_stdout_is_reported(arguments, unbuffered):
     assert ended.returncode == 1
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("arguments", [("config", "show"), ("--version",), ("ports", "/dev/null")])
+@pytest.mark.parametrize(("arguments", "unbuffered"), OUTPUTS)
 def test_closed_stdout_ends_quietly(arguments, unbuffered):
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     read, write = os.pipe()

@@ -14,7 +14,7 @@ from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
 
-@pytest.mark.parametrize("command", ["demo", "replay", "run"])
+@pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.thorough), "replay", "run"])
 def test_a_first_start_says_that_it_compiles_and_can_be_interrupted(command: str, tmp_path: Path) -> None:
     pack, table = tmp_path / "pack.toml", tmp_path / "table.csv"
     pack.write_text('[sensor]\nport = "/dev/none"\n')

@@ -72,7 +72,9 @@ async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path)
         speed = BLOCKS_PER_S * BLOCK_S / PACKS
         edges, stop = SimulatedEdges(fleet, start_s=time.time(), speed=speed), asyncio.Event()
         settings = MqttSettings(url=tuple(f"mqtt://127.0.0.1:{port}" for port in cluster.mqtt_ports))
-        sending = asyncio.create_task(run_edges(fleet, edges, settings, connections=2, stop=stop, report=lambda _: None))
+        sending = asyncio.create_task(
+            run_edges(fleet, edges, settings, connections=2, stop=stop, report=lambda _: None)
+        )
         async with Heartbeats(nc) as heartbeats:
             await heartbeats.until_held(PARTITIONS, *workers)
             await heartbeats.until(blocks)
