@@ -50,7 +50,7 @@ def test_lists_raised_alarms_with_times_and_values(
         ("hook = [{run = ['/none/such']}]", 0, "alarms.hook.0.run = /none/such: no such program here"),
         ("hook = [{relay = 'high'}]", 2, "alarms.hook.0.relay: only the board of [sensor] with protocol = 'binary'"),
         ("hook = [{topic = 'load/set'}]", 2, "alarms.hook.0.topic = load/set: there is no broker"),
-        ("hook = [{}]", 2, "give one of run, topic and relay"),
+        ("hook = [{}]", 2, "give exactly one of run, topic and relay"),
         ("hook = [{topic = 'a', payload = '$nothing'}]", 2, "payload: 'nothing': must be one of $json"),
     ],
 )
