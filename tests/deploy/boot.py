@@ -1,4 +1,4 @@
-"""A small Debian that boots in a container from this machine's own /usr, with the service in it."""
+"""Container with a small Debian, booted from this machine's /usr, with the service in it."""
 
 import os
 import re
@@ -29,7 +29,7 @@ from bms_estimator.process.boot_clock import synchronised
 print("clock", ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)), synchronised(), flush=True)
 '
 """
-"""Prints what the service's sandbox shows of the clock."""
+"""Program that prints the clock's state as seen in the service's sandbox."""
 
 PACK = """
 [pack]
@@ -44,7 +44,7 @@ password_file = "mqtt-password"
 """
 SECRET = "open-sesame-4711"
 
-HARDER = """
+DROP_IN = """
 [Service]
 ExecStartPost=/opt/bms-estimator/bin/clock
 LoadCredential=mqtt-password:/root/mqtt-password
@@ -53,7 +53,7 @@ RestartSec=100ms
 # The board is on a pseudo-terminal.
 DeviceAllow=char-pts rw
 """
-"""For both units: a short watchdog, and the settings of this container."""
+"""Drop-in for both units: a short watchdog, and settings for this container."""
 
 BROKER = """
 listener 1883 127.0.0.1
@@ -62,7 +62,7 @@ password_file /root/bms.passwd
 acl_file /root/bms.acl
 """
 
-JUDGE = """
+SCRIPT_UNIT = """
 [Unit]
 SuccessAction=poweroff-force
 FailureAction=poweroff-force
@@ -74,17 +74,17 @@ StandardError=append:/root/report
 ExecStart=/root/judge
 """
 
-STANDINS = {
+STAND_INS = {
     "sudo": 'exec "$@"',
     "apt": "",
-    "python3": "",  # there is an environment
-    "udevadm": "",  # no container has a udev
-    "journalctl": "",  # it would look on for ever
+    "python3": "",  # the environment exists
+    "udevadm": "",  # containers have no udev
+    "journalctl": "",  # it would follow the journal without end
 }
-"""Programs of the page that do nothing here."""
+"""Programs of the documentation page that do nothing here."""
 
 
-def by_the_page(section: str, block: int = 0, page: str = "service") -> str:
+def commands_of_page(section: str, block: int = 0, page: str = "service") -> str:
     """Return the commands of a page of docs/pack: a block of indented lines in a section."""
     text = (PROJECT / f"docs/pack/{page}.md").read_text()
     inside = re.split(rf"(?m)^##+ {section}\n", text)[1].split("\n##")[0]
@@ -92,9 +92,9 @@ def by_the_page(section: str, block: int = 0, page: str = "service") -> str:
 
 
 def make_root(root: Path) -> None:
-    """Lay out the container's own files; all programs come from this machine, read only."""
+    """Create the container's own files. All programs are mounted read-only from this machine."""
     root.mkdir(exist_ok=True)
-    root.chmod(0o755)  # "/" of everyone in there
+    root.chmod(0o755)  # the container's root folder must be readable by all users
     for folder in (*FOLDERS, *EMPTY):
         (root / folder).mkdir(parents=True, exist_ok=True)
     for name, target in LINKS.items():
@@ -106,17 +106,17 @@ def make_root(root: Path) -> None:
     write_program(root / "opt/bms-estimator/bin/bms-estimator", PROGRAM)
     write_program(root / "opt/bms-estimator/bin/clock", CLOCK)
     write_program(root / "opt/bms-estimator/bin/pip", "#!/bin/sh\n")
-    for name, does in STANDINS.items():
+    for name, does in STAND_INS.items():
         write_program(root / "root/bin" / name, f"#!/bin/sh\n{does}\n")
-    write_program(root / "root/judge", Path(__file__).with_name("judge.sh").read_text())
+    write_program(root / "root/judge", Path(__file__).with_name("container_script.sh").read_text())
     for name, port in (("pack", "board"), ("second", "absent")):
         (root / f"root/{name}.toml").write_text(PACK.format(name=name, port=port))
     settings = "cp /root/pack.toml /root/second.toml /etc/bms-estimator/"  # "then edit it"
-    install = re.sub(r"(?m)^.*config init .*$", rf"\g<0>\n{settings}", by_the_page("Install"))
+    install = re.sub(r"(?m)^.*config init .*$", rf"\g<0>\n{settings}", commands_of_page("Install"))
     for name, commands in (
         ("install", install),
-        ("clock", by_the_page("Install", 1)),
-        ("uninstall", by_the_page("Uninstall")),
+        ("clock", commands_of_page("Install", 1)),
+        ("uninstall", commands_of_page("Uninstall")),
     ):
         (root / "root" / name).write_text(commands)
     (root / "etc/hosts").write_text("127.0.0.1 localhost\n")
@@ -129,10 +129,10 @@ def make_root(root: Path) -> None:
     system = root / "etc/systemd/system"
     for unit in ("bms-estimator", "bms-estimator@"):
         (system / f"{unit}.service.d").mkdir()
-        (system / f"{unit}.service.d/harder.conf").write_text(HARDER)
+        (system / f"{unit}.service.d/harder.conf").write_text(DROP_IN)
     shutil.copy(PROJECT / "deploy/bms-estimator@.service", system)
     shutil.copy(PROJECT / "deploy/bms-estimator@.service.d/pack.conf", system / "bms-estimator@.service.d")
-    (system / "judge.service").write_text(JUDGE)
+    (system / "judge.service").write_text(SCRIPT_UNIT)
     state = root / "var/lib/private/bms-estimator"
     for folder in (state.parent, state):
         folder.mkdir(mode=0o700, parents=True)  # as systemd wants it
@@ -149,10 +149,10 @@ def write_program(path: Path, text: str) -> None:
 
 
 def boot(root: Path, systemd_nspawn: str, timeout_s: float) -> str:
-    """Boot until the judge powers off. Returns its report.
+    """Boot the container until its script powers it off; return the report.
 
     Raises:
-        TimeoutError: It did not end in time; the message holds what the console said.
+        TimeoutError: The container did not end in time; the message has the end of the console output.
     """
     binds = {
         "/usr": "/usr",
@@ -161,7 +161,7 @@ def boot(root: Path, systemd_nspawn: str, timeout_s: float) -> str:
         str(PROJECT): "/opt/project",
     }
     command = [systemd_nspawn, "--quiet", "--register=no", "--keep-unit", "--private-network", f"--directory={root}"]
-    command += ["--capability=CAP_SYS_TIME"]  # else the container itself forbids adjtimex
+    command += ["--capability=CAP_SYS_TIME"]  # otherwise the container itself forbids adjtimex
     command += [f"--bind-ro={source}:{target}" for source, target in binds.items()]
     command += ["--boot", "systemd.unit=judge.service", "systemd.mask=systemd-networkd.service"]
     environment = {"PATH": os.environ["PATH"], "SYSTEMD_SECCOMP": os.environ.get("SYSTEMD_SECCOMP", "1")}

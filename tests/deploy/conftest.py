@@ -1,4 +1,4 @@
-"""Files to deploy, and the programs that check them."""
+"""Fixtures for the deployed files and the programs that check them."""
 
 import os
 import shutil
@@ -12,7 +12,7 @@ DEPLOY = Path(__file__).parents[2] / "deploy"
 
 @pytest.fixture
 def program() -> Callable[[str], str]:
-    """Path of a program, or a skip that names the Debian package it is in."""
+    """Function that returns the path of a program, or skips the test and names its Debian package."""
 
     def find(name: str, package: str) -> str:
         path = shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin:/sbin")

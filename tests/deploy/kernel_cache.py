@@ -1,4 +1,4 @@
-"""A cache of kernels for a service that keeps its own: what the tests have compiled, but for one kernel."""
+"""Kernel cache for a service with its own cache folder: the tests' compiled kernels except one."""
 
 import shutil
 from pathlib import Path
@@ -11,8 +11,8 @@ from bms_estimator.numba_cache import COMPILED_IN
 from bms_estimator.service.kernel_warm_up import load_kernels
 
 PACKAGE = Path(bms_estimator.__file__).parent
-LEFT_OUT = "step.run-"
-"""Begin of the names of the kernel's files that the service has to compile itself."""
+OMITTED = "step.run-"
+"""Prefix of the files of the kernel that the service has to compile."""
 
 
 def fill(cache: Path, package: Path = PACKAGE) -> None:
@@ -26,5 +26,5 @@ def fill(cache: Path, package: Path = PACKAGE) -> None:
             shutil.copytree(
                 cached,
                 cache / compiled.name / named(str(package / folder / "any.py")),
-                ignore=shutil.ignore_patterns(f"{LEFT_OUT}*", "*.tmp.*"),
+                ignore=shutil.ignore_patterns(f"{OMITTED}*", "*.tmp.*"),
             )

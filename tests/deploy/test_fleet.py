@@ -1,4 +1,4 @@
-"""The fleet's units, judged by systemd, and the three nodes' configuration, which is what the code makes."""
+"""Units of the fleet, checked by systemd, and generated configurations of three nodes."""
 
 import re
 import subprocess
@@ -21,27 +21,27 @@ NODES = "a.example,b.example,c.example"
 
 @pytest.fixture(params=["bms-estimator-fleet.service", "bms-estimator-worker@1.service"])
 def unit(request: pytest.FixtureRequest, deploy: Path, tmp_path: Path) -> Path:
-    """A unit with a program that exists here."""
+    """Unit whose program is replaced by one that exists here."""
     text = (deploy / "fleet" / request.param.replace("@1", "@")).read_text()
     path = tmp_path / request.param
     path.write_text(re.sub(r"(?m)^ExecStart=/\S+", f"ExecStart={sys.executable}", text))
     return path
 
 
-def test_systemd_finds_nothing_wrong_in_the_units(program: Program, unit: Path) -> None:
+def test_systemd_accepts_the_units(program: Program, unit: Path) -> None:
     assert verify(program("systemd-analyze", "systemd"), unit) == ""
 
 
 def test_exposure_is_at_most_1_5(program: Program, unit: Path) -> None:
     command = [program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", text)
-    assert found, text
-    assert float(found[1]) <= HIGHEST_EXPOSURE
+    exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", text)
+    assert exposure, text
+    assert float(exposure[1]) <= HIGHEST_EXPOSURE
 
 
 def example(deploy: Path, number: int) -> str:
-    """The configuration of a node of three; the claims, which are of the operator's own keys, only named."""
+    """Return the configuration of a node of three, with placeholders for the claims."""
     settings = read_toml(deploy / "fleet" / "fleet.toml", FleetSettings)
     place = NodeLocation(Path("/var/lib/bms-estimator-fleet"), number, _nodes(settings, number, NODES))
     accounts = Accounts(
@@ -52,5 +52,5 @@ def example(deploy: Path, number: int) -> str:
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_the_three_nodes_are_as_the_code_makes_them(deploy: Path, number: int) -> None:
+def test_example_configurations_are_current(deploy: Path, number: int) -> None:
     assert (deploy / f"fleet/three-nodes/n{number}.conf").read_text() == example(deploy, number)

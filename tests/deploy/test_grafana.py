@@ -22,9 +22,9 @@ TAGS = {"device", "name", "severity"}
 
 def fields(query: str) -> set[str]:
     """Return the fields between SELECT and FROM."""
-    asked = re.search(r"SELECT (.*) FROM", query)
-    assert asked
-    return set(re.findall(r'(?<!AS )"(\w+)"', asked[1]))
+    selection = re.search(r"SELECT (.*) FROM", query)
+    assert selection
+    return set(re.findall(r'(?<!AS )"(\w+)"', selection[1]))
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +44,13 @@ def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
 
 
 @pytest.mark.parametrize(("title", "target"), TARGETS, ids=[f"{title}-{t['refId']}" for title, t in TARGETS])
-def test_every_field_that_a_panel_asks_for_is_published(title: str, target: dict[str, Any]) -> None:
+def test_every_queried_field_is_published(title: str, target: dict[str, Any]) -> None:
     measurement = re.search(r'FROM "(\w+)"', target["query"])
     assert measurement
     assert fields(target["query"]) - TAGS <= set(MODELS[measurement[1]].model_fields)
 
 
-def test_every_query_brings_a_value_from_a_real_influxdb(influxdb: InfluxDB) -> None:
+def test_every_query_returns_a_value_from_a_real_influxdb(influxdb: InfluxDB) -> None:
     assert influxdb.ask(DASHBOARD["templating"]["list"][1]["query"]) == [{"key": "device", "value": "pack"}]
     for title, target in TARGETS:
         query = target["query"].replace("$device", "pack").replace("$timeFilter", "time > now() - 36500d")
@@ -59,11 +59,11 @@ def test_every_query_brings_a_value_from_a_real_influxdb(influxdb: InfluxDB) -> 
         assert any(value is not None for value in values), f"{title}: {query}"
 
 
-def test_panels_stand_beside_each_other_and_use_the_source_that_is_chosen() -> None:
+def test_panels_do_not_overlap_and_use_the_selected_source() -> None:
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
     for one, other in itertools.combinations([panel["gridPos"] for panel in DASHBOARD["panels"]], 2):
-        apart = [a[k] + a[s] <= b[k] for a, b in ((one, other), (other, one)) for k, s in (("x", "w"), ("y", "h"))]
-        assert any(apart)
+        separate = [a[k] + a[s] <= b[k] for a, b in ((one, other), (other, one)) for k, s in (("x", "w"), ("y", "h"))]
+        assert any(separate)
         assert one["x"] + one["w"] <= 24
     for _, target in TARGETS:
         assert target["datasource"]["uid"] == "${source}"

@@ -1,4 +1,4 @@
-"""The Mosquitto example, run by Mosquitto: passwords, no anonymous clients, access control."""
+"""Example configuration of Mosquitto, run by Mosquitto: passwords, anonymous clients, access control."""
 
 import asyncio
 import contextlib
@@ -14,7 +14,7 @@ from pathlib import Path
 import aiomqtt
 import pytest
 
-from tests.deploy.boot import by_the_page
+from tests.deploy.boot import commands_of_page
 from tests.free_port import free_port
 from tests.patience import LONG_S
 
@@ -26,12 +26,12 @@ LAST = {
     "bms/pack/request/+": ("homeassistant", "bms/pack/request/last"),
     "homeassistant/status": ("homeassistant", "homeassistant/status"),
 }
-"""Last message of each subscription: once it has arrived, all before it have arrived or were denied."""
+"""Sender and topic of the last message of each subscription. When it arrives, all earlier ones have arrived or were denied."""
 
 
 @pytest.fixture
 def broker(program, deploy, tmp_path) -> Iterator[int]:
-    """Port of a Mosquitto with the example's files, in a folder of its own."""
+    """Port of a Mosquitto with the example's files."""
     port = free_port()
     mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
     write_users(tmp_path, deploy, passwd)
@@ -43,7 +43,7 @@ def broker(program, deploy, tmp_path) -> Iterator[int]:
 
 
 def write_users(folder: Path, deploy: Path, passwd: str) -> None:
-    """Passwords, and what each may do: a part for each pack, as the commands of docs/pack/service.md put it together."""
+    """Write passwords and access lists, as the commands of docs/pack/mosquitto.md do."""
     passwords = folder / "bms.passwd"
     passwords.touch(mode=0o600)
     for user, password in PASSWORDS.items():
@@ -55,7 +55,7 @@ def write_users(folder: Path, deploy: Path, passwd: str) -> None:
 
 @contextlib.contextmanager
 def running(mosquitto: str, path: Path, text: str, port: int) -> Iterator[None]:
-    path.write_text(text + ("user root\n" if os.geteuid() == 0 else ""))  # the folder is root's
+    path.write_text(text + ("user root\n" if os.geteuid() == 0 else ""))  # the folder belongs to root
     with subprocess.Popen([mosquitto, "-c", path], stderr=subprocess.PIPE, text=True) as process:
         try:
             wait_for_port(process, port)
@@ -79,72 +79,74 @@ def client(port: int, user: str) -> aiomqtt.Client:
     return aiomqtt.Client("127.0.0.1", port, username=user, password=PASSWORDS[user], timeout=LONG_S)
 
 
-async def arrived(port: int, sender: str, topics: list[str], *, reader: str, subscription: str) -> list[str]:
+async def received_by(port: int, sender: str, topics: list[str], *, reader: str, subscription: str) -> list[str]:
     """Return the messages of ``sender`` that reach ``reader``."""
     allowed, last = LAST[subscription]
-    async with client(port, reader) as listening, client(port, sender) as sending, client(port, allowed) as ending:
-        await listening.subscribe(subscription, qos=1)
+    async with client(port, reader) as subscriber, client(port, sender) as sending, client(port, allowed) as ending:
+        await subscriber.subscribe(subscription, qos=1)
         for topic in topics:
             await sending.publish(topic, b"x", qos=1)
         await ending.publish(last, b"x", qos=1)
         seen: list[str] = []
         async with asyncio.timeout(LONG_S):
-            async for message in listening.messages:
+            async for message in subscriber.messages:
                 if message.topic.value == last:
                     break
                 seen.append(message.topic.value)
     return seen
 
 
-async def test_an_anonymous_client_is_refused(broker):
+async def test_anonymous_client_is_rejected(broker):
     with pytest.raises(aiomqtt.MqttError):
         async with aiomqtt.Client("127.0.0.1", broker, timeout=LONG_S):
             pass
 
 
-async def test_a_wrong_password_is_refused(broker):
+async def test_wrong_password_is_rejected(broker):
     with pytest.raises(aiomqtt.MqttError):
         async with aiomqtt.Client("127.0.0.1", broker, username="pack", password="two", timeout=LONG_S):
             pass
 
 
-async def test_the_estimator_publishes_what_the_dashboard_sees(broker):
+async def test_dashboard_receives_the_estimator_s_topics(broker):
     topics = ["bms/pack/state", "bms/pack/sensor/availability", "bms/pack/availability"]
-    assert await arrived(broker, "pack", topics, reader="dashboard", subscription="bms/#") == topics
+    assert await received_by(broker, "pack", topics, reader="dashboard", subscription="bms/#") == topics
 
 
-async def test_the_estimator_publishes_nothing_but_its_own_topics(broker):
+async def test_estimator_publishes_only_its_own_topics(broker):
     topics = ["homeassistant/light/x/set", "other/topic", "homeassistant/device/bms_pack/config"]
-    seen = await arrived(broker, "pack", topics, reader="homeassistant", subscription="homeassistant/#")
+    seen = await received_by(broker, "pack", topics, reader="homeassistant", subscription="homeassistant/#")
     assert seen == ["homeassistant/device/bms_pack/config"]
 
 
-async def test_a_pack_writes_nothing_of_another(broker):
+async def test_pack_cannot_publish_another_pack_s_topics(broker):
     topics = ["bms/pack/state", "bms/pack/event", "bms/pack/availability", "bms/pack/response/soc", "bms/shed/state"]
-    assert await arrived(broker, "shed", topics, reader="dashboard", subscription="bms/#") == ["bms/shed/state"]
+    assert await received_by(broker, "shed", topics, reader="dashboard", subscription="bms/#") == ["bms/shed/state"]
     discovery = ["homeassistant/device/bms_pack/config", "homeassistant/device/bms_shed/config"]
-    seen = await arrived(broker, "shed", discovery, reader="homeassistant", subscription="homeassistant/#")
+    seen = await received_by(broker, "shed", discovery, reader="homeassistant", subscription="homeassistant/#")
     assert seen == discovery[1:]
 
 
-async def test_a_pack_hears_nothing_of_another(broker):
+async def test_pack_receives_only_its_own_requests(broker):
     topics = ["bms/shed/request/publish_rate", "bms/pack/request/publish_rate"]
-    async with client(broker, "pack") as listening, client(broker, "homeassistant") as asking:
+    async with client(broker, "pack") as subscriber, client(broker, "homeassistant") as requester:
         for topic in ("bms/+/request/+", "bms/pack/request/+"):
-            await listening.subscribe(topic)
+            await subscriber.subscribe(topic)
         for topic in topics:
-            await asking.publish(topic, b"{}", qos=1)
+            await requester.publish(topic, b"{}", qos=1)
         async with asyncio.timeout(LONG_S):
-            assert (await anext(listening.messages)).topic.value == "bms/pack/request/publish_rate"
+            assert (await anext(subscriber.messages)).topic.value == "bms/pack/request/publish_rate"
 
 
 @pytest.fixture
 def certified(program, deploy, tmp_path) -> Iterator[int]:
-    """Port of the listener for other machines, with certificates made by the commands of docs/pack/service.md."""
+    """Port of the listener for other machines, with certificates made by the commands of docs/pack/mosquitto.md."""
     port = free_port()
     mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
     program("openssl", "openssl")
-    commands = by_the_page("Certificates", page="mosquitto").replace("broker.lan", "localhost").replace("house", "pack")
+    commands = (
+        commands_of_page("Certificates", page="mosquitto").replace("broker.lan", "localhost").replace("house", "pack")
+    )
     commands += "openssl req -x509 $new -subj /CN=pack -keyout stranger.key -out stranger.crt\n"
     subprocess.run(["bash", "-ec", commands], cwd=tmp_path, check=True, capture_output=True)
     write_users(tmp_path, deploy, passwd)
@@ -163,7 +165,7 @@ def with_certificate(port: int, folder: Path, name: str) -> aiomqtt.Client:
     return aiomqtt.Client("localhost", port, tls_params=parameters, timeout=LONG_S)
 
 
-async def test_a_certificate_says_whose_topics_a_pack_may_write(certified, tmp_path):
+async def test_certificate_decides_which_topics_a_pack_may_publish(certified, tmp_path):
     async with with_certificate(certified, tmp_path, "pack") as client:
         await client.subscribe("bms/pack/availability")
         for topic in ("bms/shed/availability", "bms/pack/availability"):
@@ -172,7 +174,7 @@ async def test_a_certificate_says_whose_topics_a_pack_may_write(certified, tmp_p
             assert (await anext(client.messages)).topic.value == "bms/pack/availability"
 
 
-def test_nobody_without_a_certificate_of_the_authority_is_let_in(certified, tmp_path):
+def test_clients_without_a_valid_certificate_are_rejected(certified, tmp_path):
     for name in (None, "stranger"):
         context = ssl.create_default_context(cafile=tmp_path / "ca.crt")
         if name:
@@ -180,47 +182,49 @@ def test_nobody_without_a_certificate_of_the_authority_is_let_in(certified, tmp_
         line = socket.create_connection(("localhost", certified), LONG_S)
         refused = pytest.raises((ssl.SSLError, ConnectionError))
         with line, refused, context.wrap_socket(line, server_hostname="localhost") as secured:
-            secured.recv(1)  # a broker that let one in would wait for a first message
+            secured.recv(1)  # an accepting broker would wait for a first message
 
 
-async def test_the_dashboard_may_not_ask_and_home_assistant_may(broker):
+async def test_home_assistant_may_send_requests_but_the_dashboard_may_not(broker):
     topics = ["bms/pack/request/soc"]
     ask = {"reader": "pack", "subscription": "bms/pack/request/+"}
-    assert await arrived(broker, "dashboard", topics, **ask) == []
-    assert await arrived(broker, "homeassistant", topics, **ask) == topics
+    assert await received_by(broker, "dashboard", topics, **ask) == []
+    assert await received_by(broker, "homeassistant", topics, **ask) == topics
 
 
-async def test_nobody_but_the_estimator_may_publish_state(broker):
+async def test_only_the_estimator_may_publish_state(broker):
     for user in ("dashboard", "homeassistant"):
-        assert await arrived(broker, user, ["bms/pack/state"], reader="dashboard", subscription="bms/#") == []
+        assert await received_by(broker, user, ["bms/pack/state"], reader="dashboard", subscription="bms/#") == []
 
 
-async def test_the_estimator_hears_the_birth_message(broker):
-    seen = await arrived(broker, "homeassistant", [], reader="pack", subscription="homeassistant/status")
-    assert seen == []  # but the last, without which it would not have ended
+async def test_estimator_receives_the_birth_message(broker):
+    seen = await received_by(broker, "homeassistant", [], reader="pack", subscription="homeassistant/status")
+    assert seen == []  # apart from the last message, which ends the reception
 
 
-async def test_the_estimator_hears_who_else_writes_its_availabilities(broker):
+async def test_estimator_receives_its_availability_topics(broker):
     topics = ["bms/pack/availability", "bms/pack/sensor/availability", "bms/pack/request/last"]
     async with client(broker, "pack") as estimator:
         for topic in topics[:2]:
             await estimator.subscribe(topic)
         await estimator.subscribe("bms/pack/request/+")
-        async with client(broker, "homeassistant") as other:  # may not write the first two, so the estimator does
+        async with client(
+            broker, "homeassistant"
+        ) as other:  # may not write the first two topics, but the estimator may
             for topic in topics[:2]:
                 await other.publish(topic, b"forged", qos=1)
                 await estimator.publish(topic, b"online", qos=1)
             await other.publish(topics[2], b"", qos=1)
         async with asyncio.timeout(LONG_S):
-            heard = [await anext(estimator.messages) for _ in topics]
-    assert [(m.topic.value, m.payload) for m in heard] == [
+            received = [await anext(estimator.messages) for _ in topics]
+    assert [(m.topic.value, m.payload) for m in received] == [
         (topics[0], b"online"),
         (topics[1], b"online"),
         (topics[2], b""),
     ]
 
 
-async def test_a_message_that_would_fill_the_memory_goes_no_further(broker):
+async def test_too_large_message_is_not_forwarded(broker):
     async with client(broker, "pack") as estimator:
         await estimator.subscribe("bms/pack/request/+")
         with contextlib.suppress(aiomqtt.MqttError):

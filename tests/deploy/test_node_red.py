@@ -1,4 +1,4 @@
-"""The flow in a real Node-RED, beside a real broker; ``make integrations`` installs it."""
+"""Flow in a real Node-RED with a real broker (``make integrations`` installs Node-RED)."""
 
 import asyncio
 import json
@@ -60,11 +60,11 @@ class NodeRed:
         self._process.terminate()
         await self._process.communicate()
 
-    async def until(self, said: Callable[[str], bool]) -> None:
+    async def until(self, condition: Callable[[str], bool]) -> None:
         assert self._process.stdout
         try:
             async with asyncio.timeout(LONG_S):
-                while not said(self.output):
+                while not condition(self.output):
                     data = await self._process.stdout.read(1 << 16)
                     assert data, self.output
                     self.output += data.decode()
@@ -72,13 +72,13 @@ class NodeRed:
             raise AssertionError(self.output) from None
 
 
-async def test_what_is_left_and_each_alarm_come_out(broker: Broker, tmp_path: Path) -> None:
+async def test_remaining_charge_and_alarms_are_reported(broker: Broker, tmp_path: Path) -> None:
     if not NODE_RED.exists():
         pytest.skip("node-red is not installed (make integrations)")
 
     async def alarm(client: Listener, *, active: bool) -> None:
-        told = SOC_LOW.model_copy(update={"active": active, "text": "charge it soon" if active else ""})
-        await client.publish("bms/attic/alarm/soc_low", told.model_dump_json(), qos=1, retain=True)
+        payload = SOC_LOW.model_copy(update={"active": active, "text": "charge it soon" if active else ""})
+        await client.publish("bms/attic/alarm/soc_low", payload.model_dump_json(), qos=1, retain=True)
 
     async with Listener(broker) as client:
         await client.publish("bms/attic/alarm/over_temperature", '{"active": false}', qos=1, retain=True)

@@ -104,7 +104,7 @@ def test_a_kernel_that_the_cache_lacks_is_compiled_into_it_once(tmp_path):
     before, first, second = seen
     written = {Path(name).name for name, at_ns in first.items() if before.get(name) != at_ns}
     assert written
-    assert all(name.startswith(kernel_cache.LEFT_OUT) for name in written)
+    assert all(name.startswith(kernel_cache.OMITTED) for name in written)
     assert second == first
 
 

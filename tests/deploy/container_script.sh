@@ -1,13 +1,13 @@
 #!/bin/sh
-# Runs inside the container as the judge: does to the service what happens in years, and reports each part under a name.
+# Runs inside the container: exposes the service to faults, and reports each part under a name.
 part() { echo "== $1"; }
-until_true() { # what ought to come comes; what does not is seen by the test
+until_true() { # reports a timeout, which the tests detect
     for _ in $(seq 300); do eval "$1" >/dev/null 2>&1 && return; sleep 0.1; done
     echo "never true: $1"
 }
 show() { systemctl show bms-estimator -p ActiveState,NRestarts,Result,StatusText,User; }
 main_pid() { systemctl show "${1:-bms-estimator}" -P MainPID; }
-by_the_page() { PATH="/root/bin:$PATH" bash -ex "$1"; }
+run_page() { PATH="/root/bin:$PATH" bash -ex "$1"; }
 lines() { journalctl --no-pager -o cat -u "${1:-bms-estimator}"; }
 cache=/var/cache/private/bms-estimator
 
@@ -20,7 +20,7 @@ systemd-run --quiet --unit=board --setenv=NUMBA_CACHE_DIR=/root/cache sh -c \
     '/opt/bms-estimator/bin/bms-estimator simulate --cell chen_mora --rate-hz 10 >/run/board'
 until_true 'grep -q /dev/pts/ /run/board'
 chgrp dialout "$(cat /run/board)" && chmod 660 "$(cat /run/board)" && mkdir /dev/bms && ln -s "$(cat /run/board)" /dev/bms/board
-cd /opt/project && by_the_page /root/install
+cd /opt/project && run_page /root/install
 
 part first
 until_true "ls $cache/*/*"
@@ -60,7 +60,7 @@ systemctl stop bms-estimator@second
 part full
 mount -t tmpfs -o size=4k,mode=700 none /var/lib/private/bms-estimator
 dd if=/dev/zero of=/var/lib/private/bms-estimator/full bs=4k count=1 status=none
-by_the_page /root/clock # which starts it again
+run_page /root/clock # which starts it again
 until_true 'timeout 5 mosquitto_sub -C 1 -u dashboard -P two -t bms/pack/health | grep -q "No space left"'
 show
 systemctl stop bms-estimator
@@ -71,5 +71,5 @@ lines
 lines bms-estimator@second
 
 part uninstall
-by_the_page /root/uninstall
+run_page /root/uninstall
 find /etc /opt /var/lib /var/cache /run -xdev -path /opt/project -prune -o -path /opt/packages -prune -o -name "*bms-estimator*" -print

@@ -1,4 +1,4 @@
-"""A service with a password and a key: neither appears in its output or its files."""
+"""Secrets of a service: password and key appear neither in its output nor in its files."""
 
 import asyncio
 import ssl
@@ -47,7 +47,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-async def test_a_password_and_a_key_are_told_nobody(tmp_path: Path, line: Line, broker: Broker, monkeypatch) -> None:
+async def test_password_and_key_are_never_shown(tmp_path: Path, line: Line, broker: Broker, monkeypatch) -> None:
     credentials = tmp_path / "credentials"
     credentials.mkdir()
     (credentials / "mqtt-password").write_text(PASSWORD)
@@ -67,21 +67,21 @@ async def test_a_password_and_a_key_are_told_nobody(tmp_path: Path, line: Line, 
             await live.wait_json("bms/pack/state")
             await live.wait_json("bms/pack/health", lambda health: health["sensor_online"])
             proc = Path(f"/proc/{service.pid}")
-            told = [(proc / "cmdline").read_bytes(), (proc / "environ").read_bytes()]
+            outputs = [(proc / "cmdline").read_bytes(), (proc / "environ").read_bytes()]
             board.cancel()
             service.terminate()
             assert service.stderr
-            told.append(await asyncio.wait_for(service.stderr.read(), LONG_S))
+            outputs.append(await asyncio.wait_for(service.stderr.read(), LONG_S))
             assert await service.wait() == 0
         finally:
             if service.returncode is None:
                 service.kill()
-    told += [payload for _, payload, _ in live.messages]
+    outputs += [payload for _, payload, _ in live.messages]
     written = files_of(tmp_path)
     assert len(written) >= 2
-    told += [path.read_bytes() for path in written]
-    assert b"broker connected" in told[2]
-    assert [secret for secret in secrets if any(secret in one for one in told)] == []
+    outputs += [path.read_bytes() for path in written]
+    assert b"broker connected" in outputs[2]
+    assert [secret for secret in secrets if any(secret in one for one in outputs)] == []
     assert {oct(path.stat().st_mode & 0o777) for path in written if path.parent.name == "state"} == {"0o600"}
 
 
@@ -91,7 +91,7 @@ def files_of(folder: Path) -> list[Path]:
 
 
 async def feed(line: Line) -> None:
-    """A board that prints text at 50 Hz."""
+    """Send lines of a text board at 50 Hz."""
     while True:
         line.write(b"3.80,0.10,25.0\r\n")
         await asyncio.sleep(0.02)
