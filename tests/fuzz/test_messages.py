@@ -7,15 +7,15 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from bms_estimator.sinks.terminal.panels import Screen
-from bms_estimator.sinks.terminal.scene import ScreenState
 from rich.console import Console
 from serial.tools.list_ports_common import ListPortInfo
 
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.topic_cache import TopicCache
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
-from bms_estimator.sinks.terminal import text_line
+from bms_estimator.sinks.terminal.screen import build_screen
+from bms_estimator.sinks.terminal.text_line import text_line
+from bms_estimator.sinks.terminal.view_state import PackView, ViewState
 from bms_estimator.sources.serial.port_list import NoPortError, may_be_board, resolve_port
 from tests.fuzz.edited_seeds import edited_seeds
 
@@ -43,11 +43,11 @@ def test_published_messages_show_only_printable_text(data: bytes) -> None:
     cache = TopicCache("bms")
     for topic in TOPICS:
         message = cache.take(f"bms/pack/{topic}", data, 0.0)
-        line = text_line.line(message) if message else None
+        line = text_line(message) if message else None
         assert line is None or line.isprintable()
     if data:
-        screen = Screen(ScreenState("pack", cache.devices["pack"].topics, 0.0, 0.0))
-        text = "".join(segment.text for segment in CONSOLE.render(screen))
+        view = ViewState(0.0, [PackView("pack", cache.devices["pack"].topics, 0.0)])
+        text = "".join(segment.text for segment in CONSOLE.render(build_screen(view, *CONSOLE.size)))
         assert text.replace("\n", "").isprintable()
 
 

@@ -17,7 +17,7 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from bms_estimator.telemetry.rest_detector import WATCHED_S
+from bms_estimator.telemetry.rest_detector import REST_S
 from tests.home_assistant.conftest import DASHBOARD
 from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant
 from tests.home_assistant.packs import Packs
@@ -209,7 +209,7 @@ def changes(home: HomeAssistant, device: str) -> int:
 
 
 def test_the_present_current_becomes_zero_by_its_button(home: HomeAssistant, packs: Packs, broker: Broker) -> None:
-    told(broker, "bms/bench/health", lambda health: health["uptime_s"] > WATCHED_S + 5.0)
+    told(broker, "bms/bench/health", lambda health: health["uptime_s"] > REST_S + 5.0)
     deadline, granted = time.monotonic() + LONG_S, '"present current taken as zero on request", "pack": "bench"'
     refused = -1
     while granted not in packs.log:

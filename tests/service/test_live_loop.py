@@ -25,7 +25,7 @@ from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
-from bms_estimator.telemetry.rest_detector import WATCHED_S
+from bms_estimator.telemetry.rest_detector import REST_S
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
@@ -276,7 +276,7 @@ class Zeroed:
             await run.sink.until(lambda s: s.estimate is not None, skip=seen)
 
 
-AT_REST = [(0.03, 3.8)] * (round(WATCHED_S) + 2)
+AT_REST = [(0.03, 3.8)] * (round(REST_S) + 2)
 
 
 async def test_current_zero_is_accepted_at_rest() -> None:
@@ -310,7 +310,7 @@ async def test_rest_before_a_silence_does_not_count() -> None:
     zero = Zeroed()
     async with running(current_zero=zero, clock=zero.clock) as run:
         await zero.watch(run, AT_REST)
-        zero.now_s += WATCHED_S
+        zero.now_s += REST_S
         await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
         await zero.watch(run, AT_REST[:2])
         with pytest.raises(UserError, match="watched for"):

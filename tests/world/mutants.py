@@ -12,14 +12,14 @@ from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.sinks.mqtt.messages import MessageBuilder
 from bms_estimator.sources.serial.board_check import BoardCheck
-from bms_estimator.store.outbox_queue import Queue
+from bms_estimator.store.outbox_queue import OutboxQueue
 
 
 @contextlib.contextmanager
 def no_rewind() -> Iterator[None]:
     """Do not resend messages that were in flight when a connection broke."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Queue, "rewind", lambda _: None)
+        patch.setattr(OutboxQueue, "rewind", lambda _: None)
         yield
 
 
