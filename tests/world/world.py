@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointContent, CheckpointFile
+from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointContent, CheckpointFile
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.service import pack_service as service
 from bms_estimator.settings.mqtt import MqttSettings
@@ -576,7 +576,7 @@ class World:
 
         def loaded(file: CheckpointFile) -> CheckpointContent:
             found = load(file)
-            if found.reason.startswith(REFUSED):
+            if found.reason.startswith(REJECTED):
                 self.fail(f"the checkpoint is {found.reason}")
             return found
 
