@@ -13,6 +13,7 @@ INPUTS  ?= 20000
 KILLS   ?= 100
 NODES   ?= 1 3
 HOME_ASSISTANT ?= 2025.2.5
+CYCLONEDX := 7.5.0
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # Programs that the tests run: compiler and simulator of the board, a broker, systemd's checks.
@@ -148,7 +149,7 @@ payloads: venv ## record the published payloads; rejects an incompatible change 
 kernels: venv
 	$(BIN)/python -c 'from bms_estimator.service.kernel_warm_up import load_kernels; load_kernels()'
 
-lock: venv ## update requirements.lock and the SBOM of the wheel after a change of dependencies (needs uv)
+lock: ## update requirements.lock and the SBOM of the wheel after a change of dependencies (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --universal pyproject.toml -o requirements.lock
 	uv pip compile --quiet --generate-hashes --no-header --universal --constraints requirements.lock pyproject.toml | \
-		$(BIN)/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible -o bms_estimator.cdx.json -
+		uv tool run --quiet --from cyclonedx-bom==$(CYCLONEDX) cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible -o bms_estimator.cdx.json -
