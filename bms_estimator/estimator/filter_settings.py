@@ -13,19 +13,25 @@ from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.sampling import BOARD, Sampling
 
-CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
-"""Default std of the OCV per cell [V] and in SOC, for a cell file without an error column."""
+CURVE_ERROR_V = 0.004
+"""Default std of the OCV per cell, for a cell file without an error column [V]."""
+CURVE_ERROR_SOC = 0.007
+"""Default std of the OCV along SOC, for a cell file without an error column."""
 MAX_SLOPE_V = 5.0
 """Upper limit of the slope per cell that converts an error of SOC to one of the OCV [V]. The steep ends of the curve have a
 better defined SOC."""
-LEARNED, LEARNED_SLOPE_V = 0.97, 0.15
-"""Fraction of the OCV's error variance that is learned permanently, and minimum slope dOCV/dSOC per cell over the whole
-curve [V] for learning. On a plateau the voltage cannot distinguish an error of the curve from one of the SOC, and the
-knees move."""
-CURVE_SOC, KNEE_V, KNEE_DECORRELATION = 0.3, 1.0, 4.0
-"""Correlation length of the OCV's error in SOC; slope per cell of 45 degrees [V]; loss of correlation per radian of slope
-angle. On a plateau the error is one of voltage, at a knee one of SOC, so that both are correlated by
-e^-(KNEE_DECORRELATION x angle)."""
+LEARNED = 0.97
+"""Fraction of the OCV's error variance that is constant and is learned."""
+LEARNED_SLOPE_V = 0.15
+"""Minimum slope dOCV/dSOC per cell over the whole curve for learning the OCV's error [V]. On a plateau the voltage
+cannot distinguish an error of the curve from an error of the SOC, and the knees move."""
+CURVE_SOC = 0.3
+"""Correlation length of the OCV's error in SOC."""
+KNEE_V = 1.0
+"""Slope dOCV/dSOC per cell that counts as an angle of 45 degrees [V]."""
+KNEE_DECORRELATION = 4.0
+"""Loss of correlation of the OCV's error per radian of slope angle. On a plateau the error is one of voltage, at a knee
+one of SOC. The correlation of both is e^-(KNEE_DECORRELATION x angle)."""
 COUNT_ERROR_SOC = 0.004
 """Minimum std of the OCV curve in SOC, because the SOC of the cell that was measured has an error."""
 BEYOND_BRANCHES = 0.2

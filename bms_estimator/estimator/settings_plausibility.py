@@ -15,9 +15,10 @@ MAX_CAPACITY_AH = 2000.0
 """Maximum plausible capacity of a cell [Ah]. The largest Li-ion cells on sale have some 1300 Ah."""
 CELL_V = 1.5, 4.5
 """Range of plausible nominal voltages of a Li-ion cell [V]: titanate has 2.3 V, NMC 3.7 V."""
-SMALL_CELL_AH, MAX_SINGLE_ROW = 5.5, 8
-"""Maximum capacity of a 18650 or 21700 cell [Ah], and number in series above which such cells are rarely used without
-cells in parallel."""
+SMALL_CELL_AH = 5.5
+"""Maximum capacity of a 18650 or 21700 cell [Ah]."""
+MAX_SINGLE_ROW = 8
+"""Number of cells in series above which cells of up to ``SMALL_CELL_AH`` are rarely used without cells in parallel."""
 CONVERTER_STEPS = 1024
 """Number of steps of the firmware's voltage converter."""
 

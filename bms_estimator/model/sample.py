@@ -33,10 +33,14 @@ CellBlock = NDArray[np.float64]
 NO_CELLS: CellBlock = np.empty((0, 0))
 """Cell voltages of a block of any length without cell voltages."""
 
-MIN_C, MAX_C = -60.0, 200.0
-"""Range of plausible temperatures of a pack or stack [C]."""
-MIN_CELL_V, MAX_CELL_V = -5.0, 10.0
-"""Range of plausible voltages of a single cell, with reversed cells [V]."""
+MIN_C = -60.0
+"""Lowest plausible temperature of a pack or stack [C]."""
+MAX_C = 200.0
+"""Highest plausible temperature of a pack or stack [C]."""
+MIN_CELL_V = -5.0
+"""Lowest plausible voltage of a single cell, which may be reversed [V]."""
+MAX_CELL_V = 10.0
+"""Highest plausible voltage of a single cell [V]."""
 
 
 class SampleStatus(IntFlag):

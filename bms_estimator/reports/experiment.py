@@ -11,8 +11,10 @@ from bms_estimator.reports.report_items import Reproduction
 from bms_estimator.reports.simulated_experiment import SensorChain, captures, experiments, pack
 from bms_estimator.reports.thesis_claims import claim
 
-FINE, COARSE = SensorChain(16), SensorChain(10)
-"""Sensor chains of the dSpace board of the thesis (16 bits) and of an Arduino (10 bits)."""
+FINE = SensorChain(16)
+"""Sensor chain of the dSpace board of the thesis, with 16 bits."""
+COARSE = SensorChain(10)
+"""Sensor chain of an Arduino, with 10 bits."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Experiment:
         return pack().a if self.recorded is None else None
 
     @property
-    def on(self) -> str:
+    def data_source(self) -> str:
         """Description of the data source."""
         if self.recorded is None:
             return "the simulated 6S pack"
@@ -89,4 +91,4 @@ class Experiment:
     @property
     def unpublished(self) -> str:
         """Reason for which the printed numbers cannot be reproduced."""
-        return f"The thesis's recordings are not published. Its procedure was run on {self.on}."
+        return f"The thesis's recordings are not published. Its procedure was run on {self.data_source}."

@@ -51,12 +51,12 @@ p { margin: .5rem 0; } .reason { color: var(--soft); font-size: .9rem; max-width
 table { border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid var(--line); vertical-align: bottom; }
 th { font-weight: 600; max-width: 9.5rem; line-height: 1.3; border-bottom: 1.5px solid var(--ink); }
-td { white-space: nowrap; } .account td { white-space: normal; }
+td { white-space: nowrap; } .text td { white-space: normal; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; white-space: nowrap; }
 tbody tr:hover { background: var(--shade); }
 td.own { font-weight: 600; } td.print { color: var(--soft); }
-.account td { text-align: left; vertical-align: top; } .account th { text-align: left; }
-.account td:nth-child(2) { min-width: 15rem; }
+.text td { text-align: left; vertical-align: top; } .text th { text-align: left; }
+.text td:nth-child(2) { min-width: 15rem; }
 .counts { display: flex; flex-wrap: wrap; gap: .6rem; margin: 1.2rem 0 .6rem; padding: 0; list-style: none; }
 .counts li { padding: .5rem .9rem; border-radius: .5rem; font-size: .85rem; }
 .counts strong { font-size: 1.3rem; display: block; line-height: 1.2; }
@@ -70,12 +70,16 @@ LONG_CELL = 40
 """Maximum length of a cell in a table of numbers [characters]. A table with longer cells is left-aligned and wraps."""
 
 INTRODUCTION = """
-<p>Every table and figure of “Adaptive estimation of Li-ion battery model parameters”, recomputed and compared with print.
+<p>Every table and figure of “Adaptive estimation of Li-ion battery model parameters”, recomputed and compared with the printed values.
 The reason for each difference is given; <a href="#table-errata">E1 to E36</a> are the errata of the thesis, whose corrections this
 project uses. Only the text of the thesis with its numbers and tables was available; the content of its figures was not.
-Values that the thesis does not print are chosen as follows: N(k) = E<sub>2.5</sub>(-k<sup>2.5</sup>), k<sub>0</sub> = 0,
-x<sub>2</sub>(0) = x<sub>3</sub>(0) = 0 (schemes 1 and 2: start and λ of E25), simulations at 100 Hz (C/10 runs at 10 Hz) with the semi-exact step, which is stable at
-any step length. Errors are always in percent of the true value.</p>
+Errors are always in percent of the true value.</p>
+<p>Values that the thesis does not print are chosen as follows:</p>
+<ul>
+<li>Nussbaum gain: N(k) = E<sub>2.5</sub>(-k<sup>2.5</sup>), k<sub>0</sub> = 0.</li>
+<li>Initial state: x<sub>2</sub>(0) = x<sub>3</sub>(0) = 0. Schemes 1 and 2 use the initial state and λ of erratum E25.</li>
+<li>Simulations: 100 Hz, and 10 Hz for runs at C/10. The semi-exact step is stable at any step length.</li>
+</ul>
 """
 
 
@@ -88,8 +92,8 @@ def page(report: Report) -> str:
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>The thesis, recomputed</title><style>{STYLE}</style></head><body>{_navigation(report)}<main>"
-        f"<h1>The thesis, recomputed</h1>{INTRODUCTION}<p>Chapter 5 was run on <strong>{escape(report.on)}</strong>.</p>"
-        f"{_counts(report)}{chapters}{_account(report)}"
+        f"<h1>The thesis, recomputed</h1>{INTRODUCTION}<p>Chapter 5 was run on <strong>{escape(report.data_source)}</strong>.</p>"
+        f"{_counts(report)}{chapters}{_summary(report)}"
         f"<footer>bms_estimator {escape(__version__)}</footer></main></body></html>"
     )
 
@@ -114,7 +118,7 @@ def _navigation(report: Report) -> str:
             for item in items
         )
         parts.append(f'<b>{escape(chapter)}</b><div class="marks">{links}</div>')
-    return "".join([*parts, '<b><a href="#account">Summary</a></b></nav>'])
+    return "".join([*parts, '<b><a href="#summary">Summary</a></b></nav>'])
 
 
 def _short(item: Item) -> str:
@@ -146,6 +150,7 @@ def _article(item: Item) -> str:
 
 def _table(table: Table) -> str:
     def style(column: str) -> str:
+        # values of this project are emphasized: recomputed values, and the joint fit of Table 8
         if column.startswith("printed"):
             return ' class="print"'
         return ' class="own"' if column.startswith(("recomputed", "joint")) else ""
@@ -157,17 +162,17 @@ def _table(table: Table) -> str:
         + "</tr>"
         for row in table.rows
     )
-    words = ' class="account"' if any(len(cell) > LONG_CELL for row in table.rows for cell in row) else ""
-    return f'<div class="scroll"><table{words}><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
+    css_class = ' class="text"' if any(len(cell) > LONG_CELL for row in table.rows for cell in row) else ""
+    return f'<div class="scroll"><table{css_class}><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
-def _account(report: Report) -> str:
+def _summary(report: Report) -> str:
     rows = "".join(
         f'<tr><td><a href="#{_anchor(item)}">{_short(item)}</a></td><td>{escape(item.title)}</td>'
         f"<td>{_badge(item)}</td><td>{escape(item.reason)}</td></tr>"
         for item in report.items
     )
     return (
-        '<h2 id="account">Summary of the verdicts</h2><div class="scroll"><table class="account"><thead><tr><th></th>'
+        '<h2 id="summary">Summary of the verdicts</h2><div class="scroll"><table class="text"><thead><tr><th></th>'
         f"<th>title</th><th>verdict</th><th>reason</th></tr></thead><tbody>{rows}</tbody></table></div>"
     )

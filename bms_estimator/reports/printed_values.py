@@ -135,8 +135,12 @@ TABLE_11 = {
     "variable steps": 0.4645,
 }
 """Average error of the output voltage [%] by load."""
-MAX_CONSTANT, MAX_CONSTANT_STEPS, MAX_STEPS = 0.9, 0.8, 1.5
-"""Largest error of the output voltage [%]: constant loads (5.3.1), constant steps and variable steps (5.3.2)."""
+MAX_CONSTANT = 0.9
+"""Largest error of the output voltage under constant loads (5.3.1) [%]."""
+MAX_CONSTANT_STEPS = 0.8
+"""Largest error of the output voltage under constant steps (5.3.2) [%]."""
+MAX_STEPS = 1.5
+"""Largest error of the output voltage under variable steps (5.3.2) [%]."""
 USUAL_STEPS = 0.1
 """Error under steps "most of the time" (5.3.2) [%]."""
 TABLE_12 = {"dynamic": 4.5, "static": 6.44}

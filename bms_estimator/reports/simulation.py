@@ -55,8 +55,10 @@ grows. With steps of 0.2 ms the result agrees with the differential equations to
 is 2 % larger."""
 AFTER_START_S = 1.0
 """Sample interval after ``START_TIMES_S`` [s]."""
-ALPHA, OTHER_ALPHA = 2.5, 2.9
-"""Alpha of (3.10): the default, and another one that fits Tables 2 and 3."""
+ALPHA = 2.5
+"""Default alpha of (3.10)."""
+OTHER_ALPHA = 2.9
+"""Another alpha of (3.10) that fits Tables 2 and 3."""
 HIGH_CURRENT_A = 4.0 * CURRENT_A
 """Current of 4C, far above the currents of the thesis's simulations [A]."""
 

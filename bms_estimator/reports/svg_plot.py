@@ -15,8 +15,10 @@ COLOURS = ("#1f5fa8", "#d1602b", "#2f8f5b", "#8a4fa3", "#b08a1e", "#4aa3b5")
 """Colors that differ in print and for color-blind readers: blue, orange, green, violet, ochre, teal."""
 POINTS = 1200
 """Maximum number of points on a line; more are not visible at this width."""
-WIDTH_IN, ROW_IN = 8.0, 3.0
-"""Width of a figure and height of a row [inches]."""
+WIDTH_IN = 8.0
+"""Width of a figure [inches]."""
+ROW_IN = 3.0
+"""Height of a row of a figure [inches]."""
 
 STYLE: dict[str, Any] = {
     "svg.fonttype": "path",

@@ -76,11 +76,11 @@ class Report:
     """Result of a report.
 
     Attributes:
-        on: Description of the data of chapter 5.
+        data_source: Description of the data of chapter 5.
         chapters: Chapters with their items.
     """
 
-    on: str
+    data_source: str
     chapters: tuple[tuple[str, tuple[Item, ...]], ...]
 
     @property
@@ -150,7 +150,7 @@ def build(
             done += 1
         chapters.append((chapter, tuple(items)))
     progress("done", done, total)
-    return Report(experiment.on, tuple(chapters))
+    return Report(experiment.data_source, tuple(chapters))
 
 
 def _select(

@@ -41,7 +41,7 @@ class ChargeEnergy(NamedTuple):
 class ChargeEnergyMeter:
     """Integrates current and power by the trapezoidal rule, and adds nothing over a gap.
 
-    Between two readings of ``flow`` the integral is net, so that current noise around zero does not count in both
+    Between two calls of ``update_totals`` the integral is net, so that current noise around zero does not count in both
     directions.
 
     Args:
@@ -55,18 +55,17 @@ class ChargeEnergyMeter:
         self._sums: NDArray[np.void] = np.zeros(1, dtype=FLOW_SUMS) if sums is None else sums
         self.continue_from(before)
 
-    def continue_from(self, flow: ChargeEnergy) -> None:
-        """Continue from ``flow``; the sums are kept."""
-        self._flow = flow
+    def continue_from(self, totals: ChargeEnergy) -> None:
+        """Continue from ``totals``. The sums since the previous call of ``update_totals`` are added to them later."""
+        self._totals = totals
 
     def add(self, trace: TraceBlock) -> None:
         """Add accepted samples; ``trace`` has shape (n,), dtype TRACE."""
         accumulate_charge_energy(self._sums, trace, self._gap_s)
 
-    @property
-    def flow(self) -> ChargeEnergy:
-        """Charge and energy so far."""
+    def update_totals(self) -> ChargeEnergy:
+        """Add the net sums since the previous call, each to its direction. Return the totals so far."""
         s = self._sums[0]
-        self._flow = self._flow.plus_net(float(s["charge_as"]), float(s["energy_ws"]))
+        self._totals = self._totals.plus_net(float(s["charge_as"]), float(s["energy_ws"]))
         s["charge_as"] = s["energy_ws"] = 0.0
-        return self._flow
+        return self._totals

@@ -51,7 +51,7 @@ class LifetimeTotals:
     @property
     def flow(self) -> ChargeEnergy:
         """Charge and energy through the terminals in all runs."""
-        return self._meter.flow
+        return self._meter.update_totals()
 
     def add(self, trace: TraceBlock) -> None:
         """Add the accepted samples of a block that the estimator has just run.

@@ -82,7 +82,11 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
         summary = window.take()
         assert summary is not None
         remaining = remaining_charge(estimator, summary.current_a)
-        return make_state_payload(summary, remaining, {}, wall_s, pack_type.meter.flow, 3.0).model_dump_json().encode()
+        return (
+            make_state_payload(summary, remaining, {}, wall_s, pack_type.meter.update_totals(), 3.0)
+            .model_dump_json()
+            .encode()
+        )
 
     def step() -> None:
         estimator.record[...] = before
@@ -93,7 +97,7 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
     yield "the state unpacked", _us(lambda: work_record.put(packed))
     yield "the estimator", _us(step) - put_back_us
     yield "the hour's sums", _us(lambda: hour_summary.add(work_record.record["hour"], trace, block, estimator))
-    yield "what has flowed", _us(lambda: (pack_type.meter.add(trace), pack_type.meter.flow))
+    yield "what has flowed", _us(lambda: (pack_type.meter.add(trace), pack_type.meter.update_totals()))
     yield "topic state", _us(state)
     yield "the state packed", _us(work_record.take)
     parameters_us = _us(lambda: make_parameters_payload(estimator, wall_s).model_dump_json())

@@ -18,12 +18,15 @@ MIN_STEPS = 5
 """Minimum number of current steps whose median determines the sign of the current."""
 LONG_REST_S = 300.0
 """Duration of a rest after which the voltage is near the OCV [s]."""
-MAX_SOC_DEVIATION, MAX_VOLTAGE_DEVIATION_V = 0.1, 0.1
-"""Maximum deviation of a rested voltage from the OCV at the counted SOC, as SOC and per cell [V]. A deviation beyond both
-is larger than errors of the model."""
-MIN_GAP_PERIODS, MIN_GAP_CHARGE = 10.0, 0.01
-"""Minimum duration of a gap with unknown charge, in multiples of the median sample period, and minimum charge, as a
-fraction of the capacity, that the current at its start would draw over it."""
+MAX_SOC_DEVIATION = 0.1
+"""Maximum deviation of the SOC of a rested voltage from the counted SOC. A deviation beyond both limits is larger than
+errors of the model."""
+MAX_VOLTAGE_DEVIATION_V = 0.1
+"""Maximum deviation of a rested voltage from the OCV at the counted SOC, per cell [V]."""
+MIN_GAP_PERIODS = 10.0
+"""Minimum duration of a gap with unknown charge, in multiples of the median sample period."""
+MIN_GAP_CHARGE = 0.01
+"""Minimum charge that the current before a gap would draw over it, as a fraction of the capacity."""
 MIN_DURATION_S = 30.0
 """Minimum duration of a capture [s]."""
 MIN_RESPONSE_V = 1e-3

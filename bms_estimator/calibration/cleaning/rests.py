@@ -1,4 +1,4 @@
-"""Removal of glitches, coulomb counting, and detection of rests."""
+"""Removal of glitches, coulomb counting by (2.1) of the thesis, and detection of rests."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,10 @@ MIN_GOOD_FRACTION = 0.5
 """Minimum fraction of good voltages; below it the faulty ones cannot be recognized."""
 REST_C_RATE = 0.01
 """Maximum C-rate of a rest [1/h]. A hundredth of 1 C changes SOC by 0.25 % in a quarter of an hour."""
-NOISE_STDS, NOISE_STEP_C_RATE = 6.0, 0.1
-"""Maximum current of a rest in standard deviations of the current's noise, and the change between two samples, as C-rate,
-below which it counts as noise [1/h]."""
+NOISE_STDS = 6.0
+"""Maximum current of a rest, in standard deviations of the current's noise."""
+NOISE_STEP_C_RATE = 0.1
+"""Maximum change of the current between two samples that counts as noise, as a C-rate [1/h]."""
 MIN_LOAD_CHARGE = 2e-5
 """Minimum charge of a load that interrupts a rest, as a fraction of the capacity. Less is a glitch of the sensor."""
 SOC_SLACK = 0.03
@@ -26,7 +27,9 @@ SOC_SLACK = 0.03
 
 
 def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
-    """Return the valid samples: finite, time increasing, voltage within half of the median of those above 0 V.
+    """Return the samples that are finite, later than all samples before, and within 50 % of the median voltage.
+
+    The median is that of the voltages above 0 V.
 
     Raises:
         UserError: Nothing is left, most voltages are glitches, or the time goes back.
@@ -74,7 +77,7 @@ def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float
 
 
 def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
-    """Return which samples belong to a rest; short glitches of the current sensor do not end one."""
+    """Return which samples belong to a rest. Short glitches of the current sensor do not end a rest."""
     resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
     time_s = good["time_s"]
     for first, last in true_runs(~resting):
@@ -90,6 +93,7 @@ def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
     change_a = np.diff(current_a)
     small_a = change_a[np.abs(change_a) < NOISE_STEP_C_RATE * capacity_ah]
     noise_a = float(np.sqrt(np.mean(small_a**2) / 2.0)) if small_a.size else 0.0
+    # a periodic load must not count as noise: the limit is below half of the 95th percentile of the current
     half_load_a = 0.5 * float(np.quantile(np.abs(current_a), 0.95))
     return max(REST_C_RATE * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
 

@@ -62,20 +62,25 @@ MIN_SLOPE_V = 1e-3
 """Minimum slope dOCV/dSOC of the corrected table per cell [V]."""
 SPAN_K = 10.0
 """Minimum temperature difference that gives activation energies and dE/dT [K]."""
-FULL_TOLERANCE_V, COLD_K = 0.03, 5.0
-"""Maximum distance of a first rest's voltage from that of a full cell, per cell [V], at which the capture counts as
-starting full, and minimum deviation from 25 C at which this rule applies [K]. Cold rests are not relaxed, so that their
-voltage gives a wrong SOC."""
-MIN_CELL_C, MAX_CELL_C = -45.0, 85.0
-"""Range of plausible cell temperatures [C]."""
+FULL_TOLERANCE_V = 0.03
+"""Maximum distance of a first rest's voltage from that of a full cell at which the capture counts as starting full, per
+cell [V]. Cold rests are not relaxed, so that their voltage gives a wrong SOC."""
+COLD_K = 5.0
+"""Minimum deviation from 25 C at which ``FULL_TOLERANCE_V`` applies [K]."""
+MIN_CELL_C = -45.0
+"""Lowest plausible cell temperature [C]."""
+MAX_CELL_C = 85.0
+"""Highest plausible cell temperature [C]."""
 PERCENTILES = (2.0, 98.0)
 """Percentiles of the captures' temperatures that become the temperature range of the ladder [%]."""
 LADDER_STD = 0.1
 """Relative std of resistances between cells of one make: two NCR18650 differ by 5 to 8 %, and cells age."""
 GENERIC_STD = 0.3
 """Relative std from which on a ladder counts as generic, not identified, so that its temperature range is unknown."""
-SHAPE_MIN_SOC, SHAPE_LIMITS = 0.4, (0.2, 20.0)
-"""SOC above which a resistance is averaged to normalize its shape, and limits of the shape relative to that mean."""
+SHAPE_MIN_SOC = 0.4
+"""SOC above which a resistance is averaged to normalize its shape."""
+SHAPE_LIMITS = (0.2, 20.0)
+"""Limits of a resistance relative to its mean above ``SHAPE_MIN_SOC``."""
 MIN_RMS_SOC = 0.1
 """Lower SOC limit of the reported RMS errors."""
 COUNT_PASSES = 3

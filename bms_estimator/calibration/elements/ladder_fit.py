@@ -45,48 +45,67 @@ ZERO_FRACTION = 1e-6
 ROUGHNESS_STD = 0.1
 """Prior std of the difference of a resistance between two SOC nodes, and between two neighbouring RC pairs, relative to
 the scale. The resistance per decade of time is about constant from a second to an hour."""
-LOW_SOC, LOW_SOC_ROUGHNESS = 0.15, 4.0
-"""SOC below which ``ROUGHNESS_STD`` is larger, and the factor."""
-BEND_V, LOW_BEND_SOC, LOW_BEND_FACTOR = 10.0, 0.12, 20.0
-"""Prior std of d2d/dSOC2 per cell [V], SOC below which the std is larger, and the factor."""
+LOW_SOC = 0.15
+"""SOC below which ``ROUGHNESS_STD`` is larger."""
+LOW_SOC_ROUGHNESS = 4.0
+"""Factor on ``ROUGHNESS_STD`` below ``LOW_SOC``."""
+BEND_V = 10.0
+"""Prior std of d2d/dSOC2 per cell [V]."""
+LOW_BEND_SOC = 0.12
+"""SOC below which that prior std is larger."""
+LOW_BEND_FACTOR = 20.0
+"""Factor on ``BEND_V`` below ``LOW_BEND_SOC``."""
 OCV_INTERVALS = 20
 """Number of SOC intervals with independent errors of the given OCV."""
 PER_KELVIN_STD_V = 1e-3
 """Prior std of u per cell [V/K]."""
 MEASURED_PER_KELVIN_STD_V = 5e-5
 """Prior std of u per cell if the cell file contains a measured dE/dT [V/K]."""
-FIXED_OCV_STD_V, FIXED_PER_KELVIN_STD_V = 1e-6, 1e-9
-"""Prior std of d [V] and of u [V/K] if these are not fitted."""
+FIXED_OCV_STD_V = 1e-6
+"""Prior std of d if d is not fitted [V]."""
+FIXED_PER_KELVIN_STD_V = 1e-9
+"""Prior std of u if u is not fitted [V/K]."""
 
 ROWS_PER_CAPTURE = 30.0
 """Number of independent rows that a capture counts as."""
-ERROR_V, ERROR_J = 4e-3, 22e3
-"""Std of a row at 25 C per cell [V], and activation energy of its growth in the cold [J/mol]."""
+ERROR_V = 4e-3
+"""Std of a row at 25 C per cell [V]."""
+ERROR_J = 22e3
+"""Activation energy of the growth of ``ERROR_V`` in the cold [J/mol]."""
 SOC_STD = 0.01
 """Std of the SOC after a change of 1; the variance grows with the change. At a knee far from the start a cell
 deviates from its curve, and that voltage error must not become a resistance."""
 RELATIVE = 0.1
 """Std relative to a voltage drop: the largest filtered current of x_0..x_3 times the scale of the resistances."""
-STEP_ROWS, STEP_V = 30.0, 1e-3
-"""Weight in rows, and std per cell [V], of all voltage jumps of a capture at clean current steps. Jumps determine R_0 and
-do not drift."""
-STEADY_FRACTION, STEADY_S, MAX_STEP_S = 0.01, 5.0, 1.5
-"""Conditions of a clean step: the current before and after it varies at most by this fraction of the largest current for
-this duration [s], and the two samples are at most this far apart [s]. With a varying current, a delay between voltage
-and current samples would change R_0."""
+STEP_ROWS = 30.0
+"""Weight of all voltage jumps of a capture at clean current steps, in rows. Jumps determine R_0 and do not drift."""
+STEP_V = 1e-3
+"""Std of these voltage jumps per cell [V]."""
+STEADY_FRACTION = 0.01
+"""Maximum variation of the current before and after a clean step, as a fraction of the largest current. With a varying
+current, a delay between voltage and current samples would change R_0."""
+STEADY_S = 5.0
+"""Duration for which the current is constant before and after a clean step [s]."""
+MAX_STEP_S = 1.5
+"""Maximum time between the two samples of a clean step [s]."""
 COUNT_STD = 0.004
 """Relative std of the charge counted in a capture, and of the capacity at its temperature."""
 STEP_FRACTION = 0.1
 """Minimum change of current at which the time since the last change restarts, as a fraction of the largest current."""
-MIN_SINCE_STEP_S, MAX_ROW_S = 10.0, 30.0
-"""Minimum of the time since the last change of current, and maximum of the time since the previous row, in the weight of
-a row [s]."""
-LONG_REST_S, REST_FRACTION = 500.0, 0.01
-"""Minimum duration of a long rest [s], and maximum current of a rest as a fraction of the largest current."""
+MIN_SINCE_STEP_S = 10.0
+"""Minimum of the time since the last change of current, in the weight of a row [s]."""
+MAX_ROW_S = 30.0
+"""Maximum of the time since the previous row, in the weight of a row [s]."""
+LONG_REST_S = 500.0
+"""Minimum duration of a long rest [s]."""
+REST_FRACTION = 0.01
+"""Maximum current of a rest, as a fraction of the largest current."""
 ROW_S = 0.5
 """Minimum time between two rows [s]."""
-MIN_SOC, MAX_SOC = 0.02, 1.01
-"""SOC range of the rows. Above 1 by the error of the counted charge."""
+MIN_SOC = 0.02
+"""Minimum SOC of the rows."""
+MAX_SOC = 1.01
+"""Maximum SOC of the rows. It exceeds 1 by the error of the counted charge."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Fit of the open-circuit voltage (2.10) to points of relaxation tests.
+"""Fit of the open-circuit voltage of Chen and Mora, (2.10) of the thesis, to points of relaxation tests.
 
 ``Points`` of one or more tests are fitted jointly. For comparison, ``average`` averages the parameters of single fits as
-(5.1)-(5.2) do. The mean of strongly correlated parameters is a poor fit.
+(5.1)-(5.2) of the thesis do. The mean of strongly correlated parameters is a poor fit.
 """
 
 from dataclasses import dataclass

@@ -14,9 +14,10 @@ from bms_estimator.model.errors import UserError
 RELAXED_V = 0.002
 """Systematic error of rests of a warm cell [V]. Relaxation continues for hours beyond the extrapolation of a rest of a
 quarter of an hour."""
-COLD_V, DOUBLING_K = 0.012, 25.0
-"""Additional error of rests of up to an hour at 0 C [V], and the temperature decrease that doubles the relaxation time [K].
-The error at -10 C is 20 mV."""
+COLD_V = 0.012
+"""Additional error of rests of up to an hour at 0 C [V]. The error at -10 C is 20 mV."""
+DOUBLING_K = 25.0
+"""Temperature decrease that doubles the relaxation time [K]."""
 COLD_SOURCE_FRACTION = 0.3
 """Fraction of the cold error that is independent between sources."""
 LONG_REST_S = 3600.0

@@ -28,9 +28,13 @@ MAX_STD_V = 0.02
 """Maximum standard deviation of an extrapolated voltage, per cell in series [V]."""
 FIT_FROM = 0.5
 """Fraction of a rest's duration from which on the exponential is fitted, because the fast RC pair has decayed by then."""
-MIN_TAU, MAX_TAU, TAU_GRID = 0.05, 0.7, 40
-"""Range of candidate time constants, as fractions of the rest's duration, and their number. A slower exponential cannot be
-distinguished from a drift, so that its extrapolation diverges."""
+MIN_TAU = 0.05
+"""Minimum candidate time constant, as a fraction of the rest's duration."""
+MAX_TAU = 0.7
+"""Maximum candidate time constant, as a fraction of the rest's duration. A slower exponential cannot be distinguished
+from a drift, so that its extrapolation diverges."""
+TAU_GRID = 40
+"""Number of candidate time constants."""
 EXTRAPOLATION_ERROR = 0.6
 """Std of the extrapolated change, as a fraction of the change, because relaxation is no pure exponential. Half-hour rests
 of a NCR18650, cut to a quarter of an hour, miss their end voltage by 2.4 mV RMS with extrapolation and by 4.7 mV without."""
@@ -44,8 +48,10 @@ SLOW_TAU_FRACTION = 0.4
 the slow extrapolation."""
 MIN_STD_V = 5e-4
 """Minimum std of a point: half a step of a usual converter, and effects of temperature [V]."""
-NEAR_FULL, NEAR_EMPTY = 0.995, 0.02
-"""SOC above which the first sample counts as full, and SOC below which the last sample counts as empty."""
+NEAR_FULL = 0.995
+"""SOC above which the first sample counts as full."""
+NEAR_EMPTY = 0.02
+"""SOC below which the last sample counts as empty."""
 MIN_POINTS = 6
 """Minimum number of points: the number of parameters of (2.10)."""
 

@@ -29,24 +29,32 @@ STD_PER_MEDIAN_STEP = 1.05
 EMPTY_FALL = 0.01
 """Minimum fall of the voltage over the last hundredth of the charge, relative, by which a discharge counts as full, that
 is down to empty."""
-PAIR_K, PAIR_CURRENT = 5.0, 0.3
-"""Maximum differences between a discharge and a charge of a pair: temperature [K], and relative current."""
+PAIR_K = 5.0
+"""Maximum temperature difference between discharge and charge of a pair [K]."""
+PAIR_CURRENT = 0.3
+"""Maximum relative difference of the current between discharge and charge of a pair."""
 MAX_MISSING_SOC = 0.1
 """Maximum SOC by which a charge may end below full. A larger difference means an incomplete charge or a wrong current."""
 GRID = np.unique(
     np.round(np.r_[np.arange(0, 0.1, 0.005), np.arange(0.1, 0.95, 0.01), np.arange(0.95, 1.0, 0.005), 1], 4)
 )
 """SOC grid of the points of a low-rate curve."""
-EVEN_SOC, HYSTERESIS_WIDTH = np.linspace(0.0, 1.0, 201), 0.01
-"""SOC grid and std of the Gaussian that smooths the hysteresis. Without smoothing, a knee at different SOCs in charge and
+EVEN_SOC = np.linspace(0.0, 1.0, 201)
+"""SOC grid of the smoothed hysteresis."""
+HYSTERESIS_WIDTH = 0.01
+"""Std in SOC of the Gaussian that smooths the hysteresis. Without smoothing, a knee at different SOCs in charge and
 discharge would appear as hysteresis."""
 HYSTERESIS_SOC = (0.03, 0.98)
 """SOC range of the measured hysteresis. Outside, the value at the end of the range is used, because the curves have
 end-point transients there."""
-POINT_V, POINT_SOC = 1e-3, 0.002
-"""Standard deviations of a point of a low-rate curve: of the voltage per cell in series [V], and of the SOC."""
-PAIR_V, PAIR_FRACTION = 1.5e-3, 0.1
-"""Systematic error of the mean of a pair per cell in series [V], and its part as a fraction of the half difference."""
+POINT_V = 1e-3
+"""Std of the voltage of a point of a low-rate curve, per cell in series [V]."""
+POINT_SOC = 0.002
+"""Std of the SOC of a point of a low-rate curve."""
+PAIR_V = 1.5e-3
+"""Constant part of the systematic error of the mean of a pair, per cell in series [V]."""
+PAIR_FRACTION = 0.1
+"""Part of the systematic error of the mean of a pair, as a fraction of the half difference."""
 UNPAIRED_FRACTION = 0.5
 """Systematic error as a fraction of the half difference, at SOCs where only one curve of a pair has data."""
 END_TRANSIENT_SOC = 0.03

@@ -27,21 +27,32 @@ from bms_estimator.model.sample import SampleBlock
 SAME_START_V = 0.02
 """Maximum difference of the first rests of captures that start at the same SOC, per cell [V]. Full charges vary by as
 much."""
-GIVEN_V, GIVEN_COMMON_V = 1e-3, 2e-3
-"""Std of each point of a given curve, and of the curve's systematic error, per cell [V]."""
-REST_SHARE, REST_SHARE_STD = 0.7, 0.3
-"""Fraction of the half difference of low-rate curves that is hysteresis and remains in a rest after a discharge, and the
-std of the fraction. The remainder is polarisation. Measured fractions are 0.4 and 0.5 for an NCA cell, 1.0 for an LFP
-cell."""
-PLATEAU_SHARE, PLATEAU_V, PLATEAU_SOC = 0.9, 0.15, 0.05
-"""Fraction that remains in a rest for a curve with a plateau; maximum slope dOCV/dSOC of a plateau per cell [V], and its
-SOC range. Two coexisting phases preserve the hysteresis (Dreyer et al., Nature Materials 9, 2010, 448). Drives of an LFP
-cell at 25, 5 and -15 C show 0.9 to 1.0."""
+GIVEN_V = 1e-3
+"""Std of each point of a given curve, per cell [V]."""
+GIVEN_COMMON_V = 2e-3
+"""Std of the systematic error of a given curve, per cell [V]."""
+REST_SHARE = 0.7
+"""Fraction of the half difference of low-rate curves that is hysteresis and remains in a rest after a discharge. The
+remainder is polarisation. Measured fractions are 0.4 and 0.5 for an NCA cell, 1.0 for an LFP cell."""
+REST_SHARE_STD = 0.3
+"""Std of ``REST_SHARE``."""
+PLATEAU_SHARE = 0.9
+"""Fraction that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the hysteresis (Dreyer et
+al., Nature Materials 9, 2010, 448). Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
+PLATEAU_V = 0.15
+"""Maximum slope dOCV/dSOC of a plateau, per cell [V]."""
+PLATEAU_SOC = 0.05
+"""SOC interval over which the slope of a plateau is computed."""
 TYPICAL_HYSTERESIS_STD = 0.6
 """Relative std of a hysteresis taken from typical cells."""
-MIN_SHARE, SHARE_POINTS, SHARE_K, SHARE_SOC = 0.1, 6, 10.0, (0.1, 0.95)
-"""Conditions for measuring the fraction by rests: lower limit of the result, minimum number of rests, maximum difference
-from the curves' temperature [K], and SOC range."""
+MIN_SHARE = 0.1
+"""Lower limit of a fraction that rests show."""
+SHARE_POINTS = 6
+"""Minimum number of rests that determine the fraction."""
+SHARE_K = 10.0
+"""Maximum distance of these rests from 25 C beyond that of the low-rate curves [K]."""
+SHARE_SOC = (0.1, 0.95)
+"""SOC range of these rests, and of a plateau."""
 MAX_CAPACITY_DIFFERENCE = 0.05
 """Relative difference between the given and the measured capacity above which a source has a remark."""
 

@@ -5,10 +5,10 @@ One linear Gaussian model over all points (a smoothing spline with random effect
 
     v = f(SOC) + (T - 25 C) u(SOC) + c(T) w(SOC) + f'(SOC) (s + q (1 - SOC)) + d(SOC) + noise
 
-f is a cubic spline with a prior of the curvature of real cells. u is dE/dT. w is the error of cold, unrelaxed rests. w is
-common to all sources and hardly distinguishable from u, so that the priors divide the observed difference between both.
-s and q are the errors of a source's first SOC and of its capacity. d is the systematic error of a source. The priors of
-u, w, s, q and d have mean 0. The curve's standard deviation follows from the posterior covariance and is large in gaps
+f is a cubic spline with a prior of the curvature of real cells. u is dE/dT. c(T) w(SOC) is the error of rests that were too
+short at low temperature. c is its std, ``Points.cold_v``. w is common to all sources and hardly distinguishable from u, so
+that the priors divide the observed difference between both. s and q are the errors of a source's first SOC and of its
+capacity. d is the systematic error of a source. The priors of u, w, s, q and d have mean 0. The curve's standard deviation follows from the posterior covariance and is large in gaps
 between points.
 """
 
@@ -33,11 +33,15 @@ NODES: Floats = np.unique(
     np.round(np.r_[np.arange(0.0, 0.1, 0.01), np.arange(0.1, 0.96, 0.02), np.arange(0.96, 1.001, 0.01)], 4)
 )
 """SOC nodes of the table."""
-BEND_V, BEND_SOC = 2.0, 0.12
-"""Prior std of d2V/dSOC2 on flat parts per ``CELL_V`` [V], and SOC range over which the slope may change by its own size,
-which adds to that std, because steep parts bend more."""
-EMPTY_SLOPE_V, EMPTY_SOC = 60.0, 0.02
-"""Slope that every curve may have at SOC 0 per ``CELL_V`` [V], and the SOC over which that slope decays."""
+BEND_V = 2.0
+"""Prior std of d2V/dSOC2 on flat parts of the curve, per ``CELL_V`` [V]."""
+BEND_SOC = 0.12
+"""SOC range over which the slope may change by its own size. The slope divided by this range adds to the prior std of
+d2V/dSOC2, because steep parts bend more."""
+EMPTY_SLOPE_V = 60.0
+"""Slope dV/dSOC that every curve may have at SOC 0, per ``CELL_V`` [V]."""
+EMPTY_SOC = 0.02
+"""SOC over which ``EMPTY_SLOPE_V`` decays to 1/e."""
 FIRST_SLOPE_V = 0.8
 """Slope dV/dSOC that the first iteration assumes per ``CELL_V`` [V]."""
 BEND_LENGTH = 0.05
@@ -48,18 +52,23 @@ CELL_V = 4.0
 """Cell voltage to which the constants above are scaled [V]."""
 TEMPERATURE_SPAN_C = 10.0
 """Minimum temperature difference of sources for dE/dT [K]."""
-ENTROPY_V_PER_K, ENTROPY_NODES = 3.5e-4, np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
-"""Prior std of dE/dT [V/K], as published entropy profiles have 0.1 to 0.5 mV/K, and SOC nodes of dE/dT."""
+ENTROPY_V_PER_K = 3.5e-4
+"""Prior std of dE/dT per ``CELL_V`` [V/K]. Published entropy profiles have 0.1 to 0.5 mV/K."""
+ENTROPY_NODES = np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
+"""SOC nodes of dE/dT."""
 DEVIATION_NODES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
 """SOC nodes of the systematic error of a source."""
-ROUGHNESS = 0.7
+INDEPENDENT_ERROR_FRACTION = 0.7
 """Independent error of each point, as a fraction of the systematic error of its source. It covers the part of the
 systematic error that varies between the nodes."""
-SOC_STD, CAPACITY_STD = 0.004, 0.01
-"""Prior std of the error of a source's first SOC, because charges end differently, and relative std of its capacity,
-because cells age."""
-EMPTY_STD_V, FULL_STD_V = 0.05, 0.005
-"""Std of the voltages at SOC 0 and 1 without a rest there, per cell [V]."""
+SOC_STD = 0.004
+"""Prior std of a source's first SOC. Charges do not end at the same SOC."""
+CAPACITY_STD = 0.01
+"""Prior relative std of a source's capacity. Cells age."""
+EMPTY_STD_V = 0.05
+"""Std of the voltage at SOC 0 without a rest there, per ``CELL_V`` [V]."""
+FULL_STD_V = 0.005
+"""Std of the voltage at SOC 1 without a rest there, per ``CELL_V`` [V]."""
 MAX_SLOPE_V = 2.0
 """Upper limit of the slope f' that converts an error of SOC to one of voltage, per ``CELL_V`` [V]. At the ends of the curve
 the slope is too uncertain."""
@@ -140,52 +149,62 @@ def fit_table(points: Points) -> TableFit:
         UserError: Too few points, or points that span too little SOC.
     """
     check_points(points)
-    cells = float(np.median(points.ocv_v)) / CELL_V
-    given = points
-    points = with_ends(points, EMPTY_STD_V * cells, FULL_STD_V * cells)
+    voltage_scale = float(np.median(points.ocv_v)) / CELL_V
+    measured = points
+    points = with_ends(points, EMPTY_STD_V * voltage_scale, FULL_STD_V * voltage_scale)
     sources = int(points.source.max()) + 1
-    noise, common = np.ones(sources), 1.0
+    scatter_factor, systematic_factor = np.ones(sources), 1.0
     middles = _middles()
-    falling_v = cells * EMPTY_SLOPE_V * np.exp(-middles / EMPTY_SOC)
-    steepness_v: Floats = np.full(middles.size, cells * FIRST_SLOPE_V)
+    empty_slope_v = voltage_scale * EMPTY_SLOPE_V * np.exp(-middles / EMPTY_SOC)
+    middle_slope_v: Floats = np.full(middles.size, voltage_scale * FIRST_SLOPE_V)
     slope_v: Floats = np.zeros(points.soc.size)
     for _ in range(ITERATIONS):
-        bends = _bend_rows(cells * BEND_V + (steepness_v + falling_v) / BEND_SOC)
-        model = _model(points, slope_v, common, bends, cells)
-        std_v = np.hypot(points.std_v, ROUGHNESS * points.common_v) * noise[points.source]
-        x = _solve(model, points, std_v, cells)
-        slope_v = np.clip(_spline(points.soc, 1) @ x[: model.splines], 0.0, MAX_SLOPE_V * cells)
-        steepness_v = _spline(middles, 1) @ x[: model.splines]
-        noise, common = _error_factors(points, model, x, common)
+        bends = _bend_rows(voltage_scale * BEND_V + (middle_slope_v + empty_slope_v) / BEND_SOC)
+        model = _model(points, slope_v, systematic_factor, bends, voltage_scale)
+        std_v = np.hypot(points.std_v, INDEPENDENT_ERROR_FRACTION * points.common_v) * scatter_factor[points.source]
+        x = _solve(model, points, std_v, voltage_scale)
+        slope_v = np.clip(_spline(points.soc, 1) @ x[: model.splines], 0.0, MAX_SLOPE_V * voltage_scale)
+        middle_slope_v = _spline(middles, 1) @ x[: model.splines]
+        scatter_factor, systematic_factor = _error_factors(points, model, x, systematic_factor)
     basis, entropy = _spline(NODES), linear_interpolation_matrix(NODES, ENTROPY_NODES)
     rows = np.vstack([model.points / std_v[:, None], model.prior])
     covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)[: model.splines, : model.splines]
     u = x[model.splines : model.splines + ENTROPY_NODES.size]
-    ocv_v = np.maximum.accumulate(basis @ x[: model.splines] + 1e-9 * NODES)
+    ocv_v = np.maximum.accumulate(
+        basis @ x[: model.splines] + 1e-9 * NODES
+    )  # PCHIP and the inverse need increasing values
     fit = PchipInterpolator(NODES, ocv_v)
     return TableFit(
         soc=NODES,
         ocv_v=ocv_v,
         error_v=np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance, basis)),
         per_kelvin_v=entropy @ u if model.temperature_columns else None,
-        residual_v=given.ocv_v - fit(given.soc),
+        residual_v=measured.ocv_v - fit(measured.soc),
         deviation_v=_deviations(points, model, x),
     )
 
 
-def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells: float) -> _Model:
-    """Return the rows of the model."""
+def _model(points: Points, slope_v: Floats, systematic_factor: float, bends: Floats, voltage_scale: float) -> _Model:
+    """Return the rows of the model.
+
+    Args:
+        points: Points of all sources.
+        slope_v: Slope f' of the curve at the points [V].
+        systematic_factor: Factor on the declared systematic errors of all sources.
+        bends: Rows of the curvature prior.
+        voltage_scale: Voltage of the cell relative to ``CELL_V``.
+    """
     spline = _spline(points.soc)
     warmer = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
     columns, stds = [spline], [np.zeros(0)]
     if np.ptp(warmer) >= TEMPERATURE_SPAN_C:
         by_soc = linear_interpolation_matrix(points.soc, ENTROPY_NODES)
         columns += [warmer[:, None] * by_soc, points.cold_v[:, None] * by_soc]
-        stds += [np.full(ENTROPY_NODES.size, ENTROPY_V_PER_K * cells), np.ones(ENTROPY_NODES.size)]
+        stds += [np.full(ENTROPY_NODES.size, ENTROPY_V_PER_K * voltage_scale), np.ones(ENTROPY_NODES.size)]
     temperature_columns = sum(one.size for one in stds)
     for source in range(int(points.source.max()) + 1):
         own = (points.source == source)[:, None]
-        off_v = common * points.common_v[:, None] * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
+        off_v = systematic_factor * points.common_v[:, None] * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
         columns += [own * off_v, own * _shifts(points.soc, slope_v)]
         stds += [np.ones(DEVIATION_NODES.size), np.array([SOC_STD, CAPACITY_STD])]
     weights = 1.0 / np.concatenate(stds)
@@ -200,10 +219,10 @@ def _shifts(soc: Floats, slope_v: Floats) -> Floats:
     return np.column_stack([slope_v, slope_v * (1.0 - soc)])
 
 
-def _solve(model: _Model, points: Points, std_v: Floats, cells: float) -> Floats:
+def _solve(model: _Model, points: Points, std_v: Floats, voltage_scale: float) -> Floats:
     """Solve for the model's coefficients with increasing spline coefficients, so that the spline increases.
 
-    The errors of a single source cannot be distinguished from the curve, so that they are 0.
+    The errors of a single source cannot be distinguished from the curve and are therefore 0.
     """
     columns = model.splines + model.temperature_columns if points.source.max() == 0 else model.points.shape[1]
     rows = np.vstack([model.points / std_v[:, None], model.prior])[:, :columns]
@@ -211,7 +230,7 @@ def _solve(model: _Model, points: Points, std_v: Floats, cells: float) -> Floats
     sums = np.tril(np.ones((model.splines, model.splines)))  # coefficients from their increments
     rows[:, : model.splines] = rows[:, : model.splines] @ sums
     lowest = np.full(rows.shape[1], -np.inf)
-    lowest[1 : model.splines] = MIN_SLOPE_V * cells * np.diff(_centres())
+    lowest[1 : model.splines] = MIN_SLOPE_V * voltage_scale * np.diff(_centres())
     orthogonal, triangle = np.linalg.qr(rows)
     increments = lsq_linear(triangle, orthogonal.T @ target, bounds=(lowest, np.inf), method="bvls").x
     x = np.zeros(model.points.shape[1])
@@ -219,13 +238,20 @@ def _solve(model: _Model, points: Points, std_v: Floats, cells: float) -> Floats
     return x
 
 
-def _error_factors(points: Points, model: _Model, x: Floats, common: float) -> tuple[Floats, float]:
-    """Return the ratio of observed to declared errors, at least 1: scatter of each source, systematic error of all."""
-    normalized = (points.ocv_v - model.points @ x) / np.hypot(points.std_v, ROUGHNESS * points.common_v)
+def _error_factors(points: Points, model: _Model, x: Floats, systematic_factor: float) -> tuple[Floats, float]:
+    """Return the factors by which the observed errors exceed the declared ones, at least 1.
+
+    The first factor is that of each source's scatter, the second that of the systematic errors of all sources.
+    """
+    normalized = (points.ocv_v - model.points @ x) / np.hypot(
+        points.std_v, INDEPENDENT_ERROR_FRACTION * points.common_v
+    )
     sources = int(points.source.max()) + 1
-    noise = [max(1.0, STD_OF_MEDIAN * float(np.median(np.abs(normalized[points.source == k])))) for k in range(sources)]
+    scatter = [
+        max(1.0, STD_OF_MEDIAN * float(np.median(np.abs(normalized[points.source == k])))) for k in range(sources)
+    ]
     own = x[model.splines + model.temperature_columns :].reshape(sources, -1)[:, : DEVIATION_NODES.size]
-    return np.array(noise), max(1.0, common * float(np.sqrt(np.mean(own**2))))
+    return np.array(scatter), max(1.0, systematic_factor * float(np.sqrt(np.mean(own**2))))
 
 
 def _deviations(points: Points, model: _Model, x: Floats) -> Floats:

@@ -1,4 +1,9 @@
-"""Average of the parameters over the settled part of a run, (3.19), with t_int and t_unst determined from the run."""
+"""Average of the parameters over the settled part of a run, (3.19) of the thesis.
+
+The average begins at t_int, when the error has settled, and ends at t_unst, when the battery becomes unstable. Both times
+are determined from the run. delta1 (2.11) and delta2 (2.12) are the SOCs below which C_ts and C_tl of the model are
+negative.
+"""
 
 from dataclasses import dataclass
 
@@ -47,15 +52,14 @@ def averaging_window(
 ) -> AveragingWindow:
     """Find t_int and t_unst of (3.19).
 
-    t_unst is the time at which the margin SOC - max(delta1, delta2) reaches zero or the voltage reaches its knee,
-    whichever is first. From t_int to t_unst, 99 % of the errors are within ``epsilon_v`` and each a_i is within 0.1 % of
+    t_unst is the time at which ``margin`` reaches zero or the voltage reaches its knee, whichever is first. From t_int to t_unst, 99 % of the errors are within ``epsilon_v`` and each a_i is within 0.1 % of
     its median. An average from the first sample on would contain the transient from a_i(t0).
 
     Args:
         time_s: Shape (n,) [s].
         error_v: e(t) (3.15) [V].
         voltage_v: y(t) [V].
-        margin: SOC - max(delta1, delta2), less the guard.
+        margin: SOC - max(delta1, delta2) - ``margin_guard`` of the observer.
         a: Shape (n, 16), a1..a15 at index 1..15.
         epsilon_v: Maximum error of a settled observer [V].
         t_int_s: t_int given by the user [s]; None: determined from the run.
@@ -76,6 +80,7 @@ def averaging_window(
     share = np.cumsum(beyond[::-1])[::-1] / remaining  # fraction of large errors in each sample and its successors
     good = (share <= 1.0 - SETTLED_SHARE) & ~beyond
     if not good.any():
+        # the window begins at its last sample, and ``averaged`` returns the last values
         reason = f"the error never settles within {1e3 * epsilon_v:.2f} mV"
         return AveragingWindow(float(time_s[inside][-1]), end_s, reason, end_reason)
     error_from = int(np.argmax(good))

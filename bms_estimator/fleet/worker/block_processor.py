@@ -123,7 +123,7 @@ class BlockProcessor:
 
     def _state(self, pack_type: PackType, now_s: float) -> bytes | None:
         """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
-        flow, window, d = pack_type.meter.flow, self._window.take(), self._delivery
+        flow, window, d = pack_type.meter.update_totals(), self._window.take(), self._delivery
         for name, value in zip(ChargeEnergy._fields, flow, strict=True):
             self._flows[name] = value
         if window is None:

@@ -17,9 +17,11 @@ BRANCHES = len(TAU_S)
 """Number of RC pairs."""
 RESISTANCES = 1 + BRANCHES
 """Number of resistances: the series resistance, then that of each RC pair."""
-WEAK_J, STRONG_J = 12e3, 45e3
-"""Activation energies of the two parts of each resistance [J/mol]: weak as in the electrolyte, strong as in reaction and
-diffusion."""
+WEAK_J = 12e3
+"""Activation energy of the weakly temperature-dependent part of each resistance, as in the electrolyte [J/mol]."""
+STRONG_J = 45e3
+"""Activation energy of the strongly temperature-dependent part of each resistance, as in reaction and diffusion
+[J/mol]."""
 HYSTERESIS_J = 8e3
 """Activation energy of the hysteresis [J/mol]: the hysteresis between C/30 curves of an LFP cell, without the drop of
 its RC network, was 1.2 and 1.7 times as large at 5 and -15 C as at 25 C."""
@@ -34,9 +36,11 @@ WEAK_SHARE = (0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57)
 """Default fraction of each resistance with activation energy ``WEAK_J``, for captures at a single temperature. The values
 are those of an 18650 NCA cell from -10 to 33 C, mean over SOC 0.3 to 1. An LFP cell from -15 to 25 C has 0.8, 1, 0.9,
 0.75, 0.7, 0.6, 0.6."""
-WEAK_FACTOR_SOC, WEAK_FACTOR = (0.0, 0.1, 0.2, 0.3, 0.45), (0.45, 0.5, 0.8, 0.9, 1.0)
-"""SOC nodes, and factor on ``WEAK_SHARE`` near empty. At SOC 0.2 and 0.1 the measured factor is 0.73 and 0.14 in the NCA
-cell, 0.97 and 0.92 in the LFP cell."""
+WEAK_FACTOR_SOC = (0.0, 0.1, 0.2, 0.3, 0.45)
+"""SOC nodes of ``WEAK_FACTOR``."""
+WEAK_FACTOR = (0.45, 0.5, 0.8, 0.9, 1.0)
+"""Factor on ``WEAK_SHARE`` near empty. At SOC 0.2 and 0.1 the measured factor is 0.73 and 0.14 in the NCA cell, 0.97
+and 0.92 in the LFP cell."""
 
 TREND = 3
 """Index of the RC pair whose filtered current decides between charge and discharge: that of 120 s."""

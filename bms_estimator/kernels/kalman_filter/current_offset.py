@@ -12,8 +12,10 @@ from bms_estimator.kernels.kalman_filter.records import OFFSET
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-REST_C, REST_S = 0.01, 60.0
-"""Maximum current in each window [C] and minimum duration [s] of a rest."""
+REST_C = 0.01
+"""Maximum mean current of a window at rest, as a C-rate."""
+REST_S = 60.0
+"""Minimum duration of a rest [s]."""
 ZERO_C = 0.002
 """Maximum mean current of a rest at which the current counts as zero [C]."""
 MIN_VARIANCE_RATIO = 4.0

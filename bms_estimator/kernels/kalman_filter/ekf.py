@@ -27,35 +27,52 @@ from bms_estimator.kernels.kalman_filter.records import (
 from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
-MIN_REACH, MAX_REACH = 0.02, 0.3
-"""Limits of half the width in SOC of the secant that gives the OCV's slope. The width is one std of the SOC."""
+MIN_REACH = 0.02
+"""Minimum of half the SOC width of the secant that gives the OCV's slope. The half width is one std of the SOC."""
+MAX_REACH = 0.3
+"""Maximum of half the SOC width of the secant that gives the OCV's slope."""
 MIN_SLOPE_V = 0.02
 """Minimum slope of the OCV of one cell [V per unit SOC]. With a smaller slope the filter diverges on a plateau."""
 HUBER = 2.0
 """Maximum innovation in std of S (Huber). S is increased for a larger innovation."""
-MINUTE_S, TEN_MINUTES_S = 60.0, 600.0
-"""Averaging times of the mean innovations that show a persistent error [s]."""
+MINUTE_S = 60.0
+"""Averaging time of the mean innovation that shows a persistent error within minutes [s]."""
+TEN_MINUTES_S = 600.0
+"""Averaging time of the mean innovation that shows a persistent error within tens of minutes [s]."""
 INFLATION_AVERAGING = 5.0, 3.0
 """Averaging times of the fast and the slow inflation, in multiples of ``MINUTE_S`` and ``TEN_MINUTES_S``."""
-CONVERGED_SOC, MAX_ITERATIONS = 0.01, 8
-"""Convergence limit in SOC and maximum number of iterations of the relinearization about the posterior."""
-MIN_SOC, MAX_SOC = -0.05, 1.05
-"""Limits of a filter's SOC."""
+CONVERGED_SOC = 0.01
+"""Change of the SOC below which the relinearization about the posterior has converged."""
+MAX_ITERATIONS = 8
+"""Maximum number of iterations of the relinearization about the posterior."""
+MIN_SOC = -0.05
+"""Lower limit of a filter's SOC."""
+MAX_SOC = 1.05
+"""Upper limit of a filter's SOC."""
 MAX_STDS = 3.0
 """Maximum magnitude of LN_R0 and LN_R, in multiples of their initial std."""
-MIN_LN_Q, MAX_LN_Q = math.log(0.5), math.log(1.3)
-"""Limits of ln of the learned over the declared capacity. Aging reduces the capacity by up to half, and new cells exceed
-their declared capacity only slightly."""
+MIN_LN_Q = math.log(0.5)
+"""Lower limit of ln of the learned over the declared capacity. Aging reduces the capacity by up to half."""
+MAX_LN_Q = math.log(1.3)
+"""Upper limit of ln of the learned over the declared capacity. New cells exceed their declared capacity only
+slightly."""
 HOLD_NOTHING, HOLD_CAPACITY, HOLD_CELL, HOLD_CELL_AND_CURVE = range(4)
 """Sets of states that an update does not change: none; LN_Q; LN_Q, OFFSET and the OCV nodes; these and CURVE."""
 INDEPENDENT_R_STD = 0.5
 """Maximum std of LN_R0 and LN_R that is independent between both. A larger std is common to both, as the unknown size of
 the cell. Only cell files of cells that were not measured have a larger std."""
-NEARLY_FULL_C, LEARNING_C, NEARLY_FULL_SOC = 0.02, 0.4, 0.9
-"""Maximum currents at which LN_Q is updated although the resistances are uncertain [C]: above and below the SOC
-``NEARLY_FULL_SOC``. Larger overpotentials cannot be distinguished from a change of capacity."""
-CHARGE, CHARGE_C = TREND + 1, 0.04
-"""Index of the RC pair of 500 s, and minimum current in it of a charge, as opposed to regeneration [C]."""
+NEARLY_FULL_C = 0.02
+"""Maximum current above ``NEARLY_FULL_SOC`` at which LN_Q is updated although the resistances are uncertain, as a
+C-rate. Larger overpotentials cannot be distinguished from a change of capacity."""
+LEARNING_C = 0.4
+"""Maximum current below ``NEARLY_FULL_SOC`` at which LN_Q is updated although the resistances are uncertain, as a
+C-rate."""
+NEARLY_FULL_SOC = 0.9
+"""SOC above which ``NEARLY_FULL_C`` limits the current instead of ``LEARNING_C``."""
+CHARGE = TREND + 1
+"""Index of the RC pair of 500 s, whose filtered current distinguishes a charge from regeneration."""
+CHARGE_C = 0.04
+"""Minimum filtered current of a charge, as a C-rate. Regeneration is shorter and has a smaller one."""
 VARYING_C = 0.2
 """Minimum standard deviation over 10 min of a load that distinguishes resistance from capacity [C]."""
 

@@ -27,8 +27,10 @@ MODEL_ERROR = 0.02
 """Relative error with which (2.5)-(2.9) describe a real element."""
 PRIOR_ERROR = 0.7
 """Relative error of the configured function in SOC bins that were not visited, after scaling to the visited ones."""
-EXPONENT_MIN, EXPONENT_MAX = 0.5, 300.0
-"""Range of the exponents."""
+EXPONENT_MIN = 0.5
+"""Lower limit of the exponents."""
+EXPONENT_MAX = 300.0
+"""Upper limit of the exponents."""
 SEARCH_POINTS = 24
 """Number of exponents in the logarithmic search."""
 REFINEMENTS = 12

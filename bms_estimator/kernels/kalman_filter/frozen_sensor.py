@@ -19,12 +19,15 @@ SUSPECT_S = 5.0
 """Duration of an implausibly constant voltage after which the voltage is no longer used [s]."""
 FROZEN_S = 60.0
 """Duration of an implausibly constant input after which the input is reported as frozen [s]."""
-SWING_V, MIN_RESOLUTION_STEPS = 0.02, 3.0
-"""Change of the voltage of one cell that proves a constant current frozen [V], and minimum change of the voltage in
-multiples of its resolution."""
-OCV_CHANGE_V, LOAD_C = 0.01, 0.1
-"""Change of the OCV of one cell that proves a constant voltage frozen [V], and minimum discharge current for that proof
-[C]. Below, only sudden changes count, because chargers regulate the voltage."""
+SWING_V = 0.02
+"""Change of the voltage of one cell that proves a constant current frozen [V]."""
+MIN_RESOLUTION_STEPS = 3.0
+"""Minimum change of the voltage for a proof, in multiples of its resolution."""
+OCV_CHANGE_V = 0.01
+"""Change of the OCV of one cell that proves a constant voltage frozen [V]."""
+LOAD_C = 0.1
+"""Minimum discharge current for the proof by the OCV, as a C-rate. Below it, only sudden changes count, because
+chargers regulate the voltage."""
 UNOBSERVED_CHARGE_ERROR = 0.1
 """Relative error of the charge counted while the voltage is not used."""
 OUTLIERS_S = 3600.0

@@ -14,20 +14,22 @@ LOAD_S = 600.0
 USUAL_S = 6.0 * 3600.0
 """Averaging time of the long-term mean load, which is expected after the present one in a long gap [s]."""
 INTERPOLATION_VARIANCE = 0.2
-"""Variance of the mean current between two samples about the straight line, over the squared change of the current. It is
-1/12 for loads that last much longer than a sample period, 0.10 and 0.18 for loads of 20 s sampled each 10 s and each 60 s,
-and 1/4 for independent samples."""
+"""Variance of the error of linear interpolation. The error is that of the mean current between two samples, and the
+variance is divided by the squared change of the current between them. It is 1/12 for loads that last much longer than a
+sample period, 0.10 and 0.18 for loads of 20 s sampled every 10 s and every 60 s, and 1/4 for independent samples."""
 MAX_EQUAL_STEPS = 1.5
 """Maximum difference between two reported currents that count as equal, in steps of the resolution."""
 IDLE_C = 0.1
-"""Minimum std of an unmeasured current [C]."""
+"""Minimum std of an unmeasured current, as a C-rate: a multiple of the current that empties the cell in an hour."""
 
 
 @njit(cache=True)
 def initialize_load_statistics(s: Record, p: Record, current_a: float) -> None:
-    """Initialize the load statistics at the first sample with the prior of ``initial_branch_currents``.
+    """Initialize the load statistics at the first sample with the prior of the load before switch-on.
 
-    The mean of the present load is the first sample's current, limited because a large current may be a short peak.
+    That load is the sum of its mean ``load_mean_c``, a part with std ``load_level_c`` that is constant for hours, and a
+    varying part with std ``load_c``, all as C-rates. ``s.rms_a2`` is the mean square over 10 min, not its root. The mean of
+    the present load is the first sample's current, limited because a large current may be a short peak.
     """
     one_c = p.capacity_as / 3600.0
     s.usual_a = p.load_mean_c * one_c
@@ -61,7 +63,8 @@ def expected_excess_charge(s: Record, held_a: float, dt_s: float) -> float:
 def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
     """Return the std of the charge in ``dt_s`` about ``held_a`` x ``dt_s`` [A s].
 
-    The unknown current is a random but constant value of the present load, or of the long-term load in a longer gap.
+    The unknown current is assumed constant over the gap. It is drawn from the distribution of the present load or, the
+    longer the gap, from that of the long-term load.
     """
     same = math.exp(-dt_s / LOAD_S)
     present_a2 = s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a
@@ -83,9 +86,10 @@ def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
 
 @njit(cache=True)
 def rounding_charge_variance(s: Record, p: Record, dt_s: float, current_a: float) -> float:
-    """Return the additional variance of the charge within ``dt_s`` by the resolution of the current [A^2 s^2].
+    """Advance the time of equal currents ``s.same_s``, and return the variance that ``dt_s`` adds to the charge [A^2 s^2].
 
-    A constant reported current has a constant error, whose charge has the variance (error x time)^2.
+    The variance is due to the resolution of the current. A constant reported current has a constant error, so that the
+    variance of its charge grows with the square of the time. Each call advances the time.
     """
     error_a2 = p.current_step_a * p.current_step_a / 12.0  # variance of rounding
     if current_a == 0.0 and s.current_a == 0.0:

@@ -29,9 +29,10 @@ from bms_estimator.numba_cache import njit
 
 GATE_STDS = 6.0
 """Limit of the innovation gate in std. A single sample beyond the gate is a glitch."""
-GATE_SAMPLES, GATE_S = 5, 5.0
-"""Minimum number and minimum duration [s] of successive samples beyond the gate that are accepted, because they show a
-change of the cell."""
+GATE_SAMPLES = 5
+"""Minimum number of successive samples beyond the gate that are accepted, because they show a change of the cell."""
+GATE_S = 5.0
+"""Minimum duration of successive samples beyond the gate that are accepted [s]."""
 SNAPSHOT_S = 60.0
 """Interval at which the last good state is stored [s]."""
 RESTORED_STD = 0.05
@@ -45,16 +46,22 @@ MIN_EVIDENCE = 0.1
 MAX_CHANGE_RATIO = 5.0
 """Limit of a voltage change, in multiples of the change that the resistances explain, so that a glitch to zero does not
 dominate the average."""
-MANY_OUTLIERS, FEW_OUTLIERS = 5.0, 1.0
-"""Numbers of recent rejected samples at which the fault OUTLIERS begins and ends."""
-OFFSET_STDS, CAPACITY_STDS = 4.0, 2.0
-"""Limits of offset and capacity, in multiples of their initial std, for the faults OFFSET and CAPACITY."""
+MANY_OUTLIERS = 5.0
+"""Number of recent rejected samples above which the fault OUTLIERS begins."""
+FEW_OUTLIERS = 1.0
+"""Number of recent rejected samples up to which the fault OUTLIERS ends."""
+OFFSET_STDS = 4.0
+"""Limit of the offset for the fault OFFSET, in multiples of its initial std."""
+CAPACITY_STDS = 2.0
+"""Limit of the capacity for the fault CAPACITY, in multiples of its initial std."""
 PRESENT_STDS = 3.0
 """Minimum offset or LN_Q of these faults, in multiples of its present std."""
 CLEAR_FRACTION = 0.7
 """Fraction of its limit below which a fault ends (hysteresis)."""
-WRONG_V, WRONG_S = 0.12, 1800.0
-"""Mean bias of one cell [V] and averaging time [s] beyond errors of an OCV of the cell's chemistry."""
+WRONG_V = 0.12
+"""Mean bias of one cell above which the OCV counts as wrong [V]. An OCV of the cell's chemistry has smaller errors."""
+WRONG_S = 1800.0
+"""Averaging time of that bias [s]."""
 SEARCHES_S = 5.0 * 3600.0
 """Time constant with which re-initializations of the SOC are discounted [s]."""
 MANY_SEARCHES = 4.0

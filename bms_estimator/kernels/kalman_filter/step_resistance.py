@@ -17,7 +17,7 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 UNHELD, HELD, STEPPED = range(3)
-"""Phases: current not constant; current constant; current stepped after a constant current."""
+"""Phases of ``detect_current_step``: the current changes; is constant; has stepped after it was constant."""
 MIN_C = 0.2
 """Minimum change of the current between two samples of a current step [C]."""
 HELD_SHARE = 0.1
@@ -27,12 +27,12 @@ STEP_STD = 0.05
 FAST_STD = 0.5
 """Relative std of the RC pairs' change within the step."""
 SHAPE_STD = 0.3
-"""Std of a random walk of ln(R_s / R_0 of the file) over the whole range of SOC."""
+"""Std by which ln(R_s / R_0) drifts over the whole range of SOC, where R_0 is the series resistance of the cell file."""
 
 
 @njit(cache=True)
 def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: float) -> None:
-    """Update the phase by one sample, after ``integrate_current``, and R_s at the end of a step.
+    """Advance the phase by one sample, and update R_s at the end of a step. Call after ``integrate_current``.
 
     Args:
         s: Record of EKF_STATE.
@@ -62,6 +62,7 @@ def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, volt
 def update_r_s_from_step(s: Record, p: Record, voltage_v: float) -> None:
     """Update R_s by the step that ends with ``voltage_v`` [V]."""
     x, step = s.mean[s.best], s.step
+    # the parts with the low and with the high activation energy add to the resistance at the present temperature
     resistances(x[SOC], p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
     change_a, fast_v = s.current_a - step.current_a, 0.0
     for k in range(BRANCHES):

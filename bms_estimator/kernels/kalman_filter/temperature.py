@@ -31,8 +31,10 @@ MAX_RATE_K_S = 0.1
 RATE_LIMIT_DELAY_S = 60.0
 """Delay until the rate limit of the temperature applies [s], because some sensors report 85 C at first."""
 
-MIN_PLAUSIBLE_C, MAX_PLAUSIBLE_C = -60.0, 120.0
-"""Range of a cell's plausible temperatures [C]."""
+MIN_PLAUSIBLE_C = -60.0
+"""Lowest plausible temperature of a cell [C]."""
+MAX_PLAUSIBLE_C = 120.0
+"""Highest plausible temperature of a cell [C]."""
 
 HEAT_J = 22.0
 """Heat capacity per Ah of a cell [J/(K Ah)]. Fits to an LG M50 at C/2 and 1C give 22 and 24 J/(K Ah)."""

@@ -1,7 +1,7 @@
 """Mittag-Leffler function E_a(-lambda k^a), 2 < a <= 3, of the Nussbaum gain.
 
-(3.10) is printed with a plus sign, which makes every term of (3.11) positive; with the minus sign it is a
-Nussbaum function (Li & Chen, Automatica 2009). With r = lambda^(1/a) k its exact value is
+The thesis prints (3.10) with a plus sign, which makes every term of (3.11) positive (erratum 1, docs/theory/thesis.md).
+With the minus sign, (3.10) is a Nussbaum function (Li & Chen, Automatica 2009). With r = lambda^(1/a) k its exact value is
 
     E_a(-r^a) = (2/a) e^(r cos(pi/a)) cos(r sin(pi/a)) + G_a(r),
     G_a(r) = (sin(pi a)/pi) int_0^inf e^(-r s) s^(a-1) / (s^(2a) + 2 s^a cos(pi a) + 1) ds.
@@ -9,7 +9,7 @@ Nussbaum function (Li & Chen, Automatica 2009). With r = lambda^(1/a) k its exac
 Substituting s^a = -cos(pi a) + sin(pi a) tan(theta) turns G into a mean of exponentials without the pole that
 approaches the real axis as a approaches 3,
 
-    G_a(r) = 1/(pi a) int e^(-r s(theta)) d theta,    s(0) .. s = inf,
+    G_a(r) = 1/(pi a) int e^(-r s(theta)) d theta,    from s(theta) = 0 to s(theta) = inf,
 
 which is tabulated over 1/(1 + r) once per a. Near r = 0, where G is not smooth because of a term r^a, the power series
 (3.11) is used.
@@ -30,6 +30,12 @@ SERIES_LIMIT = 2.0
 """Maximum r for the series (3.11). Its terms stay below 2 there, so that no digits are lost."""
 TABLE_POINTS = 1025
 """Number of nodes of G over w = 1/(1 + r) in [0, 1/(1 + SERIES_LIMIT)], for a cubic Hermite error below 1e-12."""
+PANEL_NODES = 40
+"""Number of Gauss-Legendre nodes of a panel in theta."""
+PANELS = 60
+"""Number of panels from s = 1 to each end. The last one is shorter than the resolution of theta in double precision."""
+PANEL_RATIO = 0.4
+"""Ratio of the distances of successive panel edges from the end of the range."""
 
 _W_END = 1.0 / (1.0 + SERIES_LIMIT)
 
@@ -71,7 +77,7 @@ def _mean_of_exponentials(alpha: float) -> tuple[Floats, Floats]:
     # d theta = sine dz / ((z + c)^2 + sine^2), smooth but for the peak at z = -c, which theta removes.
     theta_start = math.atan2(c, sine)
     theta_one = math.atan2(1.0 + c, sine)  # s = 1
-    nodes, weights = leggauss(40)
+    nodes, weights = leggauss(PANEL_NODES)
     s_all, w_all = [], []
 
     def panel(low: float, high: float) -> None:
@@ -83,8 +89,8 @@ def _mean_of_exponentials(alpha: float) -> tuple[Floats, Floats]:
     for end in (theta_start, 0.5 * math.pi):
         # geometric panels from s = 1 towards the end: s ~ (theta - start)^(1/alpha) and s -> inf are singular there
         edge = theta_one
-        for _ in range(60):
-            nearer = end + 0.4 * (edge - end)
+        for _ in range(PANELS):
+            nearer = end + PANEL_RATIO * (edge - end)
             panel(min(edge, nearer), max(edge, nearer))
             edge = nearer
     return np.concatenate(s_all), np.concatenate(w_all)
@@ -119,6 +125,6 @@ def _decay(r: float, value: Floats, slope: Floats) -> float:
     position = 1.0 / (1.0 + r) / step
     i = min(int(position), TABLE_POINTS - 2)
     t = position - i
-    w = t * t * (3.0 - 2.0 * t)
+    w = t * t * (3.0 - 2.0 * t)  # weight of the right node
     bend = t * (1.0 - t) * step
     return value[i] + w * (value[i + 1] - value[i]) + bend * ((1.0 - t) * slope[i] - t * slope[i + 1])

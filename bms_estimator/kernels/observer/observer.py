@@ -1,9 +1,11 @@
-"""High-gain adaptive observer, Algorithm 1.
+"""High-gain adaptive observer, Algorithm 1 of the thesis.
 
-y, i, N and a_i are constant over a sample period. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix, e
-decays with one of its eigenvalues, and (3.18) is a first-order lag driven by the mean of e^2 over the period. Each
-equation is solved exactly, so that the step is stable for every N >= 0 and every period. ``s`` is a record of
-OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+Numbers in parentheses are equations of the thesis, and errata are listed in docs/theory/thesis.md.
+
+y, i, N and a_i are constant over a sample period. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix and
+is solved exactly. e is taken to decay with the eigenvalue that [1, 1] belongs to if both time constants are equal. (3.18)
+is a first-order lag, driven by the mean of e^2 over the period, and is solved exactly. Therefore the step is stable for
+every N >= 0 and every period. ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
 """
 
 import math
@@ -16,8 +18,10 @@ from bms_estimator.numba_cache import njit
 
 MIN_LOOP_GAIN = 0.1
 """Lower limit of 1 + N R_s in the algebraic loop of (3.14). Near 0, a negative N reverses the sign of the loop."""
-LOST, REGAINED = -1, 1
-"""Results of ``lock_transition``."""
+LOST = -1
+"""Result of ``lock_transition``: the lock is lost."""
+REGAINED = 1
+"""Result of ``lock_transition``: the lock is regained."""
 
 
 @njit(cache=True)
@@ -33,12 +37,12 @@ def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v:
     s.lock = 1
     s.adapting = 1
     s.started = 1
-    if p.capacity_as == 0.0:
+    if p.capacity_as == 0.0:  # a fuel cell has neither SOC nor margins
         s.soc = s.soc_coulomb = s.delta_1 = s.delta_2 = math.nan
         return
     s.soc = p.soc_initial
     if math.isnan(s.soc):
-        ohmic = current_a * r_s(1.0, s.a)
+        ohmic = current_a * r_s(1.0, s.a)  # R_s at full charge, because the SOC is not known yet
         s.soc = soc_from_ocv(voltage_v + ohmic, p.ocv_v, p.ocv_slope_v)
     s.soc_coulomb = s.soc
     s.voltage_estimate_v = ocv(s.soc, p.ocv_v, p.ocv_slope_v)  # (4.1), x2 = x3 = 0
@@ -60,6 +64,7 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     """Advance the observer by one sample at the present SOC: Algorithm 1, lines 2 to 7."""
     e_o = ocv(s.soc, p.ocv_v, p.ocv_slope_v)
 
+    # ``output_r_s`` is 1 for the output (3.14), which contains R_s, and 0 for the output (4.1)
     s.adapting = 1 if s.soc > stability_floor(s, p) else 0
     soc = max(s.soc, stability_floor(s, p))
     ohm_s = p.output_r_s * r_s(soc, s.a) if p.output_r_s > 0.0 else 0.0
@@ -106,7 +111,7 @@ def update_margins(s: Record) -> None:
 
 @njit(cache=True)
 def stability_floor(s: Record, p: Record) -> float:
-    """Return the minimum SOC of the elements. Below, a capacitance may be negative (erratum 14)."""
+    """Return the minimum SOC at which the circuit elements are evaluated. Below it, a capacitance may be negative (erratum 14)."""
     return max(s.delta_1, s.delta_2) + p.margin_guard
 
 
@@ -114,10 +119,12 @@ def stability_floor(s: Record, p: Record) -> float:
 def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: float, dt_s: float) -> float:
     """Advance x2 and x3 by ``dt_s``, exactly: (3.2)-(3.3) with u = -gain (drop_v + x2 + x3) and constant gain and inputs.
 
-    The matrix is [[-1/tau_ts - gain, -gain], [-gain, -1/tau_tl - gain]].
+    The matrix A is [[-1/tau_ts - gain, -gain], [-gain, -1/tau_tl - gain]]. Its exponential is ``along`` I + ``across``
+    (A - ``mean`` I), and the integral of that exponential over the period is the same sum with ``phi_along`` and
+    ``phi_across``.
 
     Returns:
-        Eigenvalue with which the output error e decays [1/s].
+        Eigenvalue of the mode [1, 1], with which the output error e decays if both time constants are equal [1/s].
     """
     mean = -gain - 0.5 * (1.0 / tau_ts + 1.0 / tau_tl)
     half = 0.5 * (1.0 / tau_tl - 1.0 / tau_ts)
@@ -151,10 +158,11 @@ def track_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) 
 
     The lock is lost if the error exceeds ``lock_error_v`` for ``lock_time_s``, exceeds it with a gain of the wrong sign,
     or if the gain overflows. It is regained after the error has been within ``lock_error_v`` for ``lock_time_s``.
-    In lock, k restarts from k0 if the gain falls below ``rearm_gain``, before its sign changes. This requires a gain above
-    ``rearm_gain`` at k0, which N1 to N3 may not have, because they start at or near 0.
+    While the observer is in lock, k is reset to k0 as soon as the gain falls below ``rearm_gain``, so that the gain does not
+    become negative. Without a gain above ``rearm_gain`` at k0 there is no reset. The Nussbaum functions N1 to N3 start at or
+    near 0 and may not have such a gain.
     """
-    beyond = not abs(s.innovation_v) <= p.lock_error_v
+    beyond = not abs(s.innovation_v) <= p.lock_error_v  # NaN counts as beyond
     wrong_sign = beyond and s.gain <= 0.0
     overflow = not (math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and abs(s.gain) < p.gain_limit)
     change = lock_transition(s, p, dt_s, wrong_sign or overflow)
@@ -180,9 +188,10 @@ def lock_transition(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
         ``LOST`` after the error exceeded ``lock_error_v`` for ``lock_time_s``, or at once; ``REGAINED`` after the error
         was within that limit for ``lock_time_s``; otherwise 0.
     """
-    beyond = not abs(s.innovation_v) <= p.lock_error_v
+    beyond = not abs(s.innovation_v) <= p.lock_error_v  # NaN counts as beyond
     if beyond == (s.lock == 1):
-        # at most a fifth of the time counts per sample, so that a single sample after a long gap does not decide
+        # ``unlocked_s`` is the time for which the error has contradicted ``lock``. A sample adds at most a fifth of
+        # ``lock_time_s``, so that a single sample after a long gap does not decide
         s.unlocked_s += min(dt_s, 0.2 * p.lock_time_s)
     else:
         s.unlocked_s = 0.0
@@ -200,7 +209,7 @@ def lock_transition(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
 
 @njit(cache=True)
 def reinitialize_from_measurement(s: Record, p: Record, voltage_v: float, e_o: float) -> None:
-    """Reinitialize the observer with e = 0, k = k0 and the parameters at their limits."""
+    """Reinitialize the observer with e = 0, k = k0 and the parameters at their steady-state values ``target``."""
     s.k = p.k0
     s.gain = nussbaum_gain(s.k, p)
     s.v_ts = 0.5 * (e_o - voltage_v)

@@ -159,7 +159,7 @@ def test_page_loads_nothing(whole, page):
 
 @pytest.mark.thorough
 def test_closing_note_lists_every_item(whole, page):
-    note = whole.split('id="account"', 1)[1]
+    note = whole.split('id="summary"', 1)[1]
     for key in page.articles:
         assert f'href="#{key}"' in note
 
