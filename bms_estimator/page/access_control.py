@@ -64,7 +64,7 @@ class AccessControl:
         return self._token is None or hmac.compare_digest(_bytes(cookie), self.cookie.encode())
 
 
-def guard_of(settings: PageSettings) -> AccessControl:
+def make_access_control(settings: PageSettings) -> AccessControl:
     """Make the access control of the settings.
 
     Raises:

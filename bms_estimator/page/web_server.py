@@ -12,7 +12,7 @@ import structlog
 from aiohttp import web
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.page.access_control import HEADERS, AccessControl, guard_of
+from bms_estimator.page.access_control import HEADERS, AccessControl, make_access_control
 from bms_estimator.page.event_stream import LatestValues, Reader
 from bms_estimator.process.listener import CONNECTIONS, Listener
 from bms_estimator.settings.page import Listen, PageSettings
@@ -83,7 +83,7 @@ class WebServer:
         patient: bool = True,
     ) -> None:
         self._newest, self._opened, self._patient = newest, opened, patient
-        self._access: AccessControl = guard_of(settings)
+        self._access: AccessControl = make_access_control(settings)
         self._configured_address, self._listening = settings.address, settings.address
         self._files = {path: _read(file) for path, file in files.items()}
         self._handlers = {**dict.fromkeys(files, self._file), "/events": self._events, **handlers}

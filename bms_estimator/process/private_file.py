@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class UnsafeFileError(Exception):
-    """The path of a private file is not a regular file, or the file is too long."""
+    """A private file is not a regular file, or is longer than allowed. The message gives the reason without the path."""
 
 
 def read_private(path: Path, max_bytes: int) -> bytes:
@@ -17,14 +17,16 @@ def read_private(path: Path, max_bytes: int) -> bytes:
         max_bytes: Maximum size [bytes].
 
     Raises:
-        UnsafeFileError: The path is too long a file, or no regular file.
+        UnsafeFileError: The path is not a regular file, or the file is longer than ``max_bytes``.
         OSError: The file cannot be read.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     with open(descriptor, "rb") as file:  # noqa: PTH123 - a descriptor has no Path
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode) or found.st_size > max_bytes:
-            raise UnsafeFileError("no file, or too long")
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise UnsafeFileError("not a regular file")
+        if status.st_size > max_bytes:
+            raise UnsafeFileError(f"longer than {max_bytes} bytes")
         return file.read()
 
 

@@ -20,7 +20,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms import Change
 
 MAX_JOBS = 100
-"""Maximum number of jobs that wait for a slow program; beyond it the oldest is dropped."""
+"""Maximum number of queued jobs of a hook. If a slow program causes more, the oldest job is dropped."""
 RELAY_S = 2.0
 """Interval between two relay commands [s]. They are repeated because the board may have been reset or replaced."""
 RELAY_RETRY_S = 0.5
@@ -28,7 +28,7 @@ RELAY_RETRY_S = 0.5
 CLOSE_S = 2.0
 """Timeout of running hooks at shutdown [s]."""
 FIRST_RETRY_S = 0.5
-"""First delay before a program that could not be started is tried again [s]. It doubles with each attempt, up to 30 s."""
+"""First delay before the retry of a program that could not be started [s]. Each retry doubles the delay, up to 30 s."""
 
 PublishRaw = Callable[[str, bytes], None]
 """Publishes a payload on a topic."""
@@ -39,7 +39,7 @@ log = structlog.get_logger(__name__)
 
 
 class Job(NamedTuple):
-    """One job of a hook: report a change of an alarm."""
+    """Job of a hook: one change of an alarm to report."""
 
     alarm: Alarm
     state: Literal["raised", "cleared"]
@@ -84,8 +84,8 @@ class AlarmHooks:
     def restore_active(self, alarms: Sequence[Alarm]) -> None:
         """Restore the alarms of an earlier run.
 
-        Their jobs are not repeated, but the relay gets its level. If a hook had failed in the earlier run, all jobs are
-        repeated, so that none is lost.
+        Jobs of these alarms are not repeated, but the relay is set to its level. If a hook had failed in the earlier run,
+        all jobs are repeated, so that none is lost.
         """
         raised = {alarm.name for alarm in alarms if _counts_as_raised(alarm)}
         if "hook_failed" not in raised:
@@ -93,12 +93,12 @@ class AlarmHooks:
                 hook.restore_active(raised)
             return
         for hook in self._hooks:
-            hook.restore_active({"hook_failed"})
+            hook.restore_active({"hook_failed"})  # hook_failed itself is not announced again
         for alarm in alarms:
-            self.on_alarm_change(Change(0.0, alarm))
+            self.on_alarm_change(Change(at_s=0.0, alarm=alarm))  # hooks do not use the time
 
     async def __aenter__(self) -> Self:
-        """Start."""
+        """Start a task for each hook."""
         self._tasks = [asyncio.create_task(hook.supervise(), name="alarm hook") for hook in self._hooks]
         return self
 
@@ -122,8 +122,8 @@ class _Hook:
         error: Reason why the last attempt failed; empty after a success.
     """
 
-    def __init__(self, hook: AlarmHook, device: str) -> None:
-        self._hook, self._device = hook, device
+    def __init__(self, settings: AlarmHook, device: str) -> None:
+        self._settings, self._device = settings, device
         self.done, self.failures, self.error = 0, 0, ""
         self._raised: set[str] = set()
         self._jobs: deque[Job] = deque(maxlen=MAX_JOBS)
@@ -137,12 +137,12 @@ class _Hook:
 
     def covers(self, name: str) -> bool:
         """Return True if the hook is for this alarm. ``hook_failed`` must be listed by name."""
-        return name in self._hook.alarms if self._hook.alarms else name != "hook_failed"
+        return name in self._settings.alarms if self._settings.alarms else name != "hook_failed"
 
     def on_alarm_change(self, change: Change) -> None:
         """Queue the job that follows from a change."""
-        job = self._job(change)
-        if job is None or job.state not in self._hook.on:
+        job = self._record_change(change)
+        if job is None or job.state not in self._settings.on:
             return
         if len(self._jobs) == MAX_JOBS:
             log.warning("an alarm hook is too slow: its oldest job is dropped", hook=self.description)
@@ -153,7 +153,7 @@ class _Hook:
         self._raised = {name for name in raised if self.covers(name)}
 
     def close(self) -> None:
-        """End after the jobs that wait."""
+        """Make the hook end after its queued jobs."""
         self._closing = True
         self._wake.set()
 
@@ -175,7 +175,7 @@ class _Hook:
                 self._wake.clear()
             while self._jobs:
                 job = self._jobs.popleft()
-                if self._hook.dry_run:
+                if self._settings.dry_run:
                     log.warning("alarm hook, dry run", would=self.description, alarm=job.alarm.name, state=job.state)
                 else:
                     await self._run_job(job)
@@ -183,7 +183,7 @@ class _Hook:
     async def _run_job(self, job: Job) -> None:
         raise NotImplementedError
 
-    def _job(self, change: Change) -> Job | None:
+    def _record_change(self, change: Change) -> Job | None:
         """Record a change of an alarm. Return its job, or None if nothing changes for the hook."""
         alarm = change.alarm
         is_raised = _counts_as_raised(alarm)
@@ -202,14 +202,14 @@ class _Hook:
         self.error = ""
 
     def _fail(self, job: Job, error: str) -> None:
-        """Count a failure. A failed job for ``hook_failed`` does not raise ``hook_failed`` again: that would never end."""
+        """Count a failure. A failed job for ``hook_failed`` does not raise ``hook_failed`` again, which would cause endless jobs."""
         self.failures += 1
         if job.alarm.name != "hook_failed":
             self.error = error
 
 
 def _counts_as_raised(alarm: Alarm) -> bool:
-    """Return True for a raised alarm, and to be safe for a critical alarm that cannot be watched."""
+    """Return True for a raised alarm. A critical alarm that cannot be watched also counts as raised, to be safe."""
     return alarm.active or (alarm.severity == "critical" and not alarm.watched)
 
 
@@ -219,7 +219,7 @@ class _CommandHook(_Hook):
     @property
     def description(self) -> str:
         """Description with the name of the program."""
-        return f"run {(self._hook.run or ('',))[0]}"
+        return f"run {(self._settings.run or ('',))[0]}"
 
     async def _run_job(self, job: Job) -> None:
         """Run the program. If it cannot be started, try again until it starts or the alarm's state changes."""
@@ -241,10 +241,10 @@ class _CommandHook(_Hook):
     async def _run(self, job: Job) -> bool:
         """Run the program once. Return False if it could not be started."""
         values = _values(job, self._device)
-        text, timeout_s = values.pop("json").encode(), self._hook.timeout_s
-        variables = environment(self._hook.pass_environment, values)
+        text, timeout_s = values.pop("json").encode(), self._settings.timeout_s
+        variables = environment(self._settings.pass_environment, values)
         try:
-            code = await run(self._hook.run or (), text, variables, timeout_s)
+            code = await run(self._settings.run or (), text, variables, timeout_s)
         except StartError as error:
             self._fail(job, f"cannot be started: {error}")
             log.warning("alarm hook: the program cannot be started", hook=self.description, error=str(error))
@@ -263,8 +263,8 @@ class _CommandHook(_Hook):
 class _PublishHook(_Hook):
     """Publishes a message."""
 
-    def __init__(self, hook: AlarmHook, device: str, topic: str, publish: PublishRaw) -> None:
-        super().__init__(hook, device)
+    def __init__(self, settings: AlarmHook, device: str, topic: str, publish: PublishRaw) -> None:
+        super().__init__(settings, device)
         self._topic, self._publish = topic, publish
 
     @property
@@ -273,47 +273,49 @@ class _PublishHook(_Hook):
         return f"publish on {self._topic}"
 
     async def _run_job(self, job: Job) -> None:
-        self._publish(self._topic, Template(self._hook.payload).substitute(_values(job, self._device)).encode())
+        self._publish(self._topic, Template(self._settings.payload).substitute(_values(job, self._device)).encode())
         self._succeed()
 
 
 class _RelayHook(_Hook):
     """Hook that keeps the board's relay at its level by repeated commands, because a reset releases it."""
 
-    def __init__(self, hook: AlarmHook, device: str, set_relay: SetRelay) -> None:
-        super().__init__(hook, device)
+    def __init__(self, settings: AlarmHook, device: str, set_relay: SetRelay) -> None:
+        super().__init__(settings, device)
         self._set_relay = set_relay
 
     @property
     def description(self) -> str:
         """Description with the level of the relay pin."""
-        return f"relay pin {'high' if self._wanted.high else 'low'}"
+        return f"relay pin {'high' if self._command.high else 'low'}"
 
     @property
-    def _wanted(self) -> Relay:
-        high = (self._hook.relay == "high") == bool(self._raised)
-        silent = self._hook.level_when_silent
-        stays = silent == "keep"
-        return Relay(high, None if stays else silent == "high", 0 if stays else self._hook.silent_s)
+    def _command(self) -> Relay:
+        """Relay command with the level for the present alarms, and the level for a silent service."""
+        level_in_alarm, level_when_silent = self._settings.relay, self._settings.level_when_silent
+        high = (level_in_alarm == "high") == bool(self._raised)
+        if level_when_silent == "keep":
+            return Relay(high, high_when_silent=None)
+        return Relay(high, high_when_silent=level_when_silent == "high", silent_s=self._settings.silent_s)
 
     def on_alarm_change(self, change: Change) -> None:
         """Follow the alarms regardless of the hook's ``on``.
 
-        The level depends on whether one of them counts as raised.
+        The pin has the hook's level while at least one alarm counts as raised, otherwise the opposite level.
         """
-        before = self._wanted
-        job = self._job(change)
-        if job is not None and self._wanted != before:
+        before = self._command
+        job = self._record_change(change)
+        if job is not None and self._command != before:
             log.warning(
-                "relay", dry_run=self._hook.dry_run, hook=self.description, alarm=job.alarm.name, state=job.state
+                "relay", dry_run=self._settings.dry_run, hook=self.description, alarm=job.alarm.name, state=job.state
             )
 
     async def work(self) -> None:
         """Send the level repeatedly until the hook is closed."""
-        while not self._hook.dry_run and not self._closing:
+        while not self._settings.dry_run and not self._closing:
             self._wake.clear()
             try:
-                await self._set_relay(self._wanted)
+                await self._set_relay(self._command)
                 if self.error:
                     log.info("the board accepts relay commands again", hook=self.description)
                 self.error = ""
@@ -333,8 +335,8 @@ def hook_warnings(settings: Settings) -> list[str]:
         UserError: A hook needs a missing broker or relay.
     """
     hooks = settings.alarms.hook
-    AlarmHooks(
-        hooks, settings.pack.name, (lambda *_: None) if settings.mqtt else None, relay_of(settings, _ignore_relay)
+    AlarmHooks(  # raises UserError for a hook that cannot work
+        hooks, settings.pack.name, (lambda *_: None) if settings.mqtt else None, select_relay(settings, _ignore_relay)
     )
     return [
         f"alarms.hook.{i}.run = {hook.run[0]}: no such program here, or it may not be run"
@@ -348,13 +350,13 @@ def hook_warnings(settings: Settings) -> list[str]:
     ]
 
 
-def relay_of(settings: Settings, set_relay: SetRelay | None) -> SetRelay | None:
-    """Return ``set_relay`` if the source has a relay: only the firmware's board has a pin for one."""
+def select_relay(settings: Settings, set_relay: SetRelay | None) -> SetRelay | None:
+    """Return ``set_relay`` if the source has a relay pin, otherwise None. Only the firmware's board has one."""
     return set_relay if settings.sensor.protocol == "binary" else None
 
 
 async def _ignore_relay(_: Relay) -> None:
-    """Do nothing, for a pack without a board."""
+    """Do nothing. This function replaces the relay while the hooks are only checked."""
 
 
 def _make_hook(i: int, hook: AlarmHook, device: str, publish: PublishRaw | None, set_relay: SetRelay | None) -> _Hook:

@@ -72,7 +72,7 @@ async def _keep_alive(
     """Notify the watchdog while the source's task runs, and report the status."""
     sent_status = ""
     while True:
-        if source.pulse().task_idle_s <= SOURCE_HUNG_S:
+        if source.health().task_idle_s <= SOURCE_HUNG_S:
             notifier.alive(name)
         status = f"no samples: {source.message}" if source.message else f"{edge.store.waiting} blocks not sent"
         if status != sent_status:

@@ -20,7 +20,7 @@ from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.process.log_setup import set_level
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import SystemdNotifier
-from bms_estimator.service.alarm_hooks import AlarmHooks, PublishRaw, relay_of
+from bms_estimator.service.alarm_hooks import AlarmHooks, PublishRaw, select_relay
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.alarm_limits import out_of_range, watched
 from bms_estimator.settings.pack import Settings
@@ -97,7 +97,7 @@ async def run_pack_service(
         )
         all_sinks.append(mqtt)
         publish_raw = mqtt.publish_raw
-    hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, publish_raw, relay_of(settings, source.relay))
+    hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, publish_raw, select_relay(settings, source.relay))
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None
         all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
@@ -121,7 +121,7 @@ async def run_pack_service(
             delivery=delivery,
             current_zero=source.current_zero,
             notifier=notifier,
-            source_health=source.pulse,
+            source_health=source.health,
             recording=partial(recording_health, tap),
             hooks=hooks,
             edge=edge,

@@ -110,14 +110,14 @@ class VirtualConverter:
         return np.clip(np.rint(steps), 0, FULL_SCALE - 1)
 
 
-def window_of(rate_hz: int) -> tuple[int, int]:
+def compute_window(rate_hz: int) -> tuple[int, int]:
     """Return the number of conversion pairs in a window and its length [ns], with the clock division of the firmware."""
     slots = SLOTS_PER_S // rate_hz // 2 * 2
     cycles = round(CLOCK_HZ / (rate_hz * slots))
     return slots // 2, slots * cycles * 1_000_000_000 // CLOCK_HZ
 
 
-def aux_readings_of(rate_hz: int) -> int:
+def compute_aux_count(rate_hz: int) -> int:
     """Return the number of NTC or bandgap readings in one window: odd, as in the firmware."""
     wanted = AUX_PER_S // rate_hz
     return 1 if wanted == 0 else min((wanted - 1) | 1, AUX_MAX)

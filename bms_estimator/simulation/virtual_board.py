@@ -47,8 +47,8 @@ from bms_estimator.simulation.virtual_adc import (
     BoardParts,
     Reading,
     VirtualConverter,
-    aux_readings_of,
-    window_of,
+    compute_aux_count,
+    compute_window,
 )
 
 Signal = Callable[[float], Reading] | Iterable[Reading]
@@ -248,8 +248,8 @@ class VirtualBoard:
 
     def _set_rate(self, rate_hz: int) -> None:
         self._rate_hz = rate_hz
-        self._count, self._period_ns = window_of(rate_hz)
-        self._aux_count = aux_readings_of(rate_hz)
+        self._count, self._period_ns = compute_window(rate_hz)
+        self._aux_count = compute_aux_count(rate_hz)
 
     async def _sample_until(self, end_s: float, loop: asyncio.AbstractEventLoop) -> None:
         offset_s = loop.time() - self.time_s / self._speed
@@ -421,7 +421,7 @@ class VirtualBoard:
 
     def _zero_current(self) -> None:
         """Store the present current as zero."""
-        count = window_of(1)[0]
+        count = compute_window(1)[0]
         part = self._converter.window(self._reading, count).current / count / FULL_SCALE
         is_valid = abs(part - 0.5) <= _MAX_ZERO_OFFSET
         self._zero_ppm = round(part * 1e6) if is_valid else self._zero_ppm

@@ -139,7 +139,7 @@ class LineSource:
     relay: None = None
     """Function that switches a relay; None: no relay."""
 
-    def pulse(self) -> SourceHealth:
+    def health(self) -> SourceHealth:
         """Return the health of the task that runs the producer."""
         now_s = self._monotonic()
         return SourceHealth(

@@ -252,7 +252,7 @@ async def test_invalid_checkpoint_is_rejected_with_the_reason(
     if damage == "pipe":  # opening it for reading would block until a writer comes
         file.path.unlink()
         os.mkfifo(file.path)
-        reason = "refused: no file"
+        reason = "refused: not a regular file"
     inode = file.path.stat().st_ino
     run = await run_samples(tmp_path, current_a=0.0, samples=1)
     assert run.health.checkpoint.startswith(reason)

@@ -33,7 +33,7 @@ from bms_estimator.protocols.firmware.messages import (
     zero_current_command,
 )
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.simulation.virtual_adc import aux_readings_of, window_of
+from bms_estimator.simulation.virtual_adc import compute_aux_count, compute_window
 from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.firmware.host import Host
 from tests.simavr_board import FIRMWARE, SimavrBoard, write_readings
@@ -125,7 +125,7 @@ def test_the_boards_clock_is_the_clock_that_triggers_the_converter(start: Start,
 @pytest.mark.parametrize("rate_hz", [1, 7, 10, 300, 999, 1000])
 def test_every_rate_has_its_exact_period_from_the_next_sample_on(start: Start, rate_hz: int) -> None:
     host = start()
-    pairs, period_ns = window_of(rate_hz)
+    pairs, period_ns = compute_window(rate_hz)
     ack = host.ask(set_rate_command(rate_hz))
     assert (ack.command, ack.result, ack.value) == (MessageType.COMMAND_SET_RATE, AckResult.OK, period_ns)
     host.take(2)  # the window that had begun, and one that may have ended before the command
@@ -136,7 +136,7 @@ def test_every_rate_has_its_exact_period_from_the_next_sample_on(start: Start, r
     assert np.abs(since_us - np.arange(len(samples)) * period_ns * 1e-3).max() <= 1.0
     assert not any(s.status & BoardStatus.OVERRUN for s in samples)
     aux = [s for s in samples if s.aux_count]
-    assert {s.aux_count for s in aux} == {aux_readings_of(rate_hz)}
+    assert {s.aux_count for s in aux} == {compute_aux_count(rate_hz)}
     assert len(aux) == pytest.approx(len(samples) / max(rate_hz // 100, 1), abs=1)
     assert all((a.status ^ b.status) & BoardStatus.AUX_IS_NTC for a, b in itertools.pairwise(aux))
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.simulation.virtual_adc import aux_readings_of, window_of
+from bms_estimator.simulation.virtual_adc import compute_aux_count, compute_window
 from tests.simavr_board import FIRMWARE
 
 VECTORS = json.loads((FIRMWARE / "test_vectors.json").read_text())
@@ -56,5 +56,5 @@ def test_bad_frames_are_refused(in_c: InC) -> None:
 
 def test_every_rate_divides_the_clock_as_the_virtual_board_does(in_c: InC) -> None:
     rates = range(1, 1001)
-    divided = ["{} {} {}".format(*window_of(rate), aux_readings_of(rate)) for rate in rates]
+    divided = ["{} {} {}".format(*compute_window(rate), compute_aux_count(rate)) for rate in rates]
     assert in_c([f"timing {rate}" for rate in rates]) == divided

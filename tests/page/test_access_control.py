@@ -3,7 +3,7 @@
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.page.access_control import AccessControl, guard_of
+from bms_estimator.page.access_control import AccessControl, make_access_control
 from bms_estimator.settings.page import PageSettings, parse_listen
 
 TOKEN = "0123456789abcdef"
@@ -46,12 +46,12 @@ def test_invalid_token_is_reported(tmp_path, text, said):
     if text is not None:
         file.write_bytes(text)
     with pytest.raises(UserError, match=said):
-        guard_of(PageSettings(listen="0.0.0.0:8765", token_file=file))
+        make_access_control(PageSettings(listen="0.0.0.0:8765", token_file=file))
 
 
 def test_newline_after_the_token_is_ignored(tmp_path):
     (tmp_path / "token").write_text(f"{TOKEN}\n")
-    guard = guard_of(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
+    guard = make_access_control(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
     assert guard.is_valid_token(TOKEN)
     assert not any(guard.is_valid_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
     assert not guard.is_valid_token("\udcff" * 16)  # as aiohttp has a header that is no UTF-8

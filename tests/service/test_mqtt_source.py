@@ -13,7 +13,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.factory import open_line_source
@@ -79,7 +79,7 @@ async def test_readings_over_mqtt_are_estimated_through_disconnections_and_resta
 ) -> None:
     await publish(broker, "40.00", "99.0")  # of yesterday: the broker keeps it
     settings_, path = settings(broker), tmp_path / "heard.raw"
-    with CaptureRecorder(path, header_of(settings_.sensor, settings_.source)) as recording:
+    with CaptureRecorder(path, make_header(settings_.sensor, settings_.source)) as recording:
         async with serving(settings_, recording):
             async with Listener(broker, "bms/#") as listener:
                 await estimated(broker, listener)

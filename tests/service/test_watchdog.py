@@ -13,7 +13,7 @@ from bms_estimator.service.latency import Latency
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.service.pack_service import recording_health
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.serial.serial_port import SerialPort
 from bms_estimator.sources.serial.serial_source import SerialSource
@@ -94,13 +94,13 @@ async def test_the_idle_time_of_a_source_s_task_grows_while_it_hangs(
         for _ in range(3):
             now_s += 10.0
             async with asyncio.timeout(LONG_S):
-                while board.pulse().task_idle_s > 0.0:  # noqa: ASYNC110 - the idle time has no event
+                while board.health().task_idle_s > 0.0:  # noqa: ASYNC110 - the idle time has no event
                     await asyncio.sleep(0.001)
     monkeypatch.setattr(SerialPort, "open", hang)
     async with SerialSource(sensor, monotonic=lambda: now_s) as board:
         await asyncio.wait_for(opened.wait(), LONG_S)
         now_s += 100.0
-        assert board.pulse().task_idle_s == 100.0
+        assert board.health().task_idle_s == 100.0
 
 
 async def test_systemctl_status_shows_the_soc_or_the_reason_for_missing_samples(systemd: Systemd) -> None:
@@ -151,7 +151,7 @@ def test_latency_percentiles_are_accurate_to_a_fifth() -> None:
 
 def test_health_contains_the_state_of_a_recording(tmp_path: Path) -> None:
     assert recording_health(None) is None
-    with CaptureRecorder(tmp_path / "raw", header_of(SensorSettings())) as recording:
+    with CaptureRecorder(tmp_path / "raw", make_header(SensorSettings())) as recording:
         recording.write(0.0, b"12345")
         on = recording_health(recording)
         assert on

@@ -14,7 +14,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SPREAD_V, BmsFault, SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
-from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.serial.serial_source import SerialSource
@@ -93,7 +93,7 @@ async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happen
         monkeypatch.setattr(f"bms_estimator.{constant}", value)
     protocol, path = name.removesuffix("-pb"), tmp_path / "line.bms"
     bms = SimulatedBms(name, swinging, cells=CELLS)
-    header = header_of(SensorSettings.model_validate({"protocol": protocol}))
+    header = make_header(SensorSettings.model_validate({"protocol": protocol}))
     with CaptureRecorder(path, header) as recording:
         async with read(bms, protocol, recording) as (board, taken):
             await taken.more(2)

@@ -32,7 +32,7 @@ from bms_estimator.protocols.firmware.messages import (
 )
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.simulation.virtual_adc import BoardParts, Reading, window_of
+from bms_estimator.simulation.virtual_adc import BoardParts, Reading, compute_window
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
 from tests.patience import LONG_S
 
@@ -50,7 +50,9 @@ async def received(board: VirtualBoard, samples: int, events: dict[int, Event] |
     async def run() -> None:
         try:
             for at in sorted({*(events or {}), samples}):
-                await board.run((at - board.samples - 0.5) * window_of(100)[1] * 1e-9)  # the last one begins by then
+                await board.run(
+                    (at - board.samples - 0.5) * compute_window(100)[1] * 1e-9
+                )  # the last one begins by then
                 if events and at in events:
                     events[at](board)
         finally:
@@ -179,7 +181,7 @@ async def test_commands_are_obeyed_and_answered() -> None:
                     await asyncio.sleep(0.005)
 
         try:
-            assert await ask(set_rate_command(250)) == (AckResult.OK, window_of(250)[1])
+            assert await ask(set_rate_command(250)) == (AckResult.OK, compute_window(250)[1])
             assert await ask(set_serial_command(77)) == (AckResult.OK, 77)
             assert await ask(set_bandgap_command(1.3)) == (AckResult.BAD_VALUE, 1_100_000)
             assert await ask(set_divider_command(5.0)) == (AckResult.OK, 5_000_000)

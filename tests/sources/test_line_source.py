@@ -12,7 +12,7 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.line_source import LineProducer, LineSource, SourceUnavailableError
@@ -83,7 +83,7 @@ async def test_capture_of_lines_replays_bit_identically(tmp_path: Path):
     path = tmp_path / "brought.raw"
     sensor = SensorSettings(protocol="text", current_sign="charge_positive")
     brought = [*lines(50.0, 51.0), b"junk\n", *lines(52.0)[1:], sample_json_line(53.0, 1.25, time_s=7.5)]
-    with CaptureRecorder(path, header_of(sensor)) as recording:
+    with CaptureRecorder(path, make_header(sensor)) as recording:
         source = LineSource(Scripted(brought), sensor, tap=recording)
         async with source:
             live = await take(source, 4)

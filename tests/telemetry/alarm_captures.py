@@ -13,7 +13,7 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.captures.raw_capture import CaptureWriter, header_of
+from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
 from bms_estimator.sources.captures.replay import Replay, open_capture
 from bms_estimator.telemetry.alarms import Change
 from tests.collector import Collector
@@ -62,7 +62,7 @@ class ReplayResult:
 def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
     """Write a raw capture of these lines."""
     arrival_s = 100.0
-    header = header_of(settings().sensor)
+    header = make_header(settings().sensor)
     writer = CaptureWriter(path, header)
     writer.write(arrival_s, b"\n")
     for line in lines:

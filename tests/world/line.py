@@ -35,7 +35,7 @@ from bms_estimator.protocols.firmware.messages import (
     SampleMessage,
     unseal,
 )
-from bms_estimator.simulation.virtual_adc import FULL_SCALE, BoardParts, Reading, aux_readings_of, window_of
+from bms_estimator.simulation.virtual_adc import FULL_SCALE, BoardParts, Reading, compute_aux_count, compute_window
 from bms_estimator.simulation.virtual_board import FIRMWARE
 from tests.world.loop import Timeline
 
@@ -144,8 +144,8 @@ class Board:
 
     def _set_rate(self, rate_hz: int) -> None:
         self._rate_hz = rate_hz
-        self._count, self._period_ns = window_of(rate_hz)
-        self._aux_count = aux_readings_of(rate_hz)
+        self._count, self._period_ns = compute_window(rate_hz)
+        self._aux_count = compute_aux_count(rate_hz)
 
     def _sum(self, part: float, count: int) -> int:
         """Return the sum of ``count`` conversions of a fraction of the reference."""

@@ -448,7 +448,7 @@ class World:
         held = door.pending_protocol is not None
         if self.timeline.now_s - process.delivered_s <= 0.05 or self._reads(process):
             return
-        given = counters["bytes_received"] + counters["unadmitted_bytes"] + sum(len(data) for _, data in door._pending)
+        given = counters["bytes_received"] + counters["rejected_bytes"] + sum(len(data) for _, data in door._pending)
         if given != process.delivered_bytes:
             self.fail(f"{process.delivered_bytes} bytes came, {given} are counted: {counters}")
         if self.settings.sensor.protocol == "binary" and not process.foreign:

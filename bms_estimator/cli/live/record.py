@@ -19,7 +19,7 @@ from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.serial.serial_source import SerialSource
@@ -55,7 +55,7 @@ def record(
     settings = load_pack(pack)[0] if pack else Settings()
     protocol = "text" if text else None
     settings = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol)
-    with flush_logs(), CaptureRecorder(out, header_of(settings.sensor, settings.source)) as recording:
+    with flush_logs(), CaptureRecorder(out, make_header(settings.sensor, settings.source)) as recording:
         progress = asyncio.run(_record(settings, recording, seconds))
     if recording.fault:
         raise UserError(f"recording ended: {recording.fault}")

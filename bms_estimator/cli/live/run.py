@@ -25,7 +25,7 @@ from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.terminal.screen import LOG_LINES
 from bms_estimator.sinks.terminal.sink import TerminalSink
-from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 
 
@@ -76,7 +76,7 @@ def _run_one(settings: Settings, cell: PackModel, record: Path | None, *, view: 
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if view and sys.stdout.isatty() else None)
     recorder = (
-        CaptureRecorder(record, header_of(settings.sensor, settings.source)) if record else contextlib.nullcontext()
+        CaptureRecorder(record, make_header(settings.sensor, settings.source)) if record else contextlib.nullcontext()
     )
     sinks = [TerminalSink(log=log)] if view else []
     with flush_logs(), recorder as tap:

@@ -18,7 +18,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.mqtt.broker_config import check as check_brokers
-from bms_estimator.page.access_control import guard_of
+from bms_estimator.page.access_control import make_access_control
 from bms_estimator.process.systemd import is_for_the_service
 from bms_estimator.service.alarm_hooks import hook_warnings
 from bms_estimator.settings.alarm_limits import out_of_range, watched
@@ -114,7 +114,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         unreadable, unchecked = _unreadable("page", settings.page, "token_file")
         warnings += unchecked
         if not unreadable:
-            guard_of(settings.page)
+            make_access_control(settings.page)
     if settings.influx is not None:
         unreadable, unchecked = _unreadable("influx", settings.influx, "password_file", "token_file")
         warnings += unchecked

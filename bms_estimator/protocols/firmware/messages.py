@@ -212,7 +212,7 @@ class Hello:
         Raises:
             ProtocolError: The packet is another message.
         """
-        return cls(*cls.LAYOUT.unpack(body_of(packet, MessageType.HELLO, cls.LAYOUT.size)))
+        return cls(*cls.LAYOUT.unpack(extract_body(packet, MessageType.HELLO, cls.LAYOUT.size)))
 
     @property
     def firmware(self) -> str:
@@ -249,7 +249,7 @@ class Ack:
         Raises:
             ProtocolError: The packet is another message.
         """
-        command_type, result, value = cls.LAYOUT.unpack(body_of(packet, MessageType.ACK, cls.LAYOUT.size))
+        command_type, result, value = cls.LAYOUT.unpack(extract_body(packet, MessageType.ACK, cls.LAYOUT.size))
         try:
             return cls(command_type, AckResult(result), value)
         except ValueError as error:
@@ -289,13 +289,13 @@ class SampleMessage:
         Raises:
             ProtocolError: The packet is another message.
         """
-        body = body_of(packet, MessageType.SAMPLE, cls.HEAD.size - 2 + 2 * cls.SUM_BYTES + cls.TAIL.size)
+        body = extract_body(packet, MessageType.SAMPLE, cls.HEAD.size - 2 + 2 * cls.SUM_BYTES + cls.TAIL.size)
         sequence, board_us = struct.unpack_from("<II", body)
         sums = (int.from_bytes(body[i : i + cls.SUM_BYTES], "little") for i in (8, 8 + cls.SUM_BYTES))
         return cls(sequence, board_us, *sums, *cls.TAIL.unpack_from(body, 8 + 2 * cls.SUM_BYTES))
 
 
-def body_of(packet: bytes, kind: MessageType, size: int) -> bytes:
+def extract_body(packet: bytes, kind: MessageType, size: int) -> bytes:
     """Return the body of a packet without CRC.
 
     Raises:

@@ -8,7 +8,7 @@ from typing import Any
 from bms_estimator.protocols.base.reading import Reading
 
 
-def reading_of(sample: Mapping[str, Any]) -> Reading | None:
+def convert_sample(sample: Mapping[str, Any]) -> Reading | None:
     """Return the reading of aiobmsble's ``BMSSample``, positive on charge; None without voltage or current."""
     voltage_v, current_a = _number(sample.get("voltage")), _number(sample.get("current"))
     if math.isnan(voltage_v) or math.isnan(current_a):

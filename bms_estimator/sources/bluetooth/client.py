@@ -14,7 +14,7 @@ from bleak.exc import BleakError
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.ble_source import BleSource
-from bms_estimator.sources.bluetooth.bms_sample import reading_of
+from bms_estimator.sources.bluetooth.bms_sample import convert_sample
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 SCAN_S = 15.0
@@ -83,7 +83,7 @@ class BleProducer(LineProducer):
             raise SourceUnavailableError(str(error) or type(error).__name__) from None
 
     def _line(self, sample: Mapping[str, object]) -> bytes | None:
-        reading = reading_of(sample)
+        reading = convert_sample(sample)
         if reading is None:
             self._not_measured += 1
             self._fault = "the BMS responds, but reports no voltage or no current"

@@ -76,14 +76,14 @@ class CaptureHeader:
 _VERSIONED, _HEADER = TypeAdapter(_HeaderVersion), TypeAdapter(CaptureHeader)
 
 
-def header_of(sensor: SensorSettings, source: PolledSource | None = None) -> CaptureHeader:
+def make_header(sensor: SensorSettings, source: PolledSource | None = None) -> CaptureHeader:
     """Return the header of a capture, of the serial device or of ``source`` if there is one."""
     if source is not None:
         return CaptureHeader(sensor.protocol, source.described, 0, sensor.current_sign)
     return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign, address=sensor.address)
 
 
-def sensor_of(path: Path) -> SensorSettings:
+def read_sensor_settings(path: Path) -> SensorSettings:
     """Return the board settings of the capture ``path`` that decoding needs.
 
     Raises:

@@ -17,8 +17,8 @@ from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, CurrentSign,
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
-from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, sensor_of
-from bms_estimator.sources.captures.tables import READERS, ColumnTable, Sign, samples_of, table_reader
+from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, read_sensor_settings
+from bms_estimator.sources.captures.tables import READERS, ColumnTable, Sign, convert_table, table_reader
 
 PACED_INTERVAL_S = 0.05
 """Interval at which a paced replay yields due samples [s]."""
@@ -63,7 +63,7 @@ class RawCapture:
     def __init__(
         self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
     ) -> None:
-        recorded = sensor_of(path)
+        recorded = read_sensor_settings(path)
         used = sensor or recorded
         if used.protocol != recorded.protocol:
             raise UserError(
@@ -243,7 +243,7 @@ def load_capture(source: str | Path | ColumnTable, *, current_sign: CurrentSign 
     if current_sign not in (None, *get_args(CurrentSign)):
         raise UserError(f"current_sign = {current_sign!r}: must be one of {', '.join(get_args(CurrentSign))}")
     if not isinstance(source, str | Path):
-        return Columns(samples_of(source, Sign(current_sign)), "capture")
+        return Columns(convert_table(source, Sign(current_sign)), "capture")
     path = Path(source)
     blocks = [block.copy() for block in open_capture(path, current_sign=current_sign)]
     return Columns(np.concatenate(blocks) if blocks else np.zeros(0, dtype=SAMPLE), path.name)

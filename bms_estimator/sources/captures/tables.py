@@ -229,7 +229,7 @@ def table_reader(path: Path, sign: Sign) -> CsvTable | ParquetTable | None:
     return next((reader(path, sign) for suffix, reader in READERS.items() if name.endswith(suffix)), None)
 
 
-def samples_of(table: ColumnTable, sign: Sign) -> SampleBlock:
+def convert_table(table: ColumnTable, sign: Sign) -> SampleBlock:
     """Return the samples of a table in memory.
 
     Raises:

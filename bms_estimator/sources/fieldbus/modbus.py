@@ -13,7 +13,7 @@ from pymodbus.exceptions import ModbusException
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.fieldbus.modbus_registers import Request, Table, plan, reading_of, split, values_of
+from bms_estimator.sources.fieldbus.modbus_registers import Request, Table, decode_reading, list_values, plan, split
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 Client = AsyncModbusSerialClient | AsyncModbusTcpClient
@@ -55,7 +55,7 @@ class ModbusProducer(LineProducer):
 
     def __init__(self, settings: ModbusSource) -> None:
         logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # LineSource logs the reason in one line
-        self._settings, self._values = settings, values_of(settings)
+        self._settings, self._values = settings, list_values(settings)
         self._requests: Sequence[Request] = ()
         self._refused: set[str] = set()
         self._counters = {"refused": 0, "not_measured": 0}
@@ -113,7 +113,7 @@ class ModbusProducer(LineProducer):
 
     def _line(self, words: Mapping[tuple[Table, int], int]) -> bytes | None:
         """Return the line of a sample; None without voltage or current."""
-        reading = reading_of(self._values, words)
+        reading = decode_reading(self._values, words)
         if reading is None:
             self._counters["not_measured"] += 1
             self._fault = "the device responds, but its voltage or current is absent or not a number"

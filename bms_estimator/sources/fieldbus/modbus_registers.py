@@ -49,7 +49,7 @@ class Request(NamedTuple):
         return f"{quantities} ({self.table} register{'s' if last else ''} {self.address}{last})"
 
 
-def values_of(settings: ModbusSource) -> tuple[Value, ...]:
+def list_values(settings: ModbusSource) -> tuple[Value, ...]:
     """Return the values to read from the device."""
     single_registers = {"voltage": settings.voltage, "current": settings.current, "temperature": settings.temperature}
     values = [Value(quantity, register) for quantity, register in single_registers.items() if register is not None]
@@ -101,7 +101,7 @@ def decode(register: Register, words: Words) -> float:
     return math.nan if raw == register.absent or not math.isfinite(value) else round(value, DECIMALS)
 
 
-def reading_of(values: Sequence[Value], words: Words) -> Reading | None:
+def decode_reading(values: Sequence[Value], words: Words) -> Reading | None:
     """Return the reading with the device's sign of current; None without voltage or current."""
     decoded: dict[str, list[float]] = {}
     for quantity, register in values:

@@ -29,7 +29,7 @@ class Channel(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """``in``, ``curr`` or ``temp``."""
+        """``in``, ``curr`` or ``temp``; empty if the name begins with none of them."""
         name = self.path.name.removeprefix("in_") if _is_iio(self.path) else self.path.name
         words = {"in": "in", "voltage": "in", "curr": "curr", "temp": "temp"}
         return next((kind for word, kind in words.items() if name.startswith(word)), "")
@@ -38,8 +38,8 @@ class Channel(NamedTuple):
         """Return the present value [V, A, C].
 
         Raises:
-            OSError: It cannot be read now.
-            NotANumberError: It is no number.
+            OSError: The file cannot be read now.
+            NotANumberError: The content of its file is not a number.
         """
         if not _is_iio(self.path):
             return 1e-3 * read_number(self.path)
@@ -52,8 +52,8 @@ def read_number(path: Path) -> float:
     """Read the number in a sysfs file.
 
     Raises:
-        OSError: It cannot be read now.
-        NotANumberError: It is not a number.
+        OSError: The file cannot be read now.
+        NotANumberError: The content of the file is not a number.
     """
     with path.open("rb") as file:
         text = file.read(MAX_BYTES)
@@ -124,7 +124,7 @@ def _chips(root: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _bus_address(chip: Path) -> str:
-    """Return the bus address of a chip: the name of the device's folder, which contains the folder of the driver's class."""
+    """Return the bus address of a chip, e.g. ``1-0040`` for ``.../1-0040/hwmon/hwmon3`` or ``.../1-0040/iio:device0``."""
     folder = chip.resolve().parent
     return folder.parent.name if folder.name == "hwmon" else folder.name
 

@@ -59,7 +59,11 @@ class MqttProducer(LineProducer):
         self._conflicting = False
         self._lost: Counter[str] = Counter({"too_long": 0, "overflow": 0})
         self._options = ConnectOptions(
-            f"bms-source-{secrets.token_hex(4)}", None, self._count_lost, MAX_QUEUED_MESSAGES, MAX_BYTES
+            f"bms-source-{secrets.token_hex(4)}",
+            will=None,
+            on_message_lost=self._count_lost,
+            max_waiting=MAX_QUEUED_MESSAGES,
+            max_bytes=MAX_BYTES,
         )
 
     @property
@@ -86,7 +90,9 @@ class MqttProducer(LineProducer):
         self._broker = next(self._brokers)
         try:
             async with self._connect(self._broker, self._options) as connection:
-                for topic, reason in (await connection.subscribe(None, self._assembler.topics)).items():
+                # without retain-as-published, live messages arrive unmarked even if their publisher retains them
+                rejections = await connection.subscribe(requests=None, others=self._assembler.topics)
+                for topic, reason in rejections.items():
                     raise SourceUnavailableError(f"not allowed to read {topic}: {reason}")
                 yield CONNECTED
                 async for line in self._lines(connection):
@@ -96,12 +102,13 @@ class MqttProducer(LineProducer):
 
     async def _lines(self, connection: Connection) -> AsyncGenerator[bytes, None]:
         """Yield the lines of a connection; raises ``BrokerConnectionError`` when it is lost."""
+        poll_messages = self._settings.ask  # payloads by topic
         receiving: asyncio.Future[ReceivedMessage] | None = None
         poll_sent_s = -float("inf")
         try:
             while True:
                 now_s = self._monotonic()
-                if self._settings.ask and now_s - poll_sent_s >= self._settings.ask_s:
+                if poll_messages and now_s - poll_sent_s >= self._settings.ask_s:
                     poll_sent_s = now_s
                     await self._poll(connection)
                 receiving = receiving or asyncio.ensure_future(connection.receive())
@@ -131,7 +138,7 @@ class MqttProducer(LineProducer):
                 raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.reason}")
 
     def _log_conflict(self) -> None:
-        """Log the begin and the end of a conflict between two publishers."""
+        """Log the beginning and the end of a conflict between two publishers."""
         conflict = self._assembler.conflict
         if bool(conflict) == self._conflicting:
             return
@@ -152,7 +159,7 @@ def producer(settings: Settings) -> MqttProducer:
         UserError: No broker is configured, or its URL or credentials are not valid.
     """
     source = settings.source
-    assert isinstance(source, MqttSource)  # noqa: S101 - as KINDS has it
+    assert isinstance(source, MqttSource)  # noqa: S101 - KINDS maps kind = "mqtt" to MqttSource
     if source.broker is not None:
         return MqttProducer(source, source.broker)
     if settings.mqtt is None:

@@ -22,21 +22,24 @@ MAX_INTERVAL_DEVIATION = 0.1
 MIN_RETURN_FRACTION = 0.75
 """Minimum fraction of jumps that return to the previous value. A load that varies at random has fewer."""
 MIN_REPEAT_FRACTION = 0.25
-"""Minimum fraction of messages without a jump. It shows that a publisher does not publish changes only."""
+"""Minimum fraction of messages without a jump. With fewer, one publisher may be sending only changes."""
 MAX_SPREAD = 0.5
 """Largest interquartile range of a publisher's intervals, as a fraction of their median."""
 MIN_JUMPS = {"voltage": 0.01, "current": 0.2}
-"""Minimum difference between the values of two publishers, as a fraction of the larger value, by quantity."""
+"""Minimum jump between two messages, as a fraction of the larger value, by quantity. Smaller changes count as repeats."""
 SAME_FRACTION = 0.2
 """Two values belong to one publisher if they differ by less than this fraction of the jump between the two publishers."""
 
 
 class _Message(NamedTuple):
-    """A message.
+    """A received message.
 
     Attributes:
-        is_back: The value jumped back to the value before the last jump.
-        is_quick: It arrived sooner than one publisher would publish.
+        value: Value of the quantity.
+        at_s: Arrival time on a monotonic clock [s].
+        is_jump: True if the value differs from the previous message's by more than the minimum jump.
+        is_back: True if the value jumped back to the value before the last jump.
+        is_quick: True if the message arrived sooner than one publisher would publish.
     """
 
     value: float
@@ -50,9 +53,9 @@ class PublisherConflict:
     """Detects a second publisher of one quantity on one topic.
 
     Two publishers with different values make the value jump back and forth, and one of the two jumps arrives sooner
-    than one publisher would publish. A load that switches on and off jumps, too, but in step with its publisher. If the
-    publisher sends changes only, such a load can look like two publishers. Therefore values must also repeat, or the
-    jumps must be regular.
+    than one publisher would publish. A load that switches on and off also makes the value jump, but each jump arrives at
+    its publisher's usual interval. If the publisher sends only changes, such a load can look like two publishers.
+    Therefore values must also repeat, or the jumps must be regular.
 
     Args:
         min_jump: Minimum difference between the values of two publishers, as a fraction of the larger value.
@@ -75,8 +78,9 @@ class PublisherConflict:
         if self._messages and self._is_jump(self._messages[-1].value, value):
             before, levels = self._messages[-1], self._levels
             self._levels = before.value, value
-            is_back = levels is not None and _is_back(levels, value)
-            message = _Message(value, now_s, True, is_back, self._is_quick(now_s - before.at_s))
+            is_back = levels is not None and _is_near(value, levels[0], other=levels[1])
+            is_quick = self._is_quick(now_s - before.at_s)
+            message = _Message(value, now_s, is_jump=True, is_back=is_back, is_quick=is_quick)
         self._messages.append(message)
         return self._has_two_publishers
 
@@ -95,24 +99,24 @@ class PublisherConflict:
         return repeats >= MIN_REPEAT_FRACTION * len(self._messages) or self._jumps_are_regular(jumps)
 
     def _quick_returns(self) -> int:
-        """Count quick returns to the more frequent value that arrive on the regular schedule of its publisher.
+        """Count the intervals of the more frequent value that have its usual length and contain a quick return.
 
-        A single publisher that also sends changes returns to its value between two regular messages instead.
+        With two publishers, the more frequent value keeps its regular interval, and the other publisher's messages fall
+        into some of these intervals. A single publisher that also sends each change returns to the value between two
+        regular messages, so that the interval is shorter than usual.
         """
         messages, levels = list(self._messages), self._levels
         if levels is None:
             return 0
-        frequent = max(
-            (
-                [i for i, each in enumerate(messages) if _is_back((level, other), each.value)]
-                for level, other in (levels, levels[::-1])
-            ),
-            key=len,
-        )
+        indices_by_level = [
+            [i for i, message in enumerate(messages) if _is_near(message.value, level, other=other)]
+            for level, other in (levels, levels[::-1])
+        ]
+        frequent = max(indices_by_level, key=len)
         pairs = list(itertools.pairwise(frequent))
         usual_s = median([messages[j].at_s - messages[i].at_s for i, j in pairs] or [0.0])
         return sum(
-            any(each.is_back and each.is_quick for each in messages[i + 1 : j + 1])
+            any(message.is_back and message.is_quick for message in messages[i + 1 : j + 1])
             and abs(messages[j].at_s - messages[i].at_s - usual_s) < MAX_INTERVAL_DEVIATION * usual_s
             for i, j in pairs
         )
@@ -143,7 +147,6 @@ def _intervals_s(messages: Sequence[_Message]) -> list[float]:
     return [after.at_s - before.at_s for before, after in itertools.pairwise(messages)]
 
 
-def _is_back(levels: tuple[float, float], value: float) -> bool:
-    """Return True if a value is close to the value before the last jump."""
-    before, after = levels
-    return abs(value - before) < SAME_FRACTION * abs(after - before)
+def _is_near(value: float, level: float, *, other: float) -> bool:
+    """Return True if a value differs from ``level`` by less than ``SAME_FRACTION`` of its distance to ``other``."""
+    return abs(value - level) < SAME_FRACTION * abs(other - level)

@@ -102,9 +102,9 @@ class SampleAssembler:
             return "; ".join(errors)
         if not self._values:
             retained = " but retained messages" if self._counters["retained"] else ""
-            return f"no message on {', '.join(dict.fromkeys(self._topics_of(*NEEDED)))}{retained}"
+            return f"no message on {', '.join(dict.fromkeys(self._find_topics(*NEEDED)))}{retained}"
         absent = [name for name in NEEDED if name not in self._values]
-        return f"{absent[0]}: no message on {', '.join(self._topics_of(absent[0]))}" if absent else None
+        return f"{absent[0]}: no message on {', '.join(self._find_topics(absent[0]))}" if absent else None
 
     def wait_s(self, now_s: float) -> float | None:
         """Return the time until a sample is complete without a further message [s]; None if one is needed."""
@@ -201,7 +201,7 @@ class SampleAssembler:
         """Count a sample that lacks voltage or current."""
         self._counters["stale"] += 1
         if name in self._values:
-            topics = ", ".join(self._topics_of(name))
+            topics = ", ".join(self._find_topics(name))
             self._faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.max_age_s:g} s")
 
     def _value(self, name: str, now_s: float, max_age_s: float) -> float | None:
@@ -215,7 +215,7 @@ class SampleAssembler:
         fresh = {cell: stored.value for cell, stored in self._cells.items() if now_s - stored.at_s <= max_age_s}
         return [fresh.get(cell, math.nan) for cell in range(1, max(fresh, default=0) + 1)]
 
-    def _topics_of(self, *quantities: str) -> list[str]:
+    def _find_topics(self, *quantities: str) -> list[str]:
         return [binding.topic for binding in self._bindings if binding.quantity in quantities]
 
 

@@ -1,6 +1,6 @@
 """Check that the board on the port is the pack's: the configured one, the stored one, or the first one of this run.
 
-Another board has another divider. Its voltages would be wrong by several percent, and nothing else would show it.
+Another board has another voltage divider. Its voltages would be wrong by several percent without any other symptom.
 """
 
 import math
@@ -15,7 +15,7 @@ from bms_estimator.sources.serial.known_board_file import NO_BOARD, STORED_FIELD
 from bms_estimator.sources.source import Chunk
 
 MAX_PENDING_READS = 4096
-"""Maximum number of pending chunks of a board whose serial number is not known yet: at least seconds of data."""
+"""Maximum number of pending chunks of a board whose serial number is still unknown. They hold at least several seconds of data."""
 STORE_RETRY_S = 60.0
 """Minimum interval between two attempts to store the board [s]."""
 
@@ -46,8 +46,8 @@ class BoardCheck:
         self.pending_protocol: DeviceProtocol | None = None
         """Decoder of the pending chunks; None if no chunks are pending."""
         self._pending = deque[Chunk]()
-        self.unadmitted_bytes = 0
-        """Number of rejected bytes: of other boards, of ports lost before their board was known, and of chunks beyond the limit."""
+        self.rejected_bytes = 0
+        """Number of bytes of other boards, of ports that were lost before their board was known, and of surplus pending chunks."""
 
     @property
     def serial(self) -> str:
@@ -55,14 +55,14 @@ class BoardCheck:
         return self._configured or self._known.get("serial", "")
 
     def on_port_opened(self) -> None:
-        """Reset after the port was opened; its board is unknown again."""
+        """Reset after the port was opened. The board on the port is unknown again."""
         self.pending_protocol = self._make_decoder() if self.serial else None
         self._refused = False
         self._drop(self._pending)
         self._pending.clear()
 
     def reload_known_board(self) -> None:
-        """Start to check in a thread if a user has accepted another board. A missing file is no acceptance."""
+        """Start a thread that checks if a user has accepted another board. A missing file does not count as acceptance."""
         if self._memory and not self._is_reloading:
             self._is_reloading = True
             Thread(target=self._reload, args=(self._memory,), daemon=True).start()
@@ -129,7 +129,7 @@ class BoardCheck:
             log.info("this is the pack's board from now on", **self._known)
 
     def _store_board(self, now_s: float) -> None:
-        """Start to store the board in a thread, unless one runs or the last attempt was less than a minute ago."""
+        """Start a thread that stores the board, unless one is running or the last attempt is less than ``STORE_RETRY_S`` ago."""
         if self._memory is None or self._is_storing or now_s - self._store_begun_s < STORE_RETRY_S:
             return
         self._is_storing, self._store_begun_s = True, now_s
@@ -149,13 +149,13 @@ class BoardCheck:
             self._is_storing = False
 
     def _drop(self, chunks: Iterable[Chunk]) -> None:
-        self.unadmitted_bytes += sum(len(data) for _, data in chunks)
+        self.rejected_bytes += sum(len(data) for _, data in chunks)
 
     def _check(self, serial: str, chunks: Sequence[Chunk]) -> None:
         """Compare the serial number of the board that sent ``chunks`` with that of the pack's board.
 
         Raises:
-            OtherBoardError: They differ.
+            OtherBoardError: The serial numbers differ.
         """
         if serial == self.serial:
             return

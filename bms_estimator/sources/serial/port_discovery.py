@@ -1,6 +1,7 @@
 """Choice of the port to open.
 
-It is the configured port. If the serial number of the board is known, all ports with a common USB chip are candidates.
+If the serial number of the board is unknown, only the configured port is opened. If the number is known, all ports with one
+of the usual USB-serial chips are also candidates, because the board may have been moved to another port.
 """
 
 import math
@@ -17,20 +18,20 @@ BUSY_PORT_RETRY_S = 1.0
 
 
 class PortDiscovery:
-    """Choice of the next port to open, in turn.
+    """Chooses the next port to open. Candidates take turns.
 
     Args:
         port: Device path, or ``auto``.
         monotonic: Monotonic clock [s].
 
     Attributes:
-        is_preferred: True if the last chosen port is the configured one; a silent device on it is waited for. Any other port
-            may belong to another device and is closed soon.
+        is_preferred: True if the last chosen port is the configured one. It stays open while its device is silent. Any other
+            port may belong to another device. It is closed when its device is silent.
     """
 
     def __init__(self, port: str, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._port, self._monotonic = port, monotonic
-        self._skipped: dict[str, tuple[float, float]] = {}  # by path: since when and until when
+        self._skipped: dict[str, tuple[float, float]] = {}  # begin and end of the skip by path [s]
         self.is_preferred = True
 
     def next(self, serial: str) -> str:
@@ -51,20 +52,18 @@ class PortDiscovery:
         else:
             configured = [self._port] if os.path.exists(self._port) else []  # noqa: PTH110 - as in ``resolve_port``
         configured_devices = {os.path.realpath(path) for path in configured}
-        candidates, now_s = (
-            configured + [path for path in boards if os.path.realpath(path) not in configured_devices],
-            self._monotonic(),
-        )
+        candidates = configured + [path for path in boards if os.path.realpath(path) not in configured_devices]
+        now_s = self._monotonic()
         if not candidates:
-            resolve_port(self._port)  # reports the reason
+            resolve_port(self._port)  # raises NoPortError with the reason
         self._skipped = {path: times for path, times in self._skipped.items() if path in candidates}
         not_skipped = (-math.inf, -math.inf)
-        due = [path for path in candidates if self._skipped.get(path, not_skipped)[1] <= now_s] or configured
+        due = [path for path in candidates if self._skipped.get(path, not_skipped)[1] <= now_s]
+        due = due or configured  # while all candidates are skipped, the configured port is retried
         if not due:
             raise NoPortError(f"{self._port}: board {serial} was found neither there nor on {', '.join(candidates)}")
-        chosen = min(
-            due, key=lambda path: self._skipped.get(path, not_skipped)[0]
-        )  # the port that was skipped longest ago
+        # the port that was skipped longest ago; a port that was never skipped comes first
+        chosen = min(due, key=lambda path: self._skipped.get(path, not_skipped)[0])
         self.is_preferred = chosen in configured
         return chosen
 

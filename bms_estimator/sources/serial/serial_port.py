@@ -1,4 +1,4 @@
-"""Serial port: opened with pyserial, read by the event loop, and reopened when it is lost. It does not know protocols."""
+"""Serial port that is opened with pyserial, read by the event loop, and reopened when it is lost, for any protocol."""
 
 import asyncio
 import os
@@ -25,8 +25,8 @@ log = structlog.get_logger(__name__)
 class SerialPort:
     """Serial port that queues received bytes with their arrival times.
 
-    Arrival times are the wall clock at start plus the time since on a monotonic clock that includes suspend. They never
-    step.
+    An arrival time is the wall clock at start plus the time since then on a monotonic clock that includes suspend.
+    Arrival times therefore never step.
 
     Args:
         open_next: Opens the port: returns its path, and the port.
@@ -36,8 +36,8 @@ class SerialPort:
         first_retry_s: Delay before a missing or lost port is retried [s].
 
     Attributes:
-        openings: Number of times that it was opened.
-        lost: Event that is set when the port fails, or by the owner to have it closed.
+        openings: Number of openings of the port.
+        lost: Event that is set when the port fails. The owner may also set it to have the port closed.
     """
 
     def __init__(
@@ -75,16 +75,15 @@ class SerialPort:
     async def open(self) -> str:
         """Open the port, with retries until it succeeds, and return its path.
 
-        Each attempt waits longer than the one before, until ``confirm`` is called.
+        Each attempt waits longer than the previous one, until ``reset_backoff`` is called.
         """
         while True:
             await asyncio.sleep(self._retry_s)
             self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), MAX_RETRY_S)
             try:
                 path, self._port = self._open_next()
-            except (
-                PortBusyError
-            ) as error:  # its text needs a slow search through /proc, which must not block other packs
+            except PortBusyError as error:
+                # the error's text needs a slow search through /proc, which must not block other packs
                 reason = await asyncio.to_thread(str, error)
             except (NoPortError, OSError) as error:
                 reason = str(error)
@@ -93,12 +92,12 @@ class SerialPort:
             self._report(f"waiting for {reason}")
         self.openings += 1
         self.lost.clear()
-        self._chunks.put_nowait((self.now_s, b""))
+        self._chunks.put_nowait((self.now_s, b""))  # marks the opening of the port
         asyncio.get_running_loop().add_reader(self._port.fileno(), self._read, self._port.fileno())
         return path
 
-    def confirm(self) -> None:
-        """Confirm that the device on the port is the wanted one. If it is lost, the first retry has the minimum delay."""
+    def reset_backoff(self) -> None:
+        """Reset the delay between attempts to open the port to its minimum."""
         self._retry_s = self._first_retry_s
 
     def close(self) -> None:

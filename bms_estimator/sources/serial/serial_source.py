@@ -50,7 +50,8 @@ class SerialSource:
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
-        memory: File of the pack's board, if it has a serial number; None: the board is not stored.
+        memory: File that stores the pack's board. It is used only if the board reports a serial number. None: the board is
+            not stored.
         tap: Receives a copy of each arrival time and chunk that the decoder is fed.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
@@ -73,7 +74,7 @@ class SerialSource:
         slow_s = settings.period_s or 0.0
         self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
         self._monotonic = monotonic
-        make_protocol(settings).feed(0.0, b"\0\n")  # compiles its kernel before bytes arrive
+        make_protocol(settings).feed(0.0, b"\0\n")  # ends a frame, so that numba compiles the decoder now
         self._decoder = make_protocol(settings)
         has_serial_number = settings.protocol == "binary"  # other devices report no serial number
         self._board_check = BoardCheck(
@@ -89,9 +90,9 @@ class SerialSource:
         )
         self._message: str | None = "not opened yet"
         self._openings = 0  # number of openings of the port whose chunks have been read
-        self._rejected = False  # True while the message is the reason why the device was rejected
-        self._path = ""  # of the port that is open
-        self._last_check_s = monotonic()  # last iteration of the task
+        self._rejected = False  # True from the rejection of a device until another message is set
+        self._path = ""  # path of the open port
+        self._last_check_s = monotonic()  # time of the last iteration of the task
         self._block_arrival_s = math.nan  # arrival time of the last block's bytes
         self._faults = FaultLog()
         self._decoded = asyncio.Event()
@@ -103,7 +104,7 @@ class SerialSource:
         """Counters of the decoder, the board check and the tap, and the number of ``reconnects``."""
         counters = {
             **self._decoder.counters,
-            "unadmitted_bytes": self._board_check.unadmitted_bytes,
+            "rejected_bytes": self._board_check.rejected_bytes,
             "reconnects": max(self._port.openings - 1, 0),
         }
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
@@ -128,7 +129,7 @@ class SerialSource:
         """Rate error of the board's clock relative to the host's [1e-6]; None if unknown."""
         return self._decoder.clock_ppm
 
-    def pulse(self) -> SourceHealth:
+    def health(self) -> SourceHealth:
         """Return the health of the port and its task."""
         now_s = self._port.now_s
         return SourceHealth(
@@ -159,14 +160,14 @@ class SerialSource:
                     self._block_arrival_s = arrival_s
                     if self._message is not None:
                         self._message, self._rejected = None, False
-                        self._port.confirm()
+                        self._port.reset_backoff()
                     yield block
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 
     def _accepted_chunks(self, chunk: Chunk) -> Sequence[Chunk]:
         """Return the chunks to decode now."""
-        if not chunk[1]:
+        if not chunk[1]:  # an empty chunk marks an opening of the port
             self._openings += 1
             self._decoder.on_port_opened()
             self._board_check.on_port_opened()
@@ -245,7 +246,7 @@ class SerialSource:
         except TimeoutError:
             raise UserError(f"the board has not answered within {COMMAND_TIMEOUT_S:.0f} s") from None
         finally:
-            command.done = True
+            command.done = True  # cancels a command without an answer
         if command.refusal:
             raise UserError(command.refusal)
 
@@ -263,9 +264,9 @@ class SerialSource:
             raise
 
     async def _stay_open(self) -> None:
-        """Keep the port open: open it, supervise it until it is lost, and repeat."""
+        """Open the port, supervise it until it is lost, and repeat for ever."""
         while True:
-            if self._rejected:
+            if self._rejected:  # a user may have accepted another board since then
                 self._board_check.reload_known_board()
             path = self._path = await self._port.open()
             try:

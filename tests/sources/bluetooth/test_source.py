@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.bluetooth.bms_sample import reading_of
+from bms_estimator.sources.bluetooth.bms_sample import convert_sample
 from bms_estimator.sources.bluetooth.source import MIN_PYTHON_HEX
 from bms_estimator.sources.factory import open_line_source
 
@@ -40,7 +40,7 @@ JBD = {
 
 
 def test_a_sample_of_aiobmsble_is_a_reading_with_charge_positive() -> None:
-    reading = reading_of(JBD)
+    reading = convert_sample(JBD)
     assert reading is not None
     assert reading[:4] == Reading(15.6, -2.87, 22.133, (3.43, 3.425, 3.432, 3.417))[:4]
     settings = Settings.model_validate({"source": {"kind": "ble", "name": "DP04S007L4S100A"}})
@@ -49,14 +49,14 @@ def test_a_sample_of_aiobmsble_is_a_reading_with_charge_positive() -> None:
 
 def test_temperature_is_the_mean_of_cell_sensors() -> None:
     sensors = [Sensor(18.1, "CELL"), Sensor(18.3, "CELL"), Sensor(31.0, "MOSFET")]
-    reading = reading_of(JBD | {"temp_values": sensors})
+    reading = convert_sample(JBD | {"temp_values": sensors})
     assert reading is not None
     assert reading.temperature_c == pytest.approx(18.2)
 
 
 @pytest.mark.parametrize(("sensors", "mean_c"), [([18.0, 19.0], 18.5), ([], math.nan), ([math.nan, 19.0], 19.0)])
 def test_temperature_without_cell_sensors_and_bms_is_the_mean(sensors: list[float], mean_c: float) -> None:
-    reading = reading_of({"voltage": 13.2, "current": 0, "temp_values": sensors})
+    reading = convert_sample({"voltage": 13.2, "current": 0, "temp_values": sensors})
     assert reading is not None
     assert reading.temperature_c == pytest.approx(mean_c, nan_ok=True)
     assert reading.cells_v == ()
@@ -66,7 +66,7 @@ def test_temperature_without_cell_sensors_and_bms_is_the_mean(sensors: list[floa
     "sample", [{}, {"voltage": 13.2}, {"current": 1.0}, JBD | {"voltage": math.nan}, JBD | {"current": None}]
 )
 def test_without_voltage_or_current_there_is_no_reading(sample: dict[str, object]) -> None:
-    assert reading_of(sample) is None
+    assert convert_sample(sample) is None
 
 
 @pytest.mark.parametrize("told", [{}, {"name": "a", "address": "A4:C1:38:00:11:22"}, {"address": "A4C138001122"}])

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bms_estimator.settings.modbus_source import MAX_WORDS, PROFILES, CellRegisters, ModbusSource, Register
-from bms_estimator.sources.fieldbus.modbus_registers import GAP_WORDS, Value, decode, plan, reading_of, split, values_of
+from bms_estimator.sources.fieldbus.modbus_registers import (
+    GAP_WORDS,
+    Value,
+    decode,
+    decode_reading,
+    list_values,
+    plan,
+    split,
+)
 
 FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
 RANGES = {
@@ -59,15 +67,15 @@ def test_requests_cover_every_register_once_within_the_maximum_length(wanted: li
 
 
 def test_a_known_device_is_asked_in_as_few_requests_as_possible() -> None:
-    (request,) = plan(values_of(source(profile="victron-gx")))
+    (request,) = plan(list_values(source(profile="victron-gx")))
     assert (request.table, request.address, request.words) == ("holding", 259, 4)
     assert request.described == "source.voltage, source.current, source.temperature (holding registers 259 to 262)"
-    seplos = plan(values_of(source(profile="seplos-v3")))
+    seplos = plan(list_values(source(profile="seplos-v3")))
     assert [(r.table, r.address, r.words) for r in seplos] == [("input", 0x1000, 10), ("input", 0x1100, 16)]
 
 
 def test_a_refused_request_is_split_by_quantity_and_without_gaps() -> None:
-    (request,) = plan(values_of(source(profile="victron-gx")))
+    (request,) = plan(list_values(source(profile="victron-gx")))
     assert [(r.address, r.words) for r in split(request)] == [(259, 1), (261, 1), (262, 1)]
     (alone,) = split(split(request)[0])
     assert split(alone) == (alone,)
@@ -78,10 +86,10 @@ def test_readings_of_known_devices() -> None:
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
     assert victron.sensor == {"current_sign": "charge_positive", **steps}
     told = words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
-    assert reading_of(values_of(victron), told) == (52.34, -12.3, -2.5, (), pytest.approx(math.nan, nan_ok=True))
+    assert decode_reading(list_values(victron), told) == (52.34, -12.3, -2.5, (), pytest.approx(math.nan, nan_ok=True))
     seplos = source(profile="seplos-v3")
     held = {0x1000: 5320, 0x1001: 0xFF38, 0x1009: 2961} | {0x1100 + i: 3325 + i for i in range(16)}
-    reading = reading_of(values_of(seplos), {("input", address): word for address, word in held.items()})
+    reading = decode_reading(list_values(seplos), {("input", address): word for address, word in held.items()})
     assert reading is not None
     assert reading[:3] == (53.2, -2.0, 22.95)
     assert reading.cells_v == tuple(round(3.325 + i / 1000, 3) for i in range(16))
@@ -92,11 +100,11 @@ def test_a_float_that_is_no_number_is_not_measured(raw: float) -> None:
     register = {"address": 0, "type": "float32"}
     given = source(voltage=register, current=register | {"address": 2}, temperature=register | {"address": 4})
     held = words(13.0, "float32") | words(1.5, "float32", address=2) | words(raw, "float32", address=4)
-    reading = reading_of(values_of(given), held)
+    reading = decode_reading(list_values(given), held)
     assert reading is not None
     assert math.isnan(reading.temperature_c)
-    assert reading_of(values_of(given), held | words(raw, "float32")) is None
-    assert reading_of(values_of(given), held | words(raw, "float32", address=2)) is None
+    assert decode_reading(list_values(given), held | words(raw, "float32")) is None
+    assert decode_reading(list_values(given), held | words(raw, "float32", address=2)) is None
 
 
 def test_infinite_value_is_not_measured() -> None:
@@ -112,12 +120,12 @@ def test_absent_value_is_not_measured() -> None:
         cells={"address": 3, "count": 2, "absent": 0, "scale": 0.001},
     )
     held = {("holding", i): word for i, word in enumerate([1300, 0xFFFF, 32767, 3300, 0])}
-    reading = reading_of(values_of(given), held)
+    reading = decode_reading(list_values(given), held)
     assert reading is not None
     assert (reading.current_a, reading.cells_v[0]) == (-1.0, 3.3)
     assert math.isnan(reading.temperature_c)
     assert math.isnan(reading.cells_v[1])
-    none = reading_of(values_of(given), held | {("holding", 3): 0})
+    none = decode_reading(list_values(given), held | {("holding", 3): 0})
     assert none is not None
     assert none.cells_v == ()
 
@@ -170,7 +178,7 @@ def test_what_a_gx_device_does_not_measure_reads_0_and_is_no_reading(
 ) -> None:
     voltage, current, temperature = registers
     read = words(voltage, "uint16", address=259) | words(current, "int16", address=261)
-    reading = reading_of(values_of(source(profile="victron-gx")), read | words(temperature, "int16", address=262))
+    reading = decode_reading(list_values(source(profile="victron-gx")), read | words(temperature, "int16", address=262))
     assert (reading is None) is (measured is None)
     if reading is not None and measured is not None:
         warm_c = None if math.isnan(reading.temperature_c) else reading.temperature_c

@@ -145,7 +145,7 @@ def test_rejected_board_is_blocked_until_the_port_is_reopened() -> None:
         door.accept((BEGIN_S, other.hello()), dialect)
     frame = other.frames(1)[0]
     assert door.accept((BEGIN_S, frame), dialect) == ()
-    assert door.unadmitted_bytes == len(other.hello() + frame)
+    assert door.rejected_bytes == len(other.hello() + frame)
     door.on_port_opened()
     assert len(door.accept((BEGIN_S, own.hello()), dialect)) == 1
 
@@ -157,9 +157,9 @@ def test_each_pending_byte_is_passed_once_or_counted() -> None:
     door.on_port_opened()
     assert not any(door.accept(read, dialect) for read in reads[:7])
     door.on_port_opened()  # the port was lost
-    assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7])
+    assert door.rejected_bytes == sum(len(data) for _, data in reads[:7])
     assert not any(door.accept(read, dialect) for read in reads)
     hello = BEGIN_S, board.hello()
     assert door.accept(hello, dialect) == [*reads[6:], hello]
     door.on_port_opened()
-    assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])
+    assert door.rejected_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])
