@@ -62,7 +62,7 @@ class BlockStore:
         self._run_id = secrets.token_hex(8)
         self._put_count, self._waiting = 0, deque[tuple[int, ReadyBlock]]()  # the latter are not on disk yet
         self._on_disk: StoreResult | None = None  # None before the first transaction
-        self._synced_opening = 0  # value of database.opened at the last transaction
+        self._open_count_at_sync = 0  # value of database.open_count at the last transaction
         self._first_unconfirmed, self._after_s = 1, 0
         self._cursor, self._unacknowledged = 1, set[int]()
         self._last_resend = (0, -math.inf)  # block number and time
@@ -154,7 +154,7 @@ class BlockStore:
                 self._unacknowledged |= {number for number, _ in page.blocks}
                 return [QueuedMessage(number, self._message(number, data)) for number, data in page.blocks]
 
-    def sent(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Record that the broker has acknowledged a block. It stays stored, because the server may still lose it."""
         self._unacknowledged.discard(number)
 
@@ -217,7 +217,7 @@ class BlockStore:
     async def _sync(self) -> bool:
         """Synchronize memory and disk. Return False if the disk failed."""
         put = list(self._waiting)
-        recount = self._on_disk is None or self._synced_opening != self._database.opened
+        recount = self._on_disk is None or self._open_count_at_sync != self._database.open_count
         known_s = self._on_disk.kept.made_s if self._on_disk else 0
         transaction = StoreTransaction(
             self._run_id, put, self._first_unconfirmed, known_s, self._after_s, self._most_bytes, self._wall(), recount
@@ -226,7 +226,7 @@ class BlockStore:
             result = await self._database.call(transaction)
         except StoreError:
             return False
-        self._synced_opening = self._database.opened
+        self._open_count_at_sync = self._database.open_count
         while self._waiting and put and self._waiting[0][0] <= put[-1][0]:
             self._waiting.popleft()
         self._apply_result(result)

@@ -34,7 +34,7 @@ class MessageQueue(Protocol):
     async def take(self, most: int) -> Sequence[QueuedMessage]:
         """Wait for a message, then return up to ``most`` of the oldest that were not returned since ``rewind``."""
 
-    def sent(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Record that the broker has acknowledged a message."""
 
     def rewind(self) -> None:
@@ -120,7 +120,7 @@ class QueueSender:
         if rejection is not None and rejection.is_retryable:
             return False
         self._rejected += rejection is not None
-        self._outbox.sent(queued.number)
+        self._outbox.acknowledge(queued.number)
         self._update_stats()
         self._acknowledged.set()
         return True

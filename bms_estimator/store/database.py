@@ -111,9 +111,9 @@ class Database:
         return True
 
     @property
-    def opened(self) -> int:
+    def open_count(self) -> int:
         """Number of times that the file was opened. A new opening may have found an empty file."""
-        return self._file.opened
+        return self._file.open_count
 
     async def call(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run ``work`` in a transaction.
@@ -159,7 +159,7 @@ class _File:
         self._inode = (0, 0)
         self._ready = False  # the schema was checked
         self._synced_s = 0.0
-        self.opened = 0
+        self.open_count = 0
 
     def run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run one transaction, in a new file if the existing one is unusable."""
@@ -222,7 +222,7 @@ class _File:
         self._connection.text_factory = lambda raw: raw.decode(errors="surrogateescape")  # a damaged row must not fail
         self._prepare(self._connection)
         self._ready = True
-        self.opened += 1
+        self.open_count += 1
         return self._connection
 
     def _prepare(self, connection: sqlite3.Connection) -> None:

@@ -39,7 +39,7 @@ class Outbox:
         self._backlog_read = database is None
         self._offset: int | None = None  # from queue numbers to those on disk; None until the backlog was read
         self._next_numbers: deque[int] = deque(maxlen=BEHIND_INTERVALS)  # the queue's next number, at each interval
-        self._synced_opening = 0  # value of database.opened at the last synchronization of memory and disk
+        self._open_count_at_sync = 0  # value of database.open_count at the last synchronization of memory and disk
         self._filled, self._sync_requested = asyncio.Event(), asyncio.Event()
         self._closing = False
         self._task: asyncio.Task[None] | None = None
@@ -87,9 +87,9 @@ class Outbox:
             self._sync_requested.set()
         return taken
 
-    def sent(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Record that the broker has acknowledged a message."""
-        self._queue.sent(number)
+        self._queue.acknowledge(number)
 
     def rewind(self) -> None:
         """Make ``take`` return all unacknowledged messages again, in order, after a lost connection."""
@@ -133,13 +133,13 @@ class Outbox:
                 backlog = await self._database.call(read_backlog)
                 self._offset = queue.prepend_backlog(backlog.runs)
                 queue.dropped += backlog.damaged
-                self._synced_opening = self._database.opened
+                self._open_count_at_sync = self._database.open_count
             transaction = self._transaction(self._offset, write=write)
             if transaction:
                 queue.mark_writing(transaction.rows)
                 self._apply_result(await self._database.call(transaction))
-            queue.disk_state_known, queue.skip_disk = self._synced_opening == self._database.opened, False
-            self._synced_opening = self._database.opened
+            queue.disk_state_known, queue.skip_disk = self._open_count_at_sync == self._database.open_count, False
+            self._open_count_at_sync = self._database.open_count
         except StoreError:
             queue.disk_state_known, queue.skip_disk = False, True
         self._backlog_read = True

@@ -88,7 +88,7 @@ class OutboxQueue:
         self.in_flight |= {waiting.number: waiting for waiting in taken}
         return taken
 
-    def sent(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Record that a message is acknowledged."""
         if self.in_flight.pop(number, None):
             self._forget(number)

@@ -91,7 +91,7 @@ async def test_restart_continues_store_numbers_and_time_and_sends_unconfirmed_bl
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(6))
         for block in await take(store, 6):
-            store.sent(block.number)
+            store.acknowledge(block.number)
         store.on_request(BlockRequest(store=int(WALL_S) * NS, number=4, resend=False))
         assert (store.waiting, store.kept) == (0, 3)
     async with opened(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
@@ -127,7 +127,7 @@ async def test_unacknowledged_blocks_are_taken_again_after_a_rewind(tmp_path: Pa
         await written(store, *minutes(6))
         await take(store, 5)
         for number in (1, 2, 4):
-            store.sent(number)
+            store.acknowledge(number)
         store.rewind()
         assert numbers(await take(store, 4)) == [3, 4, 5, 6]
 

@@ -5,13 +5,15 @@ from collections.abc import AsyncGenerator
 
 from nats.aio.client import Client
 
-from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, Stored, StreamError, read_stream
+from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StoredMessage, StreamError, read_stream
 
 POLL_S = 0.1
 """Poll interval while a node lacks data that another one has [s]."""
 
 
-async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -> AsyncGenerator[Stored, None]:
+async def read_messages(
+    nc: Client, stream: str, subject: str, first: int, last: int
+) -> AsyncGenerator[StoredMessage, None]:
     """Yield all messages between two sequence numbers, in order.
 
     The node that responds may lag behind the stream's leader. Therefore it is polled until it has the message ``last``.

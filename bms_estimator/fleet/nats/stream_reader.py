@@ -20,7 +20,7 @@ RESPONSE_TIMEOUT_S = 10.0
 _END_OF_BATCH, _NO_MESSAGES = "204", "404"
 
 
-class Stored(NamedTuple):
+class StoredMessage(NamedTuple):
     """A message of a stream."""
 
     subject: str
@@ -35,7 +35,7 @@ class StreamError(Exception):
 
 async def read_stream(
     nc: Client, stream: str, subject: str, *, first: int = 1, since_s: float | None = None
-) -> AsyncIterator[list[Stored]]:
+) -> AsyncIterator[list[StoredMessage]]:
     """Yield batches of messages in the order of the stream, up to its last message.
 
     Args:
@@ -60,7 +60,7 @@ async def read_stream(
         start = {"seq": batch[-1].sequence + 1}
 
 
-async def _batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[list[Stored], bool]:
+async def _batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[list[StoredMessage], bool]:
     """Return one batch; True if the stream has further messages."""
     inbox = nc.new_inbox()
     responses = await nc.subscribe(inbox, pending_msgs_limit=-1, pending_bytes_limit=-1)
@@ -72,8 +72,8 @@ async def _batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[l
         await responses.unsubscribe()
 
 
-async def _collect(responses: Subscription, stream: str) -> tuple[list[Stored], bool]:
-    batch = list[Stored]()
+async def _collect(responses: Subscription, stream: str) -> tuple[list[StoredMessage], bool]:
+    batch = list[StoredMessage]()
     while True:
         try:
             message = await responses.next_msg(timeout=RESPONSE_TIMEOUT_S)
@@ -83,7 +83,7 @@ async def _collect(responses: Subscription, stream: str) -> tuple[list[Stored], 
         status = headers.get("Status")
         if status is None:
             subject, sequence = headers["Nats-Subject"], int(headers["Nats-Sequence"])
-            batch.append(Stored(subject, sequence, message.data, headers))
+            batch.append(StoredMessage(subject, sequence, message.data, headers))
         elif status in (_END_OF_BATCH, _NO_MESSAGES):
             return batch, bool(batch) and int(headers.get("Nats-Num-Pending", 0)) > 0
         else:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, known_cells, model_key, model_of, stored
+from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, encode_row, known_cells, model_key, model_of
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import DEVICE_NAME
 
@@ -150,7 +150,7 @@ class _Reader:
                 column: value for column, value in zip(columns, values, strict=True) if value and column != "pack"
             }
             kind = self._kind(filled)
-            self._kinds[key] = kind, stored(kind)
+            self._kinds[key] = kind, encode_row(kind)
         return name, *self._kinds[key]
 
     def _kind(self, filled: Mapping[str, str]) -> PackSpec:

@@ -11,7 +11,7 @@ from nats.aio.client import Client
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, Stored, StreamError, read_stream
+from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StoredMessage, StreamError, read_stream
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 
 POLL_S = 1.0
@@ -165,7 +165,7 @@ async def put(
         raise StreamError(f"the server does not store rows of {bucket}: {error}") from None
 
 
-def _entry(bucket: str, message: Stored) -> tuple[str, bytes | None]:
+def _entry(bucket: str, message: StoredMessage) -> tuple[str, bytes | None]:
     """Return key and value of a message; the value None means that the key was removed."""
     is_removed = message.headers.get("KV-Operation") in _REMOVING_OPERATIONS or "Nats-Marker-Reason" in message.headers
     return message.subject.removeprefix(_key(bucket, "")), None if is_removed else message.data

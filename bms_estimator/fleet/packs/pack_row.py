@@ -71,7 +71,7 @@ COLUMNS = ("pack", *PackSpec.model_fields)
 """Columns of a table in written order."""
 
 
-def stored(kind: PackSpec) -> bytes:
+def encode_row(kind: PackSpec) -> bytes:
     """Encode a pack's row for the server; equal values give equal bytes."""
     return kind.model_dump_json(exclude_defaults=True).encode()
 

@@ -22,7 +22,7 @@ from nats.js.errors import NotFoundError
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.stored_messages import stored
+from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
@@ -331,7 +331,7 @@ class PartitionLease:
             return
         latest: dict[str, BlockResult] = {}
         subject = subjects.kept(self.number)
-        messages = stored(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
+        messages = read_messages(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
         async with aclosing(messages):
             async for message in messages:
                 pack = message.subject.rpartition(".")[2]
