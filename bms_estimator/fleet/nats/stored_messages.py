@@ -1,4 +1,4 @@
-"""Messages of a stream on a subject, between two sequence numbers."""
+"""Reader of a stream's messages on a subject, between two sequence numbers."""
 
 import asyncio
 from collections.abc import AsyncGenerator
@@ -8,7 +8,7 @@ from nats.aio.client import Client
 from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StoredMessage, StreamError, read_stream
 
 POLL_S = 0.1
-"""Poll interval while a node lacks data that another one has [s]."""
+"""Poll interval while the responding node lags behind the stream's leader [s]."""
 
 
 async def read_messages(
@@ -38,6 +38,6 @@ async def read_messages(
             if first > last:
                 return
         if (await nc.jetstream().stream_info(stream)).state.first_seq > last:
-            return  # the stream has meanwhile dropped the messages
+            return  # the stream has dropped the messages meanwhile
         await asyncio.sleep(POLL_S)
     raise StreamError(f"the server has lost message {last} of {stream}, or the responding node lags far behind")

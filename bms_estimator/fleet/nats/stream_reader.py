@@ -1,6 +1,6 @@
-"""Messages of a stream, read in batches from a sequence number on, without a consumer on the server.
+"""Reader of a stream's messages in batches from a sequence number on, without a consumer on the server.
 
-It uses batched direct gets (https://github.com/nats-io/nats-architecture-and-design, ADR-31), which nats-py does not
+The reader uses batched direct gets (https://github.com/nats-io/nats-architecture-and-design, ADR-31), which nats-py does not
 support. Each request is independent, so that reading continues after a restart of the server.
 """
 
@@ -13,15 +13,17 @@ from nats.aio.client import Client
 from nats.aio.subscription import Subscription
 from nats.errors import TimeoutError as NatsTimeoutError
 
-BATCH, BATCH_BYTES = 1000, 8 << 20
-"""Maximum number and size of messages in one response, so that other users of the connection do not wait long."""
+BATCH_MESSAGES = 1000
+"""Maximum number of messages in one response, so that other users of the connection do not wait long."""
+BATCH_BYTES = 8 << 20
+"""Maximum size of one response [bytes], so that other users of the connection do not wait long."""
 RESPONSE_TIMEOUT_S = 10.0
-"""Timeout of one message of a response [s]."""
-_END_OF_BATCH, _NO_MESSAGES = "204", "404"
+"""Timeout of each message of a response [s]."""
+_END_OF_BATCH, _NO_MESSAGES = "204", "404"  # values of the header Status
 
 
 class StoredMessage(NamedTuple):
-    """A message of a stream."""
+    """Message of a stream."""
 
     subject: str
     sequence: int
@@ -61,11 +63,11 @@ async def read_stream(
 
 
 async def _batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[list[StoredMessage], bool]:
-    """Return one batch; True if the stream has further messages."""
+    """Return one batch, and True if the stream has further messages."""
     inbox = nc.new_inbox()
     responses = await nc.subscribe(inbox, pending_msgs_limit=-1, pending_bytes_limit=-1)
     try:
-        data = json.dumps(request | {"batch": BATCH, "max_bytes": BATCH_BYTES}).encode()
+        data = json.dumps(request | {"batch": BATCH_MESSAGES, "max_bytes": BATCH_BYTES}).encode()
         await nc.publish(f"$JS.API.DIRECT.GET.{stream}", data, reply=inbox)
         return await _collect(responses, stream)
     finally:

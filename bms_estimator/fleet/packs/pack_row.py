@@ -77,7 +77,7 @@ def encode_row(kind: PackSpec) -> bytes:
 
 
 def kind_of(data: bytes) -> PackSpec:
-    """Decode a row encoded by ``stored``.
+    """Decode a row encoded by ``encode_row``.
 
     Raises:
         ValueError: The bytes are not a row; the message gives the reason.
