@@ -78,7 +78,7 @@ class CellRegisters(Register):
         return first.model_copy(update={"address": self.address + number * (self.step or self.words)})
 
     @model_validator(mode="after")
-    def _in_range(self) -> Self:
+    def _check_last_address(self) -> Self:
         if self.cell(self.count - 1).address + self.words > 0x10000:
             raise ValueError("count: the last cell lies beyond the last register, 65535")
         return self

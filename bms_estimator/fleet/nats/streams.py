@@ -171,7 +171,7 @@ async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
     name = consumer(partition)
     config = {
         "durable_name": name,
-        "filter_subject": subjects.kept(partition),
+        "filter_subject": subjects.stored_raw(partition),
         "ack_policy": "none",
         "priority_groups": [GROUP],
         "priority_policy": "pinned_client",
