@@ -1,7 +1,7 @@
-"""Checkpoint files: the estimator's state on disk, restored only if it is valid and belongs to the same pack.
+"""Checkpoint files with the estimator's state. A state is restored only if it is valid and belongs to the pack.
 
-Each ``pack_identity`` has its own file with named fields. Edited settings and versions with other fields therefore lose
-nothing.
+Each ``pack_identity`` has its own file with named fields. Therefore no state is lost if settings are edited or a version
+with other fields is installed.
 """
 
 import io
@@ -31,11 +31,12 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import new_totals
 
 FORMAT = 7
-"""Version of the file's layout. Raise it when a field changes its meaning, and migrate files of the previous version."""
+"""Version of the file's layout. Increment it when a field changes its meaning, and migrate files of the previous
+version."""
 DAY_S = 86400.0
 """Length of a day [s]."""
 MAX_FILE_BYTES = 1 << 20
-"""Maximum size of a checkpoint file [bytes]; usual files have about 100 kB."""
+"""Maximum size of a checkpoint file [bytes]. A normal file has about 100 kB."""
 MAX_FILES = 8
 """Maximum number of checkpoint files of one pack; older ones are deleted."""
 REJECTED = "refused: "
@@ -45,7 +46,7 @@ MAX_LATER_FILES = 4
 _COUNTER_FIELDS = "restarts", "total", "clean", "alarms"
 """Field names of the run counters in the file."""
 MAX_COUNT = 1e15
-"""Maximum plausible counter: 30,000 years at 1,000 samples a second."""
+"""Maximum plausible value of a counter: the number of samples of 30,000 years at 1,000 a second."""
 
 log = structlog.get_logger(__name__)
 
@@ -74,7 +75,7 @@ class CheckpointContent:
     state: Mapping[str, NDArray[Any]]
     """Fields of ESTIMATOR_STATE by their names, as from ``fields``; empty if the file was rejected."""
     unseen_s: float
-    """Time since the file was saved [s]; infinite if unknown."""
+    """Time since the state was saved [s]; infinite if unknown."""
     counters: RunCounters
     """Counters including this start; zero if the file belongs to another pack or cannot be read."""
     reason: str
@@ -108,7 +109,7 @@ class CheckpointFile:
         """Number of samples and SOC of the last saved state; None before the first save of this run."""
 
     def save(self, state: NDArray[np.void], counters: RunCounters) -> None:
-        """Write the file atomically: after a power cut either the old or the new one exists.
+        """Write the file atomically: after a power cut either the old or the new file exists.
 
         A missing folder is created.
 
@@ -123,7 +124,7 @@ class CheckpointFile:
         self._write(content, counters)
 
     def update_counters(self, counters: RunCounters) -> None:
-        """Update the run counters in the file, if there is one, without changing the state and its save time.
+        """Update the run counters in an existing file without changing the state and its save time.
 
         Raises:
             OSError: The file cannot be written.
@@ -165,11 +166,11 @@ class CheckpointFile:
             )
 
     def quarantine(self) -> str:
-        """Rename a rejected file, so that the next save does not overwrite it. Return a description for people.
+        """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user.
 
-        A file of a later format is valid. It gets a name of its own, so that the later version can use it after a
-        re-upgrade. The user must restore it, because files that this version writes meanwhile are newer, although they
-        may contain less learning.
+        A file of a later format is valid. It gets a separate name, so that the later version can use it after a
+        re-upgrade. The user must restore the file, because this version meanwhile writes newer files, although these may
+        contain less learning.
         """
         quarantined = self.path.with_name(f"{self._name}.refused.npz")
         if self._is_later:
@@ -218,7 +219,7 @@ class CheckpointFile:
         return CheckpointContent(state, unseen_s, counters, "")
 
     def _remove_oldest(self) -> None:
-        """Remove the oldest files of the pack, because each tried cell leaves one."""
+        """Remove the pack's oldest files beyond ``MAX_FILES``, because each configured cell leaves a file."""
         ours = re.compile(rf"{re.escape(self._name)}-[0-9a-f]{{8}}\.npz")
         others = [path for path in self.path.parent.iterdir() if ours.fullmatch(path.name) and path != self.path]
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
@@ -235,7 +236,7 @@ class _RejectedError(Exception):
 
 
 def _next_counters(file: Mapping[str, NDArray[Any]], now_s: float) -> RunCounters:
-    """Return a file's run counters including this start. Invalid counters restart from zero at ``now_s``."""
+    """Return the run counters of a file, including this start. Invalid counters restart from zero at ``now_s``."""
     try:
         return _read_counters(file)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:

@@ -15,8 +15,9 @@ from bms_estimator.settings.pack import Settings
 def pack_identity(settings: Settings, cell: PackModel) -> str:
     """Return the hash of all numbers on which the meaning of a state depends.
 
-    These are the cells in series, the capacity, the open-circuit voltage and the sign of the current; for a fuel cell,
-    all its parameters and the sign. A changed description, tuning value or other setting does not change the hash.
+    For a battery, these are the number of cells in series, the capacity, the open-circuit voltage and the sign of the
+    current. For a fuel cell, these are all parameters and the sign of the current. A changed description, tuning value
+    or other setting does not change the hash.
     """
     if isinstance(cell, FuelCellModel):  # the learned theta is relative to the parameters of the cell file
         return hashlib.sha256(repr((*cell.a, settings.sensor.current_sign)).encode()).hexdigest()
@@ -27,7 +28,7 @@ def pack_identity(settings: Settings, cell: PackModel) -> str:
 
 
 def observer_identity(settings: Settings, cell: PackModel) -> str:
-    """Return the hash of all that the observer's parameters and gain depend on.
+    """Return the hash of all settings and cell data on which the observer's parameters and gain depend.
 
     With another hash the observer's own state is discarded; it converges again within seconds.
     """
@@ -46,6 +47,7 @@ def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDAr
 
 def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Return the fields of a state that stay valid with another observer identity."""
-    kept = "observer.soc", "observer.soc_coulomb", "observer.started"
-    dropped = "observer.", "learning.", "series_resistance."
-    return {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}
+    valid = "observer.soc", "observer.soc_coulomb", "observer.started"
+    # both of them are computed from the observer's estimates and are discarded with these
+    prefixes = "observer.", "learning.", "series_resistance."
+    return {name: v for name, v in state.items() if name in valid or not name.startswith(prefixes)}

@@ -20,9 +20,10 @@ _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith(
 OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
 EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
-"""Number of trailing axes of a field that run along the filter's states; a later version appends states at the end."""
+"""Number of trailing axes along the filter's states, by field. Later versions append states at the end of these axes."""
 MAX_SOC_DIFFERENCE = 0.03
-"""Maximum difference between the SOC of filter and observer. A larger one shows that the filter was switched off."""
+"""Maximum difference between the SOC of filter and observer. A larger difference shows that the filter was switched
+off."""
 
 
 def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
@@ -58,7 +59,7 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
     f = estimator.record["filter"]
     soc_difference = abs(f["soc"][0] - estimator.state["soc"][0])
     if estimator.identifying and (not filter_was_on or soc_difference > MAX_SOC_DIFFERENCE):
-        unseen_s = math.inf  # the filter's state is outdated
+        unseen_s = math.inf  # the filter's state is outdated: resume as after a gap of unknown length
     if "filter.mean_a" not in saved:  # saved by a version without load statistics
         f["mean_a"] = f["current_a"]
     if filter_was_on and saved.get("filter.mean", np.zeros(0)).shape[-1] < STATES:
@@ -73,7 +74,7 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
 
 
 def copy_known_fields(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
-    """Copy those saved fields, by name, whose shape ``record`` has too, or has with additional filter states."""
+    """Copy saved fields to the fields of ``record`` with equal names and shapes, or with additional filter states."""
     for name, field in fields(record):
         value = saved.get(name)
         if value is None or value.ndim != field.ndim:
@@ -99,7 +100,7 @@ def _reset_ocv_states(estimator: Estimator) -> None:
 
 
 def _reset_switched_states(estimator: Estimator) -> None:
-    """Initialize current offset and capacity as configured if a setting has made them a state or a constant."""
+    """Initialize current offset and capacity as configured if a changed setting made one a state or a constant."""
     f, p = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
     best = f["best"]
     for j, variance in ((OFFSET, offset_variance(p)), (LN_Q, p["capacity_std"] ** 2)):

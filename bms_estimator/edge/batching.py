@@ -7,7 +7,8 @@ import numpy as np
 from bms_estimator.model.sample import SampleBlock
 
 MAX_SAMPLES = 7_000
-"""Maximum number of samples in a block: even samples that do not compress stay below ``streams.MAX_BLOCK_BYTES``."""
+"""Maximum number of samples in a block. A block of this many incompressible samples stays below
+``streams.MAX_BLOCK_BYTES``."""
 
 
 class ReadyBlock(NamedTuple):
@@ -23,11 +24,11 @@ class Batcher:
 
     Args:
         block_s: Minimum time from the first sample of a block to that of the next one [s].
-        most: Maximum number of samples in a block.
+        max_samples: Maximum number of samples in a block.
     """
 
-    def __init__(self, block_s: float, most: int = MAX_SAMPLES) -> None:
-        self._block_s, self._most = block_s, most
+    def __init__(self, block_s: float, max_samples: int = MAX_SAMPLES) -> None:
+        self._block_s, self._max_samples = block_s, max_samples
         self._parts: list[SampleBlock] = []
         self._count, self._arrival_s, self._end_s = 0, 0.0, 0.0
 
@@ -42,11 +43,11 @@ class Batcher:
             if not self._count:
                 self._end_s = float(samples["time_s"][0]) + self._block_s
             fits = int(np.searchsorted(samples["time_s"], self._end_s))
-            part, samples = np.split(samples, [min(fits, self._most - self._count)])
+            part, samples = np.split(samples, [min(fits, self._max_samples - self._count)])
             self._parts.append(part)
             self._count += part.size
             self._arrival_s = arrival_s if part.size else self._arrival_s
-            if samples.size or self._count == self._most:
+            if samples.size or self._count == self._max_samples:
                 completed += self.cut()
         return completed
 

@@ -34,7 +34,7 @@ _MAGIC, _VERSION = b"BMSB", 1
 MAX_SAMPLES = 65_535
 """Maximum number of samples of a block."""
 MAX_NUMBER = 2**63
-"""Maximum number of a store or block."""
+"""Limit of the creation time of a store [ns since 1970] and of the number of a block: they fit a signed integer."""
 _COLUMNS = tuple((name, np.dtype(SAMPLE[name]).newbyteorder("<")) for name in SAMPLE.names or ())
 _SAMPLE_BYTES = sum(dtype.itemsize for _, dtype in _COLUMNS)
 
@@ -100,7 +100,10 @@ def decode(data: bytes) -> Block:
 
 
 def peek_header(data: bytes) -> tuple[int, float]:
-    """Return number of samples and arrival time [s since 1970] from a block's header; 0 and infinity if it is not a block."""
+    """Return number of samples and arrival time [s since 1970] from a block's header.
+
+    Bytes that are not a block give 0 and infinity.
+    """
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         return 0, math.inf
     _, _, count, *_, arrival_s = _HEADER.unpack_from(data)

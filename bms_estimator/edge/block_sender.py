@@ -34,8 +34,9 @@ from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.store.database import RETRY_S, Database
 
 MIB = 1 << 20
-OVERDUE = 1.5
-"""Age at which an incomplete block is sent, in block lengths."""
+"""Mebibyte [bytes]."""
+MAX_BLOCK_AGE = 1.5
+"""Age at which an incomplete block is sent, as a multiple of the block duration."""
 HANDOVER_S = 2.0
 """Time limit for sending the remaining blocks at shutdown [s]."""
 DISCONNECT_TIMEOUT_S = 1.0
@@ -53,7 +54,7 @@ class BlockSender:
         folder: Folder of the blocks, in ``<pack>.edge.sqlite``.
         connect: Opens a connection; default: over TCP.
         clock: Clock whose wall time dates samples.
-        steady: Clock that never steps and continues during suspend [s].
+        steady: Monotonic clock that continues during suspend [s].
         most_samples: Maximum number of samples of a block.
         first_delay_s: Delay after a lost connection or a temporary rejection [s].
         retry_s: Delay before a failed disk is retried [s].
@@ -108,7 +109,7 @@ class BlockSender:
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
         wall_s = self._clock.wall()
-        # a new store may begin later than our clock, if a worker had blocks of a later store
+        # a new store may have been created later than the sample clock's time, if a worker had blocks of a later store
         self._sample_clock.advance_to(self.store.last_s)
         placed = samples.copy()
         placed["time_s"] = self._sample_clock.place(samples["time_s"], wall_s, self._steady())
@@ -122,7 +123,7 @@ class BlockSender:
         """Return counters of the blocks."""
         store = self.store
         return EdgeHealth(
-            blocks_kept=store.kept,
+            blocks_kept=store.unconfirmed,
             blocks_unsent=store.waiting,
             blocks_dropped=store.dropped,
             trouble=self.delivery.trouble,
@@ -137,7 +138,7 @@ class BlockSender:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Complete the open block, and send within ``handover_s``; the next run sends the rest."""
+        """Complete the open block, and send blocks for at most ``handover_s``. The next run sends the remaining blocks."""
         self._end_block()
         if self._task is not None:
             self._link.closing.set()
@@ -152,7 +153,7 @@ class BlockSender:
         """Restart the timer that completes the open block if the source falls silent."""
         if self._overdue_timer is not None:
             self._overdue_timer.cancel()
-        due_s = OVERDUE * self._block_s
+        due_s = MAX_BLOCK_AGE * self._block_s
         has_samples = len(self._batcher) > 0
         self._overdue_timer = asyncio.get_running_loop().call_later(due_s, self._end_block) if has_samples else None
 

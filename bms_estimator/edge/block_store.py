@@ -1,4 +1,4 @@
-"""Store of an edge's blocks: on disk until a worker has confirmed them, returned in order, and again on request.
+"""Store of an edge's blocks. A block stays on disk until a worker has confirmed it, and is sent again on request.
 
 The event loop never waits for the disk. Blocks that cannot be written wait in memory without a number. A block is sent
 only after its number is on disk, since a restart could otherwise use the number again.
@@ -25,7 +25,8 @@ from bms_estimator.store.database import Database, StoreError
 MAX_WAITING = 500_000
 """Maximum number of samples in memory while the disk cannot be written: 20 MB, or five days at one sample a second."""
 RETRY_S = 1.0
-"""Retry interval of a disk operation that failed [s]; ``Database`` avoids a disk that has failed."""
+"""Retry interval of a failed disk operation [s]. ``Database`` rejects operations without access while a disk has
+failed."""
 RESEND_S = 30.0
 """Minimum interval between two resends of a block [s], because a lagging worker repeats its request before the block
 can arrive."""
@@ -39,7 +40,7 @@ class BlockStore:
     Args:
         database: Database with ``EDGE_TABLES``, synced at each transaction; its owner opens and closes it.
         topic: Topic of the blocks.
-        most_bytes: Maximum total size of blocks on disk [bytes]; beyond it the oldest is dropped.
+        most_bytes: Maximum total size of blocks on disk [bytes]. Beyond it, the oldest block is dropped.
         wall: Wall clock [s since 1970].
         resend_s: Minimum interval between two resends of one block [s].
 
@@ -62,7 +63,7 @@ class BlockStore:
         self._run_id = secrets.token_hex(8)
         self._put_count, self._waiting = 0, deque[tuple[int, ReadyBlock]]()  # the latter are not on disk yet
         self._on_disk: StoreResult | None = None  # None before the first transaction
-        self._synced_opening = 0  # value of database.opened at the last transaction
+        self._open_count_at_sync = 0  # value of database.open_count at the last transaction
         self._first_unconfirmed, self._after_s = 1, 0
         self._cursor, self._unacknowledged = 1, set[int]()
         self._last_resend = (0, -math.inf)  # block number and time
@@ -76,7 +77,7 @@ class BlockStore:
     @property
     def last_s(self) -> float:
         """Time of the last sample on disk, or else the creation time of the store [s since 1970]; initially -inf."""
-        return self._on_disk.kept.made_s + self._on_disk.kept.last_s if self._on_disk else -math.inf
+        return self._on_disk.state.made_s + self._on_disk.state.last_s if self._on_disk else -math.inf
 
     @property
     def oldest(self) -> int:
@@ -84,14 +85,14 @@ class BlockStore:
         return max(self._on_disk.oldest, self._first_unconfirmed) if self._on_disk else 1
 
     @property
-    def kept(self) -> int:
+    def unconfirmed(self) -> int:
         """Number of blocks that no worker has confirmed."""
-        return len(self._waiting) + (self._on_disk.kept.next - self.oldest if self._on_disk else 0)
+        return len(self._waiting) + (self._on_disk.state.next - self.oldest if self._on_disk else 0)
 
     @property
     def waiting(self) -> int:
         """Number of blocks that the broker has not acknowledged."""
-        ready = self._on_disk.kept.next - self._cursor if self._on_disk else 0
+        ready = self._on_disk.state.next - self._cursor if self._on_disk else 0
         return len(self._waiting) + ready + len(self._unacknowledged)
 
     async def __aenter__(self) -> Self:
@@ -122,9 +123,9 @@ class BlockStore:
 
     def on_request(self, awaits: BlockRequest) -> None:
         """Handle a worker's request for its next block."""
-        if self._on_disk is None or awaits.store < (made := self._on_disk.kept.made_s * NS):
+        if self._on_disk is None or awaits.store < (created_ns := self._on_disk.state.made_s * NS):
             return
-        if awaits.store > made or awaits.number > self._on_disk.kept.next:
+        if awaits.store > created_ns or awaits.number > self._on_disk.state.next:
             self._request_new_store(math.ceil(awaits.store / NS))
             return
         self._first_unconfirmed = max(self._first_unconfirmed, awaits.number)
@@ -136,17 +137,17 @@ class BlockStore:
     async def take(self, most: int) -> list[QueuedMessage]:
         """Wait for a block, then return up to ``most`` consecutive ones."""
         while True:
-            while self._on_disk is None or self._cursor >= self._on_disk.kept.next:
+            while self._on_disk is None or self._cursor >= self._on_disk.state.next:
                 self._filled.clear()
                 await self._filled.wait()
-            made_s, first = self._on_disk.kept.made_s, self._cursor
+            made_s, first = self._on_disk.state.made_s, self._cursor
             try:
-                page = await self._database.call(PageRead(made_s, first, self._on_disk.kept.next, most))
+                page = await self._database.call(PageRead(made_s, first, self._on_disk.state.next, most))
             except StoreError:
                 await asyncio.sleep(RETRY_S)
                 continue
-            if (self._on_disk.kept.made_s, self._cursor) != (made_s, first):
-                continue
+            if (self._on_disk.state.made_s, self._cursor) != (made_s, first):
+                continue  # a reply or a new store has moved the cursor while the page was read
             if page.first > first:
                 self._skip_damaged(page.first)
             if page.blocks:
@@ -154,7 +155,7 @@ class BlockStore:
                 self._unacknowledged |= {number for number, _ in page.blocks}
                 return [QueuedMessage(number, self._message(number, data)) for number, data in page.blocks]
 
-    def sent(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Record that the broker has acknowledged a block. It stays stored, because the server may still lose it."""
         self._unacknowledged.discard(number)
 
@@ -168,7 +169,7 @@ class BlockStore:
         return Message(self._topic, with_oldest(data, min(self.oldest, number)), 1, retain=False)
 
     def _resend(self, number: int) -> None:
-        """Send a block and all after it again."""
+        """Send a block and all later blocks again, unless the block was resent less than ``resend_s`` ago."""
         now_s = asyncio.get_running_loop().time()
         last_number, last_s = self._last_resend
         if number >= self._cursor or (number == last_number and now_s - last_s < self._resend_s):
@@ -191,7 +192,7 @@ class BlockStore:
     def _skip_damaged(self, first: int) -> None:
         """Skip the unreadable blocks between the cursor and ``first``.
 
-        They count as lost only if no earlier block is unconfirmed; otherwise a worker will request them again.
+        They count as lost only if no earlier block is unconfirmed. Otherwise a worker will request them again.
         """
         if self.oldest >= self._cursor:
             self._drop(first - self._cursor, "blocks on the disk are damaged")
@@ -217,8 +218,8 @@ class BlockStore:
     async def _sync(self) -> bool:
         """Synchronize memory and disk. Return False if the disk failed."""
         put = list(self._waiting)
-        recount = self._on_disk is None or self._synced_opening != self._database.opened
-        known_s = self._on_disk.kept.made_s if self._on_disk else 0
+        recount = self._on_disk is None or self._open_count_at_sync != self._database.open_count
+        known_s = self._on_disk.state.made_s if self._on_disk else 0
         transaction = StoreTransaction(
             self._run_id, put, self._first_unconfirmed, known_s, self._after_s, self._most_bytes, self._wall(), recount
         )
@@ -226,7 +227,7 @@ class BlockStore:
             result = await self._database.call(transaction)
         except StoreError:
             return False
-        self._synced_opening = self._database.opened
+        self._open_count_at_sync = self._database.open_count
         while self._waiting and put and self._waiting[0][0] <= put[-1][0]:
             self._waiting.popleft()
         self._apply_result(result)
@@ -235,7 +236,7 @@ class BlockStore:
     def _apply_result(self, result: StoreResult) -> None:
         """Update the numbers in memory after a transaction."""
         before, self._on_disk = self._on_disk, result
-        if before is None or before.kept.made_s != result.kept.made_s:
+        if before is None or before.state.made_s != result.state.made_s:
             self._change_store(result, before)
         if result.dropped:
             self._drop(result.dropped, "the store is full")
@@ -249,7 +250,7 @@ class BlockStore:
     def _change_store(self, result: StoreResult, before: StoreResult | None) -> None:
         """Reset the numbers for a new store, and count the unconfirmed blocks of the one before as lost."""
         if before is not None:
-            self._drop(before.kept.next - max(before.oldest, self._first_unconfirmed), "a new store is begun")
+            self._drop(before.state.next - max(before.oldest, self._first_unconfirmed), "a new store is begun")
         self._first_unconfirmed = self._cursor = result.oldest
         self._unacknowledged.clear()
-        log.info("store of blocks", made_s=result.kept.made_s, next=result.kept.next, oldest=result.oldest)
+        log.info("store of blocks", made_s=result.state.made_s, next=result.state.next, oldest=result.oldest)

@@ -15,7 +15,7 @@ NS = 1_000_000_000
 LATEST_S = MAX_NUMBER // NS - 1
 """Latest creation time of a store, in the year 2262 [s since 1970]."""
 DROP_ROWS = 64
-"""Number of rows read at a time when blocks are dropped."""
+"""Maximum number of rows that are read at a time when blocks are dropped."""
 EDGE_TABLES = (
     """
     CREATE TABLE store (
@@ -50,11 +50,12 @@ class StoreState(NamedTuple):
 
 
 class StoreResult(NamedTuple):
-    """State after a transaction."""
+    """State of the store after a transaction."""
 
-    kept: StoreState
+    state: StoreState
+    """Row of table ``store``."""
     oldest: int
-    """Number of the oldest block; ``kept.next`` without blocks."""
+    """Number of the oldest block on disk; ``state.next`` without blocks."""
     dropped: int
     """Number of blocks dropped because the store was full."""
 
@@ -78,29 +79,30 @@ class StoreTransaction:
     after_s: int
     """Time after which the store must have been created [s since 1970]; otherwise it is replaced."""
     most_bytes: int
+    """Maximum total size of the blocks on disk [bytes]."""
     now_s: float
     """Wall clock [s since 1970]."""
     count: bool
-    """True to recount the bytes."""
+    """True to compute the total size of the blocks from the rows."""
 
     def __call__(self, connection: sqlite3.Connection) -> StoreResult:
         """Run the transaction."""
-        kept = _stored_state(connection)
-        if kept is None or kept.made_s < self.known_s or kept.made_s <= self.after_s:
-            kept = self._begin(connection)
+        state = _stored_state(connection)
+        if state is None or state.made_s < self.known_s or state.made_s <= self.after_s:
+            state = self._begin(connection)
         else:
             removed = _bytes(connection, f"WHERE number < {self.safe:d}")
             connection.execute("DELETE FROM block WHERE number < ?", (self.safe,))
-            kept = kept._replace(bytes=_bytes(connection) if self.count else kept.bytes - removed)
-        inserted = kept.taken if kept.run == self.run else 0
+            state = state._replace(bytes=_bytes(connection) if self.count else state.bytes - removed)
+        inserted = state.taken if state.run == self.run else 0
         for index, ready in self.put:
             if index > inserted:
-                kept = _insert(connection, kept, ready)._replace(run=self.run, taken=index)
-        kept, dropped = _make_room(connection, kept, self.most_bytes)
+                state = _insert(connection, state, ready)._replace(run=self.run, taken=index)
+        state, dropped = _make_room(connection, state, self.most_bytes)
         connection.execute("DELETE FROM store")
-        connection.execute("INSERT INTO store VALUES (?, ?, ?, ?, ?, ?)", kept)
+        connection.execute("INSERT INTO store VALUES (?, ?, ?, ?, ?, ?)", state)
         (oldest,) = connection.execute("SELECT min(number) FROM block").fetchone()
-        return StoreResult(kept, kept.next if oldest is None else oldest, dropped)
+        return StoreResult(state, state.next if oldest is None else oldest, dropped)
 
     def _begin(self, connection: sqlite3.Connection) -> StoreState:
         """Create a store, stamped with the time of its first waiting sample."""
@@ -115,6 +117,7 @@ class Page(NamedTuple):
     first: int
     """Number of the first readable block."""
     blocks: list[tuple[int, bytes]]
+    """Numbers and encoded blocks."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,7 @@ class PageRead:
     made_s: int
     """Creation time of the store [s since 1970]."""
     first: int
+    """Number of the first block."""
     end: int
     """Number after the last block."""
     most: int
@@ -155,31 +159,31 @@ def _stored_state(connection: sqlite3.Connection) -> StoreState | None:
     row = connection.execute("SELECT made_s, next, last_s, bytes, run, taken FROM store").fetchone()
     if row is None or [*map(type, row)] != [int, int, float, int, str, int]:
         return None
-    kept = StoreState(*row)
-    return kept if 0 < kept.made_s <= LATEST_S and 0 < kept.next < MAX_NUMBER else None
+    state = StoreState(*row)
+    return state if 0 < state.made_s <= LATEST_S and 0 < state.next < MAX_NUMBER else None
 
 
-def _insert(connection: sqlite3.Connection, kept: StoreState, ready: ReadyBlock) -> StoreState:
+def _insert(connection: sqlite3.Connection, state: StoreState, ready: ReadyBlock) -> StoreState:
     samples = ready.samples.copy()
-    samples["time_s"] = np.maximum(samples["time_s"] - kept.made_s, kept.last_s)
-    data = encode(Block(kept.made_s * NS, kept.next, kept.next, ready.arrival_s, samples))
-    connection.execute("INSERT OR REPLACE INTO block VALUES (?, ?)", (kept.next, data))
+    samples["time_s"] = np.maximum(samples["time_s"] - state.made_s, state.last_s)
+    data = encode(Block(state.made_s * NS, state.next, state.next, ready.arrival_s, samples))
+    connection.execute("INSERT OR REPLACE INTO block VALUES (?, ?)", (state.next, data))
     last_s = float(samples["time_s"][-1])
-    return kept._replace(next=kept.next + 1, last_s=last_s, bytes=kept.bytes + len(data))
+    return state._replace(next=state.next + 1, last_s=last_s, bytes=state.bytes + len(data))
 
 
-def _make_room(connection: sqlite3.Connection, kept: StoreState, most_bytes: int) -> tuple[StoreState, int]:
+def _make_room(connection: sqlite3.Connection, state: StoreState, most_bytes: int) -> tuple[StoreState, int]:
     """Drop the oldest blocks beyond the size limit, but never the newest one."""
     dropped = 0
     oldest = "SELECT number, length(data) FROM block WHERE number < ? ORDER BY number LIMIT ?"
-    while kept.bytes > most_bytes and (rows := connection.execute(oldest, (kept.next - 1, DROP_ROWS)).fetchall()):
+    while state.bytes > most_bytes and (rows := connection.execute(oldest, (state.next - 1, DROP_ROWS)).fetchall()):
         for number, size in rows:
-            if kept.bytes <= most_bytes:
+            if state.bytes <= most_bytes:
                 break
             connection.execute("DELETE FROM block WHERE number = ?", (number,))
-            kept = kept._replace(bytes=kept.bytes - size)
+            state = state._replace(bytes=state.bytes - size)
             dropped += 1
-    return kept, dropped
+    return state, dropped
 
 
 def _bytes(connection: sqlite3.Connection, condition: str = "") -> int:

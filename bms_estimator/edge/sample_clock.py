@@ -1,4 +1,4 @@
-"""Timestamps of samples for a fleet: a source's clock mapped to one that never steps back. Pure."""
+"""Timestamps of samples for a fleet: a source's clock is mapped to a clock that never steps back. Pure."""
 
 import math
 
@@ -8,16 +8,19 @@ from numpy.typing import NDArray
 Times = NDArray[np.float64]
 
 BAND_S = 1.0
-"""Maximum difference between the source's clock and the host's that is not corrected [s]: transport delays vary too."""
+"""Maximum difference between the source's clock and the host's that is not corrected [s], because transport delays vary
+too."""
 STEP_S = 10.0
-"""Difference beyond which a clock counts as set and not as drifting; the skipped time becomes a gap [s]."""
+"""Minimum difference between the clocks that counts as a step and not as drift [s]. The skipped time becomes a gap."""
 SLEW = 0.01
-"""Relative rate at which a difference between ``BAND_S`` and ``STEP_S`` is corrected. No resonator drifts as fast."""
+"""Relative rate at which a difference between ``BAND_S`` and ``STEP_S`` is corrected. It exceeds the drift of any
+resonator."""
 WINDOW_S = 600.0
 """Window over which the smallest delay is taken [s]. Samples arrive late and never early, so the smallest delay is the
 lag of the source's clock."""
 GRID = 2.0**20
-"""Offsets are multiples of 1/GRID, so that a constant period stays constant, which compresses best."""
+"""Inverse of the step of clock offsets [1/s]. With offsets on this grid, a constant period stays constant to the last
+bit, which compresses best."""
 
 
 class SampleClock:
@@ -54,7 +57,7 @@ class SampleClock:
         Args:
             source_s: Times of the source's clock [s], shape (n,). A non-finite time is replaced by the previous one.
             wall_s: Wall clock now [s since 1970].
-            steady_s: Clock that never steps and continues during suspend [s].
+            steady_s: Monotonic clock that continues during suspend [s].
         """
         now_s = self._now(wall_s, steady_s)
         source_s = _finite(source_s, self._source_s)
@@ -114,7 +117,7 @@ class SampleClock:
 
 
 def _finite(source_s: Times, before_s: float) -> Times:
-    """Replace each non-finite time by the one before it."""
+    """Replace each non-finite time by the previous time."""
     if np.isfinite(source_s).all():
         return source_s
     filled = source_s.copy()

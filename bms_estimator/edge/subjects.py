@@ -28,13 +28,13 @@ def raw(pack: str) -> str:
     return f"raw.{pack}"
 
 
-def kept(partition: int, pack: str = "*") -> str:
-    """Return the subject in the stream ``RAW`` of a pack's blocks."""
+def stored_raw(partition: int, pack: str = "*") -> str:
+    """Return the subject of a pack's blocks in the stream ``RAW``."""
     return f"p.{partition}.raw.{pack}"
 
 
 def mapping(partitions: int) -> tuple[str, str]:
-    """Return source and destination of the subject transform of ``RAW`` that assigns packs to partitions."""
+    """Return source and destination of the subject transform that assigns packs to partitions in the stream ``RAW``."""
     return "raw.*", f"p.{{{{partition({partitions},1)}}}}.raw.{{{{wildcard(1)}}}}"
 
 
@@ -79,4 +79,4 @@ class BlockRequest(BaseModel):
     store: Annotated[int, Field(ge=0, lt=2**63)]
     number: Annotated[int, Field(ge=1, le=2**63)]
     resend: bool
-    """True if a later block arrived first, so that this one and all after it must be sent again."""
+    """True if a later block arrived first, so that block ``number`` and all later blocks must be sent again."""

@@ -11,6 +11,7 @@ from bms_estimator.process.systemd import credential
 from bms_estimator.settings.broker import BrokerSettings
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
+"""Default TCP port by URL scheme."""
 
 
 class Broker(NamedTuple):

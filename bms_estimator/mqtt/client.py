@@ -24,21 +24,21 @@ from bms_estimator.mqtt.reason_codes import UNSUPPORTED_VERSION, describe_reason
 from bms_estimator.mqtt.receive_queue import ReceiveQueue
 
 DISCONNECT_TIMEOUT_S = 1.0
-"""Timeout of DISCONNECT [s]: a broken connection cannot be closed properly."""
+"""Timeout of DISCONNECT [s], which a broken connection would never complete."""
 NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 """Socket option that sends small messages immediately, without Nagle's algorithm."""
 MAX_OVERHEAD_BYTES = 16
-"""Maximum overhead of a PUBLISH packet besides topic and payload [bytes]."""
+"""Maximum size of a PUBLISH packet besides topic and payload [bytes]."""
 SOCKET_ERROR_PREFIX = "failed to receive on socket: "
 """Beginning of paho's log line about a socket error."""
 TLS_ERROR_PREFIX = "[SSL: "
-"""Beginning of the text of a TLS error that has a name, such as an alert sent by the broker."""
+"""Beginning of the text of a TLS error, such as an alert that the broker has sent."""
 
 log = structlog.get_logger(__name__)
 
 
 class _ToLog(logging.Handler):
-    """Forward log lines of paho and aiomqtt; skip the cause of a broken socket, which the reconnect loop reports."""
+    """Handler that forwards log lines of paho and aiomqtt. It skips socket errors, which the reconnect loop reports."""
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
@@ -56,9 +56,9 @@ class Timeouts(NamedTuple):
     """Timeouts of a connection."""
 
     connect_s: float = 10.0
-    """Timeout of name resolution, TCP, TLS and the broker's CONNACK together [s]."""
+    """Total timeout of name resolution, TCP, TLS and the broker's CONNACK [s]."""
     keepalive_s: int = 10
-    """MQTT keepalive interval [s]. A ping is sent after one interval and must be answered within another one. The
+    """MQTT keepalive interval [s]. A ping is sent after one interval and must be answered within another interval. The
     broker publishes the will of a silently lost client after 1.5 intervals."""
     acknowledge_s: float = 15.0
     """Timeout of PUBACK [s]. It exceeds the 10 s in which a NATS cluster elects a new leader."""
@@ -72,7 +72,7 @@ class ClosedError(aiomqtt.MqttError):
 
 
 class Client(aiomqtt.Client):
-    """Connection by one MQTT version.
+    """Connection to a broker by one MQTT version.
 
     Args:
         arguments: Arguments of aiomqtt for address, user name, password and TLS.
@@ -126,7 +126,7 @@ class Client(aiomqtt.Client):
             self._answers[info.mid] = answer
             try:
                 await asyncio.wait([answer], timeout=self._acknowledge_s)
-                # after a suspend both may be due: the answer that arrived in time counts
+                # after a suspend, both answer and timeout may be due: an answer takes precedence
                 if not answer.done():
                     raise BrokerConnectionError(
                         f"the broker has not acknowledged a message for {self._acknowledge_s:g} s"
@@ -161,7 +161,7 @@ class Client(aiomqtt.Client):
         return ReceivedMessage(message.topic.value, bytes(message.payload), bool(message.retain))
 
     def abandon(self) -> None:
-        """Give up an attempt to connect, though the broker may still answer."""
+        """Abandon a connection attempt. A later CONNACK is answered with DISCONNECT."""
         self._abandoned = True
         self._client.disconnect()
 
@@ -217,7 +217,7 @@ class Client(aiomqtt.Client):
             self._why = text.removeprefix(SOCKET_ERROR_PREFIX)
 
     def _on_socket_open(self, client: Any, userdata: Any, sock: Any) -> None:
-        """Handle a new socket as the base class does. Shut an abandoned one, because the event loop may be closing."""
+        """Handle a new socket as the base class does. Shut down an abandoned socket: the event loop may be closing."""
         if self._abandoned:
             with contextlib.suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)

@@ -17,7 +17,7 @@ class BrokerConnectionError(Exception):
 
 
 class ReceivedMessage(NamedTuple):
-    """A received message."""
+    """Received message."""
 
     topic: str
     payload: bytes
@@ -43,10 +43,10 @@ class ConnectOptions(NamedTuple):
     on_message_lost: Callable[[str, str], None]
     """Callback with kind (``too_long``, ``overflow``) and topic of each discarded message."""
     max_waiting: int = MAX_WAITING
-    """Maximum number of received messages that wait to be read; further ones are lost."""
+    """Maximum number of received messages that wait to be read; further messages are lost."""
     max_bytes: int = MAX_BYTES
-    """Maximum size of a received message [bytes]. An MQTT 5 broker withholds longer ones; those of an older broker are
-    discarded on arrival."""
+    """Maximum size of a received message [bytes]. An MQTT 5 broker withholds longer messages. Longer messages of an
+    older broker are discarded on arrival."""
 
 
 class Connection(Protocol):
@@ -81,4 +81,5 @@ class Connection(Protocol):
 
 
 Connect = Callable[[Broker, ConnectOptions], AbstractAsyncContextManager[Connection]]
-"""Connects to a broker. Entering succeeds or raises BrokerConnectionError within a bounded time."""
+"""Function that connects to a broker. Entering its context succeeds or raises BrokerConnectionError within a bounded
+time."""

@@ -14,14 +14,14 @@ class DeliveryStats:
     waiting: int = 0
     """States and events that the broker has not acknowledged yet."""
     store_trouble: Callable[[], str] = field(default=str, compare=False)
-    """Returns the reason for which queued messages and history cannot be stored; empty if they can, or if there is no
-    store."""
+    """Function that returns the reason for which queued messages and history cannot be stored. The reason is empty if
+    they can be stored, and without a database."""
     losses: int = 0
     """Number of lost connections."""
     trouble: str | None = None
     """Reason for the last lost or failed connection."""
     refused_topics: list[str] = field(default_factory=list)
-    """Topics that the broker denies, as far as it reports them."""
+    """Topics that the broker denies, as far as it reports denials."""
     corrections: int = 0
     """Availability messages of other clients that were corrected."""
     requests: Counter[str] = field(default_factory=Counter)

@@ -14,12 +14,12 @@ log = structlog.get_logger(__name__)
 
 
 class DeniedTopics:
-    """Reports denied topics in log and health, and has retained messages sent again after a temporary rejection.
+    """Reports denied topics in log and health. After a temporary rejection, it requests a resend of retained messages.
 
     Args:
         delivery: Statistics that list the denied topics.
-        resend_retained: Sends all retained messages again.
-        first_delay_s: Delay after the first temporary rejection; doubles each time [s].
+        resend_retained: Function that sends all retained messages again.
+        first_delay_s: Delay after the first temporary rejection [s]. The delay doubles with each rejection.
     """
 
     def __init__(self, delivery: DeliveryStats, resend_retained: Callable[[], object], first_delay_s: float) -> None:

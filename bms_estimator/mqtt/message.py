@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class Message(NamedTuple):
-    """One message."""
+    """MQTT message."""
 
     topic: str
     payload: bytes
@@ -13,8 +13,8 @@ class Message(NamedTuple):
 
 
 class QueuedMessage(NamedTuple):
-    """A message on its way to the broker."""
+    """Message on its way to the broker."""
 
     number: int
-    """Position in the queue, one higher for each message."""
+    """Position in the queue; consecutive messages have consecutive numbers."""
     message: Message

@@ -32,7 +32,7 @@ class BrokerConnector:
 
     def __init__(self, settings: BrokerSettings, timeouts: Timeouts = DEFAULT_TIMEOUTS) -> None:
         self._settings, self._timeouts = settings, timeouts
-        # URLs that did not answer MQTT 5 at all: the broker is stopped, or too old to reject the version
+        # URLs that did not respond to MQTT 5: the broker is stopped, or too old to reject the version
         self._silent: set[str] = set()
 
     @contextlib.asynccontextmanager

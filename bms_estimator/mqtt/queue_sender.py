@@ -1,4 +1,4 @@
-"""Sender of queued messages: oldest first, several in flight."""
+"""Sender of queued messages. The oldest message is sent first, and several messages may be in flight."""
 
 import asyncio
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class MessageQueue(Protocol):
     async def take(self, most: int) -> Sequence[QueuedMessage]:
         """Wait for a message, then return up to ``most`` of the oldest that were not returned since ``rewind``."""
 
-    def sent(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Record that the broker has acknowledged a message."""
 
     def rewind(self) -> None:
@@ -48,7 +48,7 @@ class QueueSender:
         outbox: Queue to empty.
         delivery: Statistics in which waiting and dropped messages are counted.
         denied: Denied topics, updated from the broker's results.
-        first_delay_s: Delay before a temporarily rejected message is retried; doubles each time [s].
+        first_delay_s: Delay before a temporarily rejected message is retried [s]. The delay doubles with each retry.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class QueueSender:
         self._outbox.rewind()
 
     async def _try_oldest(self, connection: Connection) -> None:
-        """Retry the oldest message alone, so that none overtakes it, until the broker accepts or drops one."""
+        """Retry the oldest message alone, so that no message overtakes it, until it is accepted or finally rejected."""
         while True:
             await asyncio.sleep(self._backoff.next_s())
             for oldest in await self._outbox.take(1):
@@ -111,7 +111,7 @@ class QueueSender:
             self._outbox.rewind()
 
     async def _send_one(self, connection: Connection, queued: QueuedMessage) -> bool:
-        """Send one message. Return False if it must be retried.
+        """Send one message. Return False if the message must be retried.
 
         A permanently rejected message is counted and dropped, because it would block all others.
         """
@@ -120,7 +120,7 @@ class QueueSender:
         if rejection is not None and rejection.is_retryable:
             return False
         self._rejected += rejection is not None
-        self._outbox.sent(queued.number)
+        self._outbox.acknowledge(queued.number)
         self._update_stats()
         self._acknowledged.set()
         return True

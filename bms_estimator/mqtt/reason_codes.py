@@ -20,7 +20,7 @@ HINTS = {
     151: "the broker allows no more",
     159: "too many connections in a short time",
 }
-"""Causes and remedies by code."""
+"""Causes and remedies by reason code."""
 
 FINAL = {
     135,  # not authorised
@@ -28,7 +28,7 @@ FINAL = {
     149,  # too large
     153,  # payload format invalid
 }
-"""Reason codes that will not change with a retry; all others (busy, quota, unspecified) may be temporary."""
+"""Reason codes of permanent rejections. All other codes (busy, quota, unspecified) may be temporary."""
 
 
 def is_final(reason: ReasonCode) -> bool:

@@ -6,14 +6,14 @@ from collections.abc import Callable
 import aiomqtt
 
 MAX_WAITING = 100
-"""Maximum number of messages that wait to be read; further ones are lost."""
+"""Maximum number of messages that wait to be read; further messages are lost."""
 MAX_BYTES = 16_384
 """Maximum length of a received message [bytes]. An MQTT 5 broker enforces it; longer messages of an older broker are
 discarded on arrival."""
 
 
 class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):
-    """Queue of received messages, bounded in their number and size. Lost messages are reported.
+    """Queue of received messages with limits of their number and size. Lost messages are reported.
 
     Args:
         on_lost: Callback with reason and topic of each lost message.

@@ -80,7 +80,7 @@ class ReconnectLoop:
         return since_s is not None and loop.time() - since_s >= MIN_CONNECTION_S
 
     def _log_loss(self, broker: Broker, event: str, errors: BaseException) -> None:
-        """Log a changed reason at once and an unchanged one rarely: a broker may be absent for days."""
+        """Log a changed reason at once, and an unchanged reason every ``LOG_S``: a broker may be absent for days."""
         while isinstance(errors, BaseExceptionGroup):
             errors = errors.exceptions[0]
         reason, now_s = str(errors), asyncio.get_running_loop().time()

@@ -22,7 +22,7 @@ MAX_WAITING = 2000
 """Maximum number of messages that wait to be read. On subscription a broker sends all retained messages at once, about
 twenty for each device."""
 MAX_BYTES = 65_536
-"""Maximum length of a message [bytes]. The longest one, ``schema``, has a quarter of it."""
+"""Maximum length of a message [bytes]. The longest message, of topic ``schema``, has a quarter of this length."""
 REASONS = {"too_long": f"longer than {MAX_BYTES} bytes", "overflow": "faster than they are read"}
 LOG_S = 60.0
 """Minimum time between two log lines on dropped messages [s]."""
@@ -42,8 +42,8 @@ class Subscriber:
         on_link_change: Called after the broker was connected or lost; ``lost_since`` distinguishes the two.
         connect: Opens a connection; default: over TCP.
         left_out: Called with the name of a device that is not stored because there are too many.
-        clock: The clocks.
-        first_delay_s: Delay before a lost broker is retried; it grows as in ``Backoff`` [s].
+        clock: Wall clock and monotonic clock.
+        first_delay_s: Delay before a lost broker is retried [s]; it grows as in ``Backoff``.
 
     Raises:
         UserError: A URL or a file of ``settings`` cannot be used.

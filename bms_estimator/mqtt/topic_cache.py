@@ -17,12 +17,12 @@ MAX_DEVICES = 64
 MAX_TOPICS = 64
 """Maximum number of topics of one device; messages on further topics are ignored."""
 MAX_DEVICE_BYTES = 128 * 1024
-"""Maximum total size of the payloads of one device [bytes]; a message that would exceed it is ignored."""
+"""Maximum total size of the payloads of one device [bytes]. A message that would exceed this size is ignored."""
 MAX_HIDDEN = 10_000
 """Maximum number of counted devices that are not stored."""
 SILENT_S = 30.0
-"""Minimum silence after which a device may be replaced by a new one [s]. A new device with a raised alarm replaces one
-without an alarm at once."""
+"""Minimum silence after which a device may be replaced by a new device [s]. A new device with a raised alarm replaces a
+device without an alarm at once."""
 REQUEST_LEVELS = ("request", "response")
 """First level of topics without device state."""
 ALARM = "alarm/"
@@ -30,7 +30,7 @@ ALARM = "alarm/"
 
 
 class DeviceMessage(NamedTuple):
-    """A message of a device."""
+    """Message of a device."""
 
     device: str
     topic: str
@@ -65,7 +65,7 @@ class TopicCache:
 
     Args:
         base_topic: First part of all topics.
-        left_out: Called with the name of a device that is not stored: a new one, or one that was replaced.
+        left_out: Called with the name of a device that is not stored: a new device, or a device that was replaced.
     """
 
     def __init__(self, base_topic: str, left_out: Callable[[str], object] = str) -> None:

@@ -1,4 +1,4 @@
-"""Table of the alarms: what each one measures, needs and advises."""
+"""Table of all alarms: fault, remedy, required quantities, and unit of the limit."""
 
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
@@ -10,7 +10,7 @@ Quantity = Literal["voltage", "current", "temperature", "cells"]
 
 
 class AlarmKind(NamedTuple):
-    """Properties of an alarm that are the same for every pack."""
+    """Properties of an alarm that are equal for all packs."""
 
     fault: str
     """Description of the fault."""

@@ -17,7 +17,7 @@ from bms_estimator.settings.pack import Settings
 MIN_SILENT_S = 10.0
 """Minimum default limit of ``link_lost`` [s]."""
 SILENT_PERIODS = 3
-"""Default limit of ``link_lost`` in sample or publish periods."""
+"""Default limit of ``link_lost`` as a multiple of the sample period or publish period."""
 
 
 class AlarmDefinition(NamedTuple):
@@ -34,12 +34,12 @@ class AlarmDefinition(NamedTuple):
 
     @property
     def kind(self) -> AlarmKind:
-        """Properties of this alarm that are the same for every pack."""
+        """Properties of this alarm that are equal for all packs."""
         return ALARM_KINDS[self.name]
 
 
 class Chemistry(NamedTuple):
-    """Voltage limits of a cell [V], and the levels at which they clear."""
+    """Voltage limits of a cell [V], and the levels at which their alarms end [V]."""
 
     over_v: float
     over_clear_v: float
@@ -54,13 +54,13 @@ _BY_NOMINAL_V = (
 )
 """Upper limits of a cell's nominal voltage [V], each with the voltage limits of its chemistry."""
 
-MIN_CHARGE = 0.02
-"""Minimum charge current as a fraction of the capacity per hour; a smaller one may be the sensor's offset."""
+MIN_CHARGE_C = 0.02
+"""Minimum charge current as a C-rate [1/h]. A smaller current may be the sensor's offset."""
 DIGITS = 9
-"""Decimals to which clear levels are rounded, so that 0.1 - 0.08 gives 0.02."""
-MAX_DISCHARGE = 5.0
-"""Default maximum discharge current as a multiple of the capacity per hour; a generic cell's file accepts readings
-far above the continuous limit of most such cells."""
+"""Number of decimals to which clear levels are rounded, so that 0.1 - 0.08 gives 0.02."""
+MAX_DISCHARGE_C = 5.0
+"""Default maximum discharge current as a C-rate [1/h]. The limit of valid samples in a generic cell's file is no
+default, because it lies far above the continuous limit of most such cells."""
 
 
 class _Default(NamedTuple):
@@ -99,7 +99,7 @@ def _silent_s(settings: Settings) -> float:
 def charging_a(cell: PackModel) -> float:
     """Return the minimum current that counts as charging [A]."""
     reference = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
-    return MIN_CHARGE * reference
+    return MIN_CHARGE_C * reference
 
 
 def out_of_range(settings: Settings, cell: PackModel) -> list[str]:
@@ -144,7 +144,7 @@ def _definition(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDef
             f"alarms.{name}.{clear_key} = {clear:g}: must not be {beyond} {key} = {limit:g}, which raises the alarm"
         )
     delay_s = rule.delay_s
-    if name == "link_lost":  # its value is a time, to which the delay is added
+    if name == "link_lost":  # the value of this alarm is a time, to which the delay is added
         limit, clear, delay_s = limit + delay_s, clear + delay_s, 0.0
     return AlarmDefinition(name, rule.severity, limit, clear, delay_s, rule.clear_delay_s, rule.latch)
 
@@ -152,7 +152,7 @@ def _definition(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDef
 def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
     """Return the defaults by alarm."""
     n = cell.cell.series_count
-    common: dict[AlarmName, _Default] = {
+    all_packs: dict[AlarmName, _Default] = {
         "over_temperature": _Default(60.0, 55.0),
         "under_temperature": _Default(-20.0, -15.0),
         "charging_below_freezing": _Default(0.0, 2.0),
@@ -164,7 +164,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "link_lost": _Default(_silent_s(settings), None),
         "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0),
     }
-    return common | (_battery_defaults(cell) if isinstance(cell, CellModel) else _stack_defaults(cell))
+    return all_packs | (_battery_defaults(cell) if isinstance(cell, CellModel) else _stack_defaults(cell))
 
 
 def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
@@ -172,7 +172,7 @@ def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
     nominal_v = c.nominal_voltage_v / n
     v = next(chemistry for max_v, chemistry in _BY_NOMINAL_V if nominal_v < max_v)
     charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
-    discharge_a = min(MAX_DISCHARGE * c.capacity_ah, c.current_max_a)
+    discharge_a = min(MAX_DISCHARGE_C * c.capacity_ah, c.current_max_a)
     return {
         "pack_over_voltage": _Default(n * v.over_v, n * v.over_clear_v),
         "pack_under_voltage": _Default(n * v.under_v, n * v.under_clear_v),

@@ -30,7 +30,7 @@ ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
 
 
 class AlarmRule(Strict):
-    """Settings that all alarms have."""
+    """Settings of every alarm."""
 
     enabled: bool = True
     severity: Literal["warning", "critical"] = "warning"

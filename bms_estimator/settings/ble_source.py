@@ -7,8 +7,10 @@ from pydantic import Field, model_validator
 
 from bms_estimator.settings.polled_source import PolledSource
 
-STEP_V, STEP_A = 0.01, 0.01
-"""Resolution of JBD [V, A]; JK is finer, the current of Daly has steps of 0.1 A."""
+VOLTAGE_RESOLUTION_V = 0.01
+"""Voltage resolution of JBD [V]; that of JK is finer."""
+CURRENT_RESOLUTION_A = 0.01
+"""Current resolution of JBD [A]; that of JK is finer, that of Daly is 0.1 A."""
 
 
 class BleSource(PolledSource):
@@ -46,6 +48,6 @@ class BleSource(PolledSource):
         """Return the ``[sensor]`` defaults; aiobmsble reports charge as positive for every BMS."""
         return {
             "current_sign": "charge_positive",
-            "voltage_resolution_v": STEP_V,
-            "current_resolution_a": STEP_A,
+            "voltage_resolution_v": VOLTAGE_RESOLUTION_V,
+            "current_resolution_a": CURRENT_RESOLUTION_A,
         }

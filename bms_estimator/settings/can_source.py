@@ -17,11 +17,11 @@ PROFILES: dict[str, dict[str, object]] = {
         "temperature": {"signal": "PackTemperature"},
     },
 }
-"""Defaults of ``[source]`` by profile. The package has a DBC file for each. All of them count charge as positive."""
+"""Defaults of ``[source]`` by profile. The package has a DBC file for each profile. Charge is positive in all of them."""
 RESOLUTIONS: dict[str, dict[str, object]] = {
     "pylontech-can": {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1},
 }
-"""Defaults of ``[sensor]`` by profile: factors of its DBC file."""
+"""Defaults of ``[sensor]`` by profile: the scale factors of the profile's DBC file."""
 LAYOUT_KEYS = ("id", "extended", "start_bit", "bits", "byte_order", "signed")
 """Former settings that described the place of a signal in a frame."""
 
@@ -50,7 +50,7 @@ class Signal(Strict):
         return table
 
     @model_validator(mode="after")
-    def _scaled(self) -> Self:
+    def _check_scale(self) -> Self:
         if self.scale == 0.0:
             raise ValueError("scale: must not be 0")
         return self
@@ -65,13 +65,13 @@ class CellSignals(Signal):
     first: Annotated[int, Field(ge=0)] = Field(default=1, description="number of the first cell in signal")
 
     @model_validator(mode="after")
-    def _numbered(self) -> Self:
+    def _check_cell_placeholder(self) -> Self:
         if self.count > 1 and "{}" not in self.signal:
-            raise ValueError("signal: of several cells it holds {}, which stands for their number")
+            raise ValueError("signal: with several cells it must contain {}, which stands for the number of the cell")
         return self
 
     def members(self) -> tuple[Signal, ...]:
-        """One signal for each cell."""
+        """Return one signal for each cell."""
         one = Signal(**self.model_dump(exclude={"count", "first"}))
         names = [self.signal.replace("{}", str(self.first + number)) for number in range(self.count)]
         return tuple(one.model_copy(update={"signal": name}) for name in names)
@@ -111,7 +111,7 @@ class CanSource(PolledSource):
         return with_profile(table, PROFILES)
 
     @model_validator(mode="after")
-    def _with_dbc(self) -> Self:
+    def _check_dbc_and_cells(self) -> Self:
         if self.dbc is None and self.profile is None:
             raise ValueError("dbc: missing; it describes the signals")
         if sum(cells.count for cells in self.cells) > 96:

@@ -11,7 +11,7 @@ from bms_estimator.settings.polled_source import Name, PolledSource
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
 """Voltage resolution at the pins, by chip [V]: INA219 data sheet; ADS1015 at 4.096 V full scale."""
 DEFAULT_RESOLUTION_V = 1.25e-3
-"""Voltage resolution of the INA226 [V]; hwmon reports finer ones only in millivolts."""
+"""Voltage resolution of the INA226 [V], used for all other chips. hwmon reports only whole millivolts."""
 
 
 class LinuxSource(PolledSource):

@@ -51,7 +51,7 @@ class Register(Strict):
     absent: int | None = Field(default=None, description="register value that means not measured, such as 32767")
 
     @model_validator(mode="after")
-    def _whole(self) -> Self:
+    def _check_scale_and_address(self) -> Self:
         if self.scale == 0.0:
             raise ValueError("scale: must not be 0")
         if self.address + self.words > 0x10000:
@@ -78,7 +78,7 @@ class CellRegisters(Register):
         return first.model_copy(update={"address": self.address + number * (self.step or self.words)})
 
     @model_validator(mode="after")
-    def _in_range(self) -> Self:
+    def _check_last_address(self) -> Self:
         if self.cell(self.count - 1).address + self.words > 0x10000:
             raise ValueError("count: the last cell lies beyond the last register, 65535")
         return self
@@ -120,7 +120,7 @@ class ModbusSource(PolledSource):
         if (self.host is None) == (self.port is None):
             raise ValueError("give host for Modbus TCP, or port for a serial line, and not both")
         if self.port is not None and self.framing == "tcp":
-            raise ValueError('framing: a serial line has "rtu"')
+            raise ValueError('framing: a serial line always uses "rtu"; remove framing, or give host for "tcp"')
         return self
 
     @property

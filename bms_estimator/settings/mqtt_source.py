@@ -27,7 +27,7 @@ LINEAR: Mapping[Unit, tuple[float, float]] = {
     "F": (5.0 / 9.0, -160.0 / 9.0),
     "K": (1.0, -273.15),
 }
-"""Factor and offset from a unit to V, A, C or s."""
+"""Factor and offset that convert a unit to V, A, C or s."""
 
 
 class ValueLocation(Strict):

@@ -25,8 +25,10 @@ SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource |
 
 SOURCE: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)
 
-MIN_RATE_HZ, MAX_RATE_HZ = 0.1, 10.0
-"""Limits of the publish rate [Hz]."""
+MIN_RATE_HZ = 0.1
+"""Minimum publish rate [Hz]."""
+MAX_RATE_HZ = 10.0
+"""Maximum publish rate [Hz]."""
 LogLevel = Literal["info", "warning", "error"]
 DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
 DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
@@ -117,7 +119,7 @@ class Settings(Strict):
     def _select_law(cls, tables: object) -> object:
         """Select the law ``learning`` by default if the identifier is off.
 
-        The printed law moves its parameters between bounds without identifying them (docs/theory/comparison.md).
+        The thesis's law moves its parameters between bounds without identifying them (docs/theory/comparison.md).
         """
         if not isinstance(tables, dict):
             return tables

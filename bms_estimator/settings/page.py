@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from bms_estimator.model.config_file import Strict
 
 DEFAULT_LISTEN = "127.0.0.1:8765"
+"""Default address of the page, host:port."""
 
 
 class Listen(NamedTuple):

@@ -12,7 +12,7 @@ class Sampling:
     current_resolution_a: float = 0.0
     """Resolution of the current [A]; 0: negligible."""
     current_dead_band_a: float = 0.0
-    """Currents below this are reported as 0 [A]."""
+    """Magnitude below which the device reports a current of 0 [A]."""
 
 
 BOARD = Sampling()

@@ -9,7 +9,7 @@ class Sink(Protocol):
     """Sink of snapshots, one for each publish period."""
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Publish a snapshot. It neither waits nor raises for an outage of the receiver."""
+        """Publish a snapshot. The method neither waits for the receiver nor raises an error if the receiver is down."""
 
     async def __aenter__(self) -> Self:
         """Start publishing."""

@@ -1,6 +1,6 @@
-"""CSV and Parquet files with the estimates of each sample, written in blocks, so that memory does not grow.
+"""CSV and Parquet files with the estimates of each sample. They are written in blocks, so that memory does not grow.
 
-The columns are the trace's fields. Every value can be read back exactly.
+The columns are the trace's fields. Every value can be restored exactly.
 """
 
 import gzip
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from bms_estimator.model.errors import UserError
 
 GZIP_LEVEL = 3
-"""Compression level of gzip: a third of the time of level 9, for some percent more bytes."""
+"""Compression level of gzip. It takes a third of the time of level 9 and gives files larger by some percent."""
 
 
 class TableSink(Protocol):
     """File to which blocks of a trace are appended; leaving the context completes it.
 
-    The first block replaces an older file, so that an earlier failure leaves that one unchanged.
+    The first block replaces an existing file. A failure before the first block leaves the existing file unchanged.
     """
 
     def __enter__(self) -> Self:

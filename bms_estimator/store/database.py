@@ -34,9 +34,10 @@ FREE_PAGES = 1024
 TRIMMED_PAGES = 4096
 """Maximum number of pages moved to shrink the file after one transaction."""
 UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT)
-"""SQLite errors of a damaged file, at any time."""
+"""SQLite error codes of a damaged file."""
 UNUSABLE_AT_OPEN = (*UNUSABLE, sqlite3.SQLITE_ERROR)
-"""SQLite errors of an unusable file while tables are checked and created: its tables have another schema."""
+"""SQLite error codes of an unusable file while its tables are checked and created. SQLITE_ERROR then means that the
+tables have another schema."""
 
 Result = TypeVar("Result")
 
@@ -44,13 +45,13 @@ log = structlog.get_logger(__name__)
 
 
 class StoreError(Exception):
-    """The database cannot be used now; the text gives the reason."""
+    """The database is unavailable; the text gives the reason."""
 
 
 class Database:
-    """Runs transactions one after the other, in a new file if the old one is unusable.
+    """Runs transactions one after the other, in a new file if the existing file is unusable.
 
-    A caller repeats the work of a failed transaction in a later one.
+    The caller repeats the work of a failed transaction in a later transaction.
 
     Args:
         path: Database file, created if missing.
@@ -60,7 +61,7 @@ class Database:
         retry_s: Delay after a failure before the disk is retried [s].
 
     Attributes:
-        reason: Reason for which the database cannot be used now; empty if it can.
+        reason: Reason for which the database is unavailable; empty while it is available.
     """
 
     def __init__(
@@ -111,9 +112,9 @@ class Database:
         return True
 
     @property
-    def opened(self) -> int:
-        """Number of times that the file was opened. A new opening may have found an empty file."""
-        return self._file.opened
+    def open_count(self) -> int:
+        """Number of times that the file was opened. After a change of this number, rows may be missing."""
+        return self._file.open_count
 
     async def call(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run ``work`` in a transaction.
@@ -159,7 +160,7 @@ class _File:
         self._inode = (0, 0)
         self._ready = False  # the schema was checked
         self._synced_s = 0.0
-        self.opened = 0
+        self.open_count = 0
 
     def run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run one transaction, in a new file if the existing one is unusable."""
@@ -205,7 +206,10 @@ class _File:
             connection.close()
 
     def _open(self) -> sqlite3.Connection:
-        """Return a connection to the file at the path, reopened if it was replaced: a deleted file would lose all data."""
+        """Return a connection to the file at the path.
+
+        The file is reopened if another file replaced it, because rows written to the former file would be lost.
+        """
         if self._connection is not None and _inode(self._path) == self._inode:
             return self._connection
         self.close()
@@ -222,7 +226,7 @@ class _File:
         self._connection.text_factory = lambda raw: raw.decode(errors="surrogateescape")  # a damaged row must not fail
         self._prepare(self._connection)
         self._ready = True
-        self.opened += 1
+        self.open_count += 1
         return self._connection
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
@@ -253,7 +257,7 @@ class _File:
 
 
 def _trim(connection: sqlite3.Connection) -> None:
-    """Release free pages once they are half of the file, so that a page is moved at most once or twice."""
+    """Release the free pages if they exceed half of the file, so that a page is moved at most once or twice."""
     (free,) = connection.execute("PRAGMA freelist_count").fetchone()
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     if free > max(FREE_PAGES, pages // 2):

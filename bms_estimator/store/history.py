@@ -17,6 +17,7 @@ from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_of
 
 MINUTES_A_DAY = 1440
+"""Number of minutes in a day."""
 WAITING_MINUTES = 2 * MINUTES_A_DAY
 """Maximum number of rows in memory while the disk cannot be written."""
 WAITING_EVENTS = 1000
@@ -71,7 +72,8 @@ class History:
         self._run_id, self._number = secrets.token_hex(8), 0
         self._due = asyncio.Event()
         self._closing = False
-        self._unpruned = MINUTES_A_DAY  # minutes since the last removal of old rows, which happens at the first one too
+        # number of rows written since old rows were last removed; this value makes the first write remove them
+        self._unpruned = MINUTES_A_DAY
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -121,7 +123,7 @@ class History:
         return self._number
 
     async def _write_repeatedly(self) -> None:
-        """Write each minute and event. After a failure retry with the next one, or in a minute."""
+        """Write each minute and event. After a failure, retry with the next minute or event, or after a minute."""
         while not self._closing:
             with contextlib.suppress(TimeoutError):  # without samples no minute ends, but a failed write is retried
                 async with asyncio.timeout(MINUTE_S):
@@ -132,7 +134,7 @@ class History:
         await self._write()
 
     async def _write(self) -> None:
-        """Write the waiting rows. Skip those that a transaction with unknown result has written."""
+        """Write the waiting rows. Skip rows that an earlier transaction with unknown result has written."""
         minutes, waiting_events, last = list(self._minutes), list(self._events), self._number
         if not minutes and not waiting_events:
             return
@@ -165,7 +167,7 @@ class History:
 def _row_time(connection: sqlite3.Connection, row: Minute) -> int:
     """Return the timestamp of a row: the start of its minute, or some seconds later if the clock was set back.
 
-    Two rows of a minute that hold more than a minute together come from different passes of the clock.
+    If two rows of a minute contain more than 60 s of measured time together, the clock was set back between them.
     """
     for time_s in range(row.time_s, row.time_s + MINUTE_S):
         existing = connection.execute("SELECT seen_s FROM minute WHERE time_s = ?", (time_s,)).fetchone()
@@ -181,7 +183,10 @@ def _remove(waiting: deque[tuple[int, Row]], last: int) -> None:
 
 
 def _prune(connection: sqlite3.Connection, max_rows: int) -> None:
-    """Delete all but the newest rows. The number of rows decides, because a clock that jumps ahead would delete all."""
+    """Delete all but the newest ``max_rows`` rows.
+
+    The limit is a number and not an age, because a clock that jumps ahead would make all rows too old.
+    """
     oldest = connection.execute(
         "SELECT time_s FROM minute ORDER BY time_s DESC LIMIT 1 OFFSET ?", (max_rows - 1,)
     ).fetchone()

@@ -1,4 +1,4 @@
-"""Reader of a pack's history, also while the service writes it."""
+"""Reader of a pack's history. It can run while the service writes the history."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -33,13 +33,13 @@ class HistoryFile:
         self._path = path
 
     def rows(self, since_s: float, until_s: float, step_s: int) -> list[Minute]:
-        """Return rows of ``step_s``, aggregated from one-minute rows; intervals without publications are left out.
+        """Return rows of length ``step_s``, aggregated from one-minute rows. Intervals without publications are omitted.
 
         Args:
             since_s: Start time [s since 1970].
             until_s: End time, exclusive [s since 1970].
-            step_s: Length of a row [s], whole minutes. With 60 s, a minute that a clock set back has repeated gives
-                two rows.
+            step_s: Length of a row [s], whole minutes. With 60 s, a minute gives two rows if it passed twice because the
+                clock was set back.
 
         Raises:
             UserError: The history cannot be read.

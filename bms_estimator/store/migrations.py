@@ -33,7 +33,7 @@ MIGRATIONS = (
     """,
     "CREATE TABLE history_mark (run TEXT NOT NULL, number INTEGER NOT NULL);",
 )
-"""Statements that migrate version n to version n + 1; a released one is never changed."""
+"""Statements that migrate version n to version n + 1. Released statements are never changed."""
 
 
 class NewerVersionError(Exception):

@@ -8,14 +8,15 @@ from typing import NamedTuple
 from bms_estimator.model.payloads import Estimate
 
 MINUTE_S = 60
+"""Length of a minute [s]."""
 MAX_INTERVAL_S = 30.0
 """Maximum interval between two publications that is never a gap [s]. No charge is counted over a gap."""
 GAP_RATIO = 3.0
-"""Maximum ratio of an interval to the previous one that is not a gap, so that a slow source has no gaps."""
+"""Maximum ratio of an interval to the previous interval that is not a gap, so that a slow source has no gaps."""
 
 
 class Minute(NamedTuple):
-    """One row of history; None for missing values. Means and extremes are taken over published values."""
+    """Row of the history; missing values are None. Means and extremes are taken over the published values."""
 
     time_s: int
     """Start of the minute [s since 1970]."""
@@ -75,7 +76,7 @@ class MinuteAccumulator:
     _seen_s: float = 0.0
 
     def add(self, estimate: Estimate, seen_s: float) -> None:
-        """Add a publication. ``seen_s`` is the measured time since the previous one, from ``measured_time`` [s]."""
+        """Add a publication. ``seen_s`` is the measured time since the previous publication [s]; see ``measured_time``."""
         self._voltage.add(estimate.voltage_v)
         self._current.add(estimate.current_a)
         self._temperature.add(estimate.temperature_c)
@@ -97,11 +98,11 @@ class MinuteAccumulator:
 
 
 def measured_time(interval_s: float, previous_s: float) -> float:
-    """Return the time between two publications [s], or 0 if it is a gap or the clock went back.
+    """Return the time between two publications [s], or 0 if the time is a gap or the clock went back.
 
     Args:
-        interval_s: Time between the two on the board's clock [s].
-        previous_s: Time between the previous two [s].
+        interval_s: Time between the two publications on the board's clock [s].
+        previous_s: Time between the previous two publications [s].
     """
     return interval_s if 0.0 < interval_s <= max(MAX_INTERVAL_S, GAP_RATIO * previous_s) else 0.0
 

@@ -1,4 +1,4 @@
-"""Ascending numbers, stored as contiguous ranges: messages of a day take one range. Pure."""
+"""Ascending numbers, stored as contiguous ranges: the messages of a day usually form one range. Pure."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator

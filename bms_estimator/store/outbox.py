@@ -1,4 +1,4 @@
-"""Queue of messages that must reach the broker, kept until the broker acknowledges them.
+"""Queue of messages that must reach the broker. A message stays queued until the broker acknowledges it.
 
 While the broker acknowledges messages promptly, nothing is written to disk. While the broker is disconnected or
 behind, queued messages are written every ``FLUSH_S``, and only a page of them stays in memory. ``kill -9`` loses at
@@ -18,7 +18,8 @@ from bms_estimator.store.outbox_table import OutboxResult, OutboxTransaction, re
 FLUSH_S = 1.0
 """Interval at which queued messages are written to disk while the broker is disconnected or behind [s]."""
 BEHIND_INTERVALS = 3
-"""Age, in intervals of ``FLUSH_S``, of an unacknowledged message at which a connected broker counts as behind."""
+"""Number of intervals ``FLUSH_S``. A connected broker that has not acknowledged a message for this long counts as
+behind."""
 
 __all__ = ["Outbox", "QueuedMessage"]
 
@@ -39,7 +40,7 @@ class Outbox:
         self._backlog_read = database is None
         self._offset: int | None = None  # from queue numbers to those on disk; None until the backlog was read
         self._next_numbers: deque[int] = deque(maxlen=BEHIND_INTERVALS)  # the queue's next number, at each interval
-        self._synced_opening = 0  # value of database.opened at the last synchronization of memory and disk
+        self._open_count_at_sync = 0  # database.open_count at the last synchronization of memory and disk
         self._filled, self._sync_requested = asyncio.Event(), asyncio.Event()
         self._closing = False
         self._task: asyncio.Task[None] | None = None
@@ -87,9 +88,9 @@ class Outbox:
             self._sync_requested.set()
         return taken
 
-    def sent(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Record that the broker has acknowledged a message."""
-        self._queue.sent(number)
+        self._queue.acknowledge(number)
 
     def rewind(self) -> None:
         """Make ``take`` return all unacknowledged messages again, in order, after a lost connection."""
@@ -113,7 +114,7 @@ class Outbox:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout_at(due_s):
                     await self._sync_requested.wait()
-        self._queue.rewind()
+        self._queue.rewind()  # unacknowledged messages in flight are queued again, so that they are written too
         await self._sync(write=True)
 
     def _must_write(self) -> bool:
@@ -133,19 +134,27 @@ class Outbox:
                 backlog = await self._database.call(read_backlog)
                 self._offset = queue.prepend_backlog(backlog.runs)
                 queue.dropped += backlog.damaged
-                self._synced_opening = self._database.opened
+                self._open_count_at_sync = self._database.open_count
             transaction = self._transaction(self._offset, write=write)
             if transaction:
                 queue.mark_writing(transaction.rows)
                 self._apply_result(await self._database.call(transaction))
-            queue.disk_state_known, queue.skip_disk = self._synced_opening == self._database.opened, False
-            self._synced_opening = self._database.opened
+            # a database that was reopened since the last synchronization may have lost rows
+            queue.disk_state_known = self._open_count_at_sync == self._database.open_count
+            queue.skip_disk = False
+            self._open_count_at_sync = self._database.open_count
         except StoreError:
-            queue.disk_state_known, queue.skip_disk = False, True
+            queue.disk_state_known = False
+            queue.skip_disk = True
         self._backlog_read = True
         self._wake_taker()
 
     def _transaction(self, offset: int, *, write: bool) -> OutboxTransaction:
+        """Return the transaction that makes the disk match memory, and mark the disk as no longer stale.
+
+        The transaction deletes rows that are no longer queued, writes new messages and reads the next page. If the state
+        of the disk is unknown, it also writes all messages in memory again and lists the rows on disk.
+        """
         queue, stored = self._queue, self._queue.stored
         gaps = queue.gaps() if queue.stale or not queue.disk_state_known else []
         queue.stale = False

@@ -1,7 +1,7 @@
 """Order of queued messages, in memory and on disk. Pure: no disk, no clock, no task.
 
 From the oldest to the newest, messages are ``in_flight`` (sent and not acknowledged), ready to be sent, ``stored`` (on
-disk only), or in the tail. New messages enter the tail. While none is stored, messages are sent from the tail.
+disk only), or in the tail. New messages enter the tail. While no message is stored, messages are sent from the tail.
 """
 
 from collections import deque
@@ -13,7 +13,8 @@ from bms_estimator.mqtt.message import Message, QueuedMessage
 from bms_estimator.store.number_ranges import NumberRanges
 
 MAX_TAIL = 4096
-"""Maximum number of messages in the tail: some megabytes, or an hour of states while the disk cannot be written."""
+"""Maximum number of messages in the tail, which grows while the disk cannot be written. The limit corresponds to some
+megabytes, or to the states of an hour at one a second."""
 PAGE = 1000
 """Maximum number of ready messages. The next page is read from disk once fewer than half of them are left."""
 
@@ -26,7 +27,7 @@ class OutboxQueue:
     """Queue of numbered messages.
 
     Attributes:
-        most: Maximum number of queued messages; beyond it the oldest one not in flight is dropped.
+        most: Maximum number of queued messages. Beyond this number, the oldest message that is not in flight is dropped.
         dropped: Number of dropped and lost messages.
         next: Number of the next message.
         in_flight: Messages that were taken and are not acknowledged yet.
@@ -88,7 +89,7 @@ class OutboxQueue:
         self.in_flight |= {waiting.number: waiting for waiting in taken}
         return taken
 
-    def sent(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Record that a message is acknowledged."""
         if self.in_flight.pop(number, None):
             self._forget(number)
@@ -119,7 +120,7 @@ class OutboxQueue:
                 self.stored.add(oldest.number)
 
     def add_page(self, rows: Iterable[QueuedMessage], end: int) -> None:
-        """Make messages read from disk ready; stored ones before ``end`` that are missing are lost."""
+        """Make messages read from disk ready. Stored messages before ``end`` that are not among ``rows`` are lost."""
         wanted = self.stored.take_before(end)
         # the page may contain messages that were dropped while it was read
         read = {waiting.number: waiting for waiting in rows if waiting.number in wanted}
@@ -148,7 +149,7 @@ class OutboxQueue:
         return runs.first - first
 
     def retain_stored(self, runs: NumberRanges) -> None:
-        """Keep only those stored messages that are in ``runs``; the others are lost."""
+        """Remove the stored messages that are not in ``runs``, and count them as lost."""
         before = len(self.stored)
         self.stored = self.stored.intersection(runs)
         self._lose(before - len(self.stored))

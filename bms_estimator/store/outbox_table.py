@@ -9,9 +9,10 @@ from bms_estimator.mqtt.message import Message, QueuedMessage
 from bms_estimator.store.number_ranges import NumberRanges
 
 MAX_ABS_NUMBER = 1 << 40
-"""Bound of plausible message numbers: not reached in a thousand years. A row beyond it is damaged."""
+"""Bound of the absolute value of plausible message numbers, which is not reached in a thousand years. A row beyond the
+bound is damaged."""
 MAX_TOPIC = 0xFFFF
-"""Maximum length of a topic, by MQTT [bytes]."""
+"""Maximum length of an MQTT topic [bytes]."""
 
 _TOPIC = re.compile(r"[^+#\x00-\x1f\x7f-\x9f\ud800-\udfff]+")  # invalid UTF-8 is decoded to surrogates, D800..DFFF
 _NUMBERS = (
@@ -58,7 +59,7 @@ class OutboxTransaction:
     """Idempotent transaction of the outbox. Numbers are those of the queue."""
 
     offset: int
-    """Difference of a number on disk to the queue's."""
+    """Number on disk minus number in the queue."""
     first: int
     """First number that is on disk only."""
     end: int
@@ -66,14 +67,14 @@ class OutboxTransaction:
     gaps: list[tuple[int, int]]
     """Half-open ranges of numbers to delete."""
     rows: list[QueuedMessage]
-    """Messages to write; existing rows are replaced."""
+    """Messages to write. Existing rows with equal numbers are replaced."""
     page: int
     """Maximum number of messages to read, from the oldest."""
     recount: bool
-    """True to list the rows that exist of the messages on disk only, before any change."""
+    """True to list, before any change, those messages on disk only whose rows exist."""
 
     def __bool__(self) -> bool:
-        """Return True if the transaction reads or writes anything."""
+        """Return True if the transaction reads or writes rows."""
         return bool(self.gaps or self.rows or self.page or self.recount)
 
     def __call__(self, connection: sqlite3.Connection) -> OutboxResult:

@@ -133,7 +133,7 @@ async def test_samples_keep_their_period_in_a_store_later_than_the_clock(
     async with feed.edge:
         feed.add(2)
         later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
-        await until(lambda: feed.edge.store._on_disk.kept.next == 2)  # on disk
+        await until(lambda: feed.edge.store._on_disk.state.next == 2)  # on disk
         feed.edge.store.on_request(later)
         await until(lambda: feed.edge.store.last_s > WALL_S + 1e8)
         feed.add(4)
@@ -267,7 +267,7 @@ async def test_stream_stores_blocks_by_pack(receiver: Receiver, engine: NatsClus
         nc = await nats.connect(engine.url)
         stack.push_async_callback(nc.close)
         stream = await nc.jetstream().stream_info(
-            subjects.RAW_STREAM, subjects_filter=subjects.kept(0).replace("0", "*", 1)
+            subjects.RAW_STREAM, subjects_filter=subjects.stored_raw(0).replace("0", "*", 1)
         )
         assert stream.state.subjects
         assert sum(name.endswith(f".raw.{receiver.pack}") for name in stream.state.subjects) == 1

@@ -91,9 +91,9 @@ async def test_restart_continues_store_numbers_and_time_and_sends_unconfirmed_bl
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(6))
         for block in await take(store, 6):
-            store.sent(block.number)
+            store.acknowledge(block.number)
         store.on_request(BlockRequest(store=int(WALL_S) * NS, number=4, resend=False))
-        assert (store.waiting, store.kept) == (0, 3)
+        assert (store.waiting, store.unconfirmed) == (0, 3)
     async with opened(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
         assert store.last_s == WALL_S + 304.0
         await written(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
@@ -107,14 +107,14 @@ async def test_restart_continues_store_numbers_and_time_and_sends_unconfirmed_bl
 async def test_full_store_drops_the_oldest_blocks_and_updates_oldest(tmp_path: Path) -> None:
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(1))
-        size = store._on_disk.kept.bytes
+        size = store._on_disk.state.bytes
     async with opened(tmp_path / "s.sqlite", most_bytes=10 * size + size // 2) as store:
         with capture_logs() as lines:
             for block in minutes(60, 1):
                 await written(store, block)
         assert [line["reason"] for line in lines if "lost" in line["event"]] == ["the store is full"]
-        assert store._on_disk.kept.bytes <= 10 * size + size // 2
-        left = store.kept
+        assert store._on_disk.state.bytes <= 10 * size + size // 2
+        left = store.unconfirmed
         assert store.dropped == 61 - left
         blocks = await take(store, left)
         assert numbers(blocks) == list(range(62 - left, 62))
@@ -127,7 +127,7 @@ async def test_unacknowledged_blocks_are_taken_again_after_a_rewind(tmp_path: Pa
         await written(store, *minutes(6))
         await take(store, 5)
         for number in (1, 2, 4):
-            store.sent(number)
+            store.acknowledge(number)
         store.rewind()
         assert numbers(await take(store, 4)) == [3, 4, 5, 6]
 
@@ -167,7 +167,7 @@ async def test_restored_disk_begins_a_later_store(tmp_path: Path, awaits: BlockR
         await written(store, *minutes(3))
         await take(store, 3)
         store.on_request(awaits)
-        await until(lambda: store._on_disk.kept.made_s * NS > awaits.store)
+        await until(lambda: store._on_disk.state.made_s * NS > awaits.store)
         await written(store, block_at(WALL_S + 1000.0))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest) == (1, 1)
@@ -190,7 +190,7 @@ async def test_damaged_database_is_replaced_by_a_later_store(tmp_path: Path, dam
     path = tmp_path / "s.sqlite"
     async with opened(path) as store:
         await written(store, *minutes(3))
-        before = store._on_disk.kept.made_s
+        before = store._on_disk.state.made_s
     if damage == "no database":
         path.write_bytes(b"nothing of the kind" * 1000)
     elif damage == "deleted":
@@ -245,7 +245,7 @@ async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(ful
         for block in minutes(3):
             store.put(block)
         await until(lambda: store._database.reason)
-        assert (store.kept, store.waiting) == (3, 3)
+        assert (store.unconfirmed, store.waiting) == (3, 3)
         (full_disk / "file").unlink()
         await asyncio.to_thread(subprocess.run, ["mount", "-o", "remount,size=10m", full_disk], check=True)
         blocks = await take(store, 3)
@@ -258,7 +258,7 @@ async def test_memory_is_bounded_while_the_disk_fails(tmp_path: Path) -> None:
         store._database.path.parent.touch()
         for i in range(60):
             store.put(block_at(WALL_S + 60.0 * i, 20_000))
-        assert store.kept == 25
+        assert store.unconfirmed == 25
         assert store.dropped == 35
 
 
@@ -270,7 +270,7 @@ async def main():
     async with opened(Path(sys.argv[1])) as store:
         for block in minutes(10_000):
             await written(store, block)
-            print(store._on_disk.kept.next, file=sys.stderr, flush=True)
+            print(store._on_disk.state.next, file=sys.stderr, flush=True)
 asyncio.run(main())
 """
 
@@ -294,6 +294,6 @@ async def test_block_numbers_are_unique_over_kills(tmp_path: Path) -> None:
         reported = await asyncio.to_thread(kill_while_writing, path)
         assert reported >= next_ + 20
         async with opened(path) as store:
-            next_ = store._on_disk.kept.next
+            next_ = store._on_disk.state.next
             assert next_ >= reported
-            assert numbers(await take(store, store.kept)) == list(range(1, next_))
+            assert numbers(await take(store, store.unconfirmed)) == list(range(1, next_))

@@ -8,7 +8,7 @@ from nats.aio.client import Client
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
-from bms_estimator.fleet.packs.pack_row import PackSpec, stored
+from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from tests.sinks.snapshots import ONE
 
 HOME, VAN, PLANT = (
@@ -96,5 +96,5 @@ async def publish_heartbeat(nc: Client, worker: str, partitions: range, **values
 
 async def load(nc: Client, packs: list[Pack]) -> None:
     """Write the packs to the table."""
-    rows = {kind: stored(kind) for kind in (HOME, VAN, PLANT)}
+    rows = {kind: encode_row(kind) for kind in (HOME, VAN, PLANT)}
     await write_bucket(nc, subjects.PACKS_BUCKET, {pack.name: rows[pack.kind] for pack in packs})

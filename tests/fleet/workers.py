@@ -21,7 +21,7 @@ from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
-from bms_estimator.fleet.packs.pack_row import PackSpec, stored
+from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import SAMPLE
@@ -30,7 +30,7 @@ from tests.patience import LONG_S
 
 PERIOD_S = 10.0
 """Interval between two samples [s]."""
-KIND = stored(PackSpec(cell="ncr18650", period_s=PERIOD_S))
+KIND = encode_row(PackSpec(cell="ncr18650", period_s=PERIOD_S))
 STORE = 1_790_000_000 * 10**9
 """Creation time of the edges' stores [ns since 1970]."""
 SAMPLES = 60

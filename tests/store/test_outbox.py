@@ -46,7 +46,7 @@ async def test_messages_are_taken_once_and_in_order():
 async def test_unacknowledged_messages_are_taken_again_before_newer_ones():
     outbox = filled(3)
     first, *_ = await outbox.take(3)
-    outbox.sent(first.number)
+    outbox.acknowledge(first.number)
     outbox.put(message(3))
     outbox.rewind()
     assert await taken(outbox, 9) == [1, 2, 3]
@@ -111,7 +111,7 @@ async def test_nothing_is_written_while_the_broker_acknowledges(path):
         for number in range(50):
             outbox.put(message(number))
             [waiting] = await outbox.take(9)
-            outbox.sent(waiting.number)
+            outbox.acknowledge(waiting.number)
             await until(lambda number=number: number + 1 in outbox._next_numbers)
     assert database.calls == 1, "the backlog of an earlier run is read"
     assert on_disk(path) == []
@@ -130,7 +130,7 @@ async def test_messages_of_an_earlier_run_precede_newer_ones(path):
         for number in range(5):
             outbox.put(message(number))
         first, *_ = await outbox.take(2)
-        outbox.sent(first.number)
+        outbox.acknowledge(first.number)
     async with Database(path) as database, Outbox(database, most=100) as outbox:
         outbox.put(message(5))
         got: list[int] = []
@@ -152,7 +152,7 @@ async def test_backlog_beyond_memory_is_read_from_disk_in_order(path):
             async with asyncio.timeout(LONG_S):
                 for waiting in await outbox.take(50):
                     got.append(int(waiting.message.payload))
-                    outbox.sent(waiting.number)
+                    outbox.acknowledge(waiting.number)
         await until(lambda: on_disk(path) == [])
     assert got == list(range(count))
     assert (outbox.dropped, outbox.waiting) == (0, 0)

@@ -115,7 +115,7 @@ class OutboxMachine(RuleBasedStateMachine):
         self.acknowledge(data.draw(st.sampled_from(sorted(self.out))))
 
     def acknowledge(self, number: int) -> None:
-        self.outbox.sent(self.out.pop(number))
+        self.outbox.acknowledge(self.out.pop(number))
         self.pending.remove(number)
         self.acknowledged.add(number)
 
@@ -199,7 +199,7 @@ class OutboxMachine(RuleBasedStateMachine):
                 self.sync(write=False)
                 for waiting in self.outbox._queue.take_next(PAGE):
                     got.append(int(waiting.message.payload))
-                    self.outbox.sent(waiting.number)
+                    self.outbox.acknowledge(waiting.number)
             assert sorted(got) == sorted(self.pending)
             assert not self.strict or got == self.pending
             self.sync(write=True)

@@ -40,8 +40,8 @@ def test_acknowledged_messages_are_deleted_only_if_written():
     queue = filled(2)
     queue.put(Message("t", b"2", 1, retain=False))
     _, second, third = queue.take_next(3)
-    queue.sent(third.number)
+    queue.acknowledge(third.number)
     assert not queue.stale, "it was never written"
-    queue.sent(second.number)
+    queue.acknowledge(second.number)
     assert queue.stale
     assert queue.gaps() == [(LOWEST, 0), (1, 3)]

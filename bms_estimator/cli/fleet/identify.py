@@ -24,7 +24,7 @@ from bms_estimator.cli.options.capture_options import AsJson, Force, check_out
 from bms_estimator.cli.options.number_options import whole
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
-from bms_estimator.fleet.packs.pack_row import PackSpec, stored
+from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
@@ -138,12 +138,12 @@ async def _put(results: Sequence["ReidentificationResult"], known: PackRegistry,
             kind = known.kind(one.pack)
             if not one.cell_file or not isinstance(kind, PackSpec):
                 continue
-            if stored_rows.get(one.pack) != stored(kind):
+            if stored_rows.get(one.pack) != encode_row(kind):
                 changed.append(one.pack)
                 continue
             name = cell_name(one.pack)
             cells[name] = one.cell_file.encode()
-            rows[one.pack] = stored(kind.model_copy(update={"cell": name, "capacity_ah": None}))
+            rows[one.pack] = encode_row(kind.model_copy(update={"cell": name, "capacity_ah": None}))
         await put(nc, CELLS_BUCKET, cells)
         await put(nc, PACKS_BUCKET, rows)
     return changed

@@ -18,7 +18,8 @@ from bms_estimator.sinks.terminal.screen import LOG_LINES
 
 def demo(
     seconds: Annotated[
-        float | None, typer.Option(parser=decimal(0.1), help="duration [s]; default: until Ctrl-C", show_default=False)
+        float | None,
+        typer.Option(parser=decimal(0.1), help="duration in seconds; default: until Ctrl-C", show_default=False),
     ] = None,
     port: Annotated[
         int | None,

@@ -32,7 +32,7 @@ def history(
         datetime | None, typer.Option(formats=FORMATS, help="end time (exclusive), UTC; default: now")
     ] = None,
     step: Annotated[
-        int, typer.Option(parser=whole(MINUTE_S), help="interval of the rows [s], whole minutes")
+        int, typer.Option(parser=whole(MINUTE_S), help="interval of the rows in seconds, whole minutes")
     ] = MINUTE_S,
     events: Annotated[bool, typer.Option("--events", help="print events instead of measurements")] = False,
     folder: Annotated[

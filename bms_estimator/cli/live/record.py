@@ -43,7 +43,9 @@ def record(
     seconds: Annotated[
         float | None,
         typer.Option(
-            parser=decimal(0.0), help="duration from the first bytes [s]; default: until Ctrl-C", show_default=False
+            parser=decimal(0.0),
+            help="duration in seconds from the first bytes; default: until Ctrl-C",
+            show_default=False,
         ),
     ] = None,
 ) -> None:

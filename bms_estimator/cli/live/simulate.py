@@ -60,7 +60,9 @@ def simulate(
     speed: Annotated[float, typer.Option(parser=decimal(1e-3), help="speed relative to real time")] = 1.0,
     seconds: Annotated[
         float,
-        typer.Option(parser=decimal(0.0), help="simulated duration [s]; default: until Ctrl-C", show_default=False),
+        typer.Option(
+            parser=decimal(0.0), help="simulated duration in seconds; default: until Ctrl-C", show_default=False
+        ),
     ] = math.inf,
     seed: Annotated[int, typer.Option(parser=whole(), help="seed of load and noise")] = 0,
 ) -> None:

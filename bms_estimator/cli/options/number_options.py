@@ -7,14 +7,14 @@ from typing import TypeVar
 
 import typer
 
-from bms_estimator.model.decimal_text import number
+from bms_estimator.model.decimal_text import number as parse_decimal
 
 Number = TypeVar("Number", int, float)
 
 
 def decimal(minimum: float = -math.inf, maximum: float = math.inf) -> Callable[[str | float], float]:
     """Return a parser of a decimal number within limits."""
-    return _within(number, minimum, maximum)
+    return _within(parse_decimal, minimum, maximum)
 
 
 def whole(minimum: float = -math.inf, maximum: float = math.inf) -> Callable[[str | int], int]:

@@ -28,27 +28,29 @@ _TEXT_BY_CLASS: dict[type[BaseException], str] = {
     TimeoutError: "no answer in time: are most nodes up, and is it the port for workers (4222)?",  # nats.errors.TimeoutError is a subclass
     ConnectionRefusedError: "connection refused: no server listens on this address",
 }
-"""Texts by exception class; the first matching class applies."""
+"""Error texts by exception class. The first matching class applies."""
 
 _TEXT_BY_PART = {
     "authorization violation": "the server requires credentials, or rejects these: check --creds",
     "permissions violation": "these credentials do not permit this: check --creds",
     "certificate_verify_failed": "the server's certificate is not trusted, or is for another name: check --ca",
 }
-"""Texts by part of the error text, for errors that the library reports as text only."""
+"""Error texts by part of the library's error text, for errors that have no exception class of their own."""
 
 AUTH_TIMEOUT_S = 10
-"""Timeout of each authentication step [s], long enough for a slow line or many simultaneous reconnects. The server's default is
-2."""
+"""Timeout of each authentication step [s], long enough for a slow line or many simultaneous reconnects. The server's
+default is 2 s."""
 
 RETRY_S = 1
 """Delay between two connection attempts [s]."""
 PING_S = 10
-"""Ping interval [s]; a connection without two responses is reconnected."""
+"""Ping interval [s]. After two unanswered pings the client reconnects."""
 FLUSH_TIMEOUT_S = 5.0
-"""Timeout of a flush [s], which a server that does not read would block."""
+"""Timeout of a flush [s]. Without a timeout, a server that stops reading would block the flush forever."""
 CLOSE_TIMEOUT_S = 3.0
-"""Timeout of closing a connection [s]."""
+"""Timeout of closing a transport, after which the transport is aborted [s]."""
+CLIENT_CLOSE_TIMEOUT_S = 2.0 * CLOSE_TIMEOUT_S
+"""Timeout of closing a client [s]. It exceeds the transport's timeout, so that the transport can be aborted first."""
 REPEATED_LOG_S = 30.0
 """Minimum interval between two log lines with equal error texts [s]."""
 
@@ -120,7 +122,7 @@ async def connect(
 async def close(nc: Client) -> None:
     """Close a connection in any state."""
     with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
-        async with asyncio.timeout(2.0 * CLOSE_TIMEOUT_S):
+        async with asyncio.timeout(CLIENT_CLOSE_TIMEOUT_S):
             await nc.close()
 
 
@@ -168,18 +170,18 @@ def tls_context(ca: Path) -> ssl.SSLContext:
 
 
 class _ConnectionEvents:
-    """Callbacks of a connection: log its errors and changes, and report them."""
+    """Callbacks of a connection, which log and report errors and changes of the connection."""
 
     def __init__(self, nc: Client, servers: str, on_link_change: Callable[[str | None], None]) -> None:
         self._nc, self._servers, self._on_link_change = nc, servers, on_link_change
-        self._last: tuple[str, float] = ("", 0.0)
+        self._logged_text, self._logged_s = "", 0.0  # text and time of the last logged error
 
     async def on_error(self, error: Exception) -> None:
         text, now_s = error_text(error), time.monotonic()
         if not self._nc.is_connected:
             self._on_link_change(text)
-        if (text, True) != (self._last[0], now_s < self._last[1] + REPEATED_LOG_S):
-            self._last = text, now_s
+        if text != self._logged_text or now_s >= self._logged_s + REPEATED_LOG_S:
+            self._logged_text, self._logged_s = text, now_s
             log.warning("error of the connection to the server", server=self._servers, reason=text)
 
     async def on_disconnect(self) -> None:
@@ -189,13 +191,13 @@ class _ConnectionEvents:
         log.warning("the connection to the server is lost; reconnecting", server=self._servers)
 
     async def on_reconnect(self) -> None:
-        self._last = ("", 0.0)
+        self._logged_text, self._logged_s = "", 0.0
         self._on_link_change(None)
         log.info("reconnected to the server", server=self._servers)
 
 
 def error_text(error: BaseException) -> str:
-    """Return an error of NATS or of the connection as text, with a remedy if one is known."""
+    """Return the text of an error of NATS or of the connection, with a remedy if one is known."""
     text = str(getattr(error, "description", None) or error).removeprefix("nats: ") or type(error).__name__
     for kind, reason in _TEXT_BY_CLASS.items():
         if isinstance(error, kind):

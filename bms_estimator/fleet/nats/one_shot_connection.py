@@ -18,8 +18,10 @@ from bms_estimator.fleet.nats.connection import (
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
 
-CONNECT_TIMEOUT_S, RETRY_S = 5, 0.1
-"""Timeout of a connection attempt, and delay between two attempts [s]."""
+CONNECT_TIMEOUT_S = 5
+"""Timeout of a connection attempt [s]."""
+RETRY_S = 0.1
+"""Delay between two connection attempts [s]."""
 
 
 @asynccontextmanager
@@ -27,7 +29,8 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
     """Connect without reconnecting. A lost connection ends the command.
 
     Raises:
-        UserError: The server does not respond or rejects the client, a file cannot be read, or later a stream cannot be read.
+        UserError: The server does not respond or rejects the client, or a file cannot be read. Within the context, a
+            stream cannot be read.
     """
     callback_errors = list[Exception]()
 

@@ -1,17 +1,19 @@
-"""Messages of a stream on a subject, between two sequence numbers."""
+"""Reader of a stream's messages on a subject, between two sequence numbers."""
 
 import asyncio
 from collections.abc import AsyncGenerator
 
 from nats.aio.client import Client
 
-from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, Stored, StreamError, read_stream
+from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StoredMessage, StreamError, read_stream
 
 POLL_S = 0.1
-"""Poll interval while a node lacks data that another one has [s]."""
+"""Poll interval while the responding node lags behind the stream's leader [s]."""
 
 
-async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -> AsyncGenerator[Stored, None]:
+async def read_messages(
+    nc: Client, stream: str, subject: str, first: int, last: int
+) -> AsyncGenerator[StoredMessage, None]:
     """Yield all messages between two sequence numbers, in order.
 
     The node that responds may lag behind the stream's leader. Therefore it is polled until it has the message ``last``.
@@ -36,6 +38,6 @@ async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -
             if first > last:
                 return
         if (await nc.jetstream().stream_info(stream)).state.first_seq > last:
-            return  # the stream has meanwhile dropped the messages
+            return  # the stream has dropped the messages meanwhile
         await asyncio.sleep(POLL_S)
     raise StreamError(f"the server has lost message {last} of {stream}, or the responding node lags far behind")

@@ -1,6 +1,6 @@
-"""Messages of a stream, read in batches from a sequence number on, without a consumer on the server.
+"""Reader of a stream's messages in batches from a sequence number on, without a consumer on the server.
 
-It uses batched direct gets (https://github.com/nats-io/nats-architecture-and-design, ADR-31), which nats-py does not
+The reader uses batched direct gets (https://github.com/nats-io/nats-architecture-and-design, ADR-31), which nats-py does not
 support. Each request is independent, so that reading continues after a restart of the server.
 """
 
@@ -13,15 +13,17 @@ from nats.aio.client import Client
 from nats.aio.subscription import Subscription
 from nats.errors import TimeoutError as NatsTimeoutError
 
-BATCH, BATCH_BYTES = 1000, 8 << 20
-"""Maximum number and size of messages in one response, so that other users of the connection do not wait long."""
+BATCH_MESSAGES = 1000
+"""Maximum number of messages in one response, so that other users of the connection do not wait long."""
+BATCH_BYTES = 8 << 20
+"""Maximum size of one response [bytes], so that other users of the connection do not wait long."""
 RESPONSE_TIMEOUT_S = 10.0
-"""Timeout of one message of a response [s]."""
-_END_OF_BATCH, _NO_MESSAGES = "204", "404"
+"""Timeout of each message of a response [s]."""
+_END_OF_BATCH, _NO_MESSAGES = "204", "404"  # values of the header Status
 
 
-class Stored(NamedTuple):
-    """A message of a stream."""
+class StoredMessage(NamedTuple):
+    """Message of a stream."""
 
     subject: str
     sequence: int
@@ -35,7 +37,7 @@ class StreamError(Exception):
 
 async def read_stream(
     nc: Client, stream: str, subject: str, *, first: int = 1, since_s: float | None = None
-) -> AsyncIterator[list[Stored]]:
+) -> AsyncIterator[list[StoredMessage]]:
     """Yield batches of messages in the order of the stream, up to its last message.
 
     Args:
@@ -60,20 +62,20 @@ async def read_stream(
         start = {"seq": batch[-1].sequence + 1}
 
 
-async def _batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[list[Stored], bool]:
-    """Return one batch; True if the stream has further messages."""
+async def _batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[list[StoredMessage], bool]:
+    """Return one batch, and True if the stream has further messages."""
     inbox = nc.new_inbox()
     responses = await nc.subscribe(inbox, pending_msgs_limit=-1, pending_bytes_limit=-1)
     try:
-        data = json.dumps(request | {"batch": BATCH, "max_bytes": BATCH_BYTES}).encode()
+        data = json.dumps(request | {"batch": BATCH_MESSAGES, "max_bytes": BATCH_BYTES}).encode()
         await nc.publish(f"$JS.API.DIRECT.GET.{stream}", data, reply=inbox)
         return await _collect(responses, stream)
     finally:
         await responses.unsubscribe()
 
 
-async def _collect(responses: Subscription, stream: str) -> tuple[list[Stored], bool]:
-    batch = list[Stored]()
+async def _collect(responses: Subscription, stream: str) -> tuple[list[StoredMessage], bool]:
+    batch = list[StoredMessage]()
     while True:
         try:
             message = await responses.next_msg(timeout=RESPONSE_TIMEOUT_S)
@@ -83,7 +85,7 @@ async def _collect(responses: Subscription, stream: str) -> tuple[list[Stored], 
         status = headers.get("Status")
         if status is None:
             subject, sequence = headers["Nats-Subject"], int(headers["Nats-Sequence"])
-            batch.append(Stored(subject, sequence, message.data, headers))
+            batch.append(StoredMessage(subject, sequence, message.data, headers))
         elif status in (_END_OF_BATCH, _NO_MESSAGES):
             return batch, bool(batch) and int(headers.get("Nats-Num-Pending", 0)) > 0
         else:

@@ -21,15 +21,19 @@ from bms_estimator.model.errors import UserError
 P = ParamSpec("P")
 T = TypeVar("T")
 
-RAW_BYTES, RAW_AGE_S = 8 << 30, 7 * 86_400.0
-"""Default limits of the stream ``RAW``: size [bytes] and age [s]."""
-HOURS_FRACTION, HOURS_AGE_S = 1 / 16, 30 * 86_400.0
-"""Limits of the stream ``HOURS``: size as a fraction of that of ``RAW``, and age [s]."""
+RAW_BYTES = 8 << 30
+"""Default maximum size of the stream ``RAW`` [bytes]."""
+RAW_AGE_S = 7 * 86_400.0
+"""Default maximum age of a message in the stream ``RAW`` [s]."""
+HOURS_FRACTION = 1 / 16
+"""Maximum size of the stream ``HOURS`` as a fraction of the maximum size of ``RAW``."""
+HOURS_AGE_S = 30 * 86_400.0
+"""Maximum age of a message in the stream ``HOURS`` [s]."""
 MAX_BLOCK_BYTES = 256 << 10
 """Maximum size of a block in ``RAW`` [bytes]: 7,000 incompressible samples."""
 PACK_FRACTION = 1 / 3
-"""Fraction of ``RAW`` that one pack can fill with blocks of the maximum size; then its oldest block is removed. By default this is
-seven days of minute blocks."""
+"""Fraction of ``RAW`` that one pack can fill with blocks of the maximum size. Beyond this fraction, the pack's oldest
+block is removed. By default the fraction corresponds to seven days of minute blocks."""
 MIN_PACK_BLOCKS = 60
 """Minimum number of stored blocks of a pack, even in a small ``RAW``: an hour of minute blocks."""
 DUPLICATES_S = 3600.0
@@ -40,12 +44,14 @@ PIN_S = 2.0
 """Time without a request after which a worker loses a partition [s]."""
 PARTITIONS_KEY = "bms.partitions"
 """Metadata key of ``RAW`` with the number of partitions."""
-RESPONSE_TIMEOUT_S, MAX_ATTEMPTS = 5.0, 12
-"""Timeout of a request [s], and number of attempts: a cluster drops requests while it elects a leader."""
+RESPONSE_TIMEOUT_S = 5.0
+"""Timeout of a request [s]."""
+MAX_ATTEMPTS = 12
+"""Maximum number of attempts of a request, because a cluster drops requests while it elects a leader."""
 NO_SUCH_STREAM = 10059
 """Error code of the server for a missing stream."""
 CONSUMER_BATCH = 16
-"""Number of consumers created at a time."""
+"""Maximum number of consumers that are created concurrently."""
 
 
 class NoAnswerError(UserError):
@@ -60,7 +66,7 @@ async def make_streams(
     raw_bytes: int = RAW_BYTES,
     raw_age_s: float = RAW_AGE_S,
 ) -> None:
-    """Create missing streams and consumers, and set limits and replicas as configured. May be repeated.
+    """Create missing streams and consumers, and set limits and replicas as configured. The function is idempotent.
 
     Args:
         nc: Connection of the tenant.
@@ -165,7 +171,7 @@ async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
     name = consumer(partition)
     config = {
         "durable_name": name,
-        "filter_subject": subjects.kept(partition),
+        "filter_subject": subjects.stored_raw(partition),
         "ack_policy": "none",
         "priority_groups": [GROUP],
         "priority_policy": "pinned_client",
@@ -178,7 +184,7 @@ async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
         raise _rejection(f"{subjects.RAW_STREAM}, consumer {name}", response)
 
 
-async def _retry(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
+async def _retry(send_request: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
     """Repeat a request until the server responds. Every request of this module is idempotent.
 
     Raises:
@@ -187,7 +193,7 @@ async def _retry(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwar
     """
     for _ in range(MAX_ATTEMPTS):
         with contextlib.suppress(NatsTimeoutError):
-            return await ask(*args, **kwargs)
+            return await send_request(*args, **kwargs)
     raise NoAnswerError(f"the server has not responded for {MAX_ATTEMPTS * RESPONSE_TIMEOUT_S:g} s: are most nodes up?")
 
 

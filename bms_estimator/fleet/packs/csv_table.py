@@ -1,4 +1,7 @@
-"""Table of a fleet's packs: CSV with one row a pack. Errors name line, column and remedy."""
+"""Reader and writer of a fleet's table of packs, a CSV file with one row per pack.
+
+An error text names the line, the column and a remedy.
+"""
 
 import csv
 import io
@@ -11,14 +14,14 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, known_cells, model_key, model_of, stored
+from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, encode_row, known_cells, model_key, model_of
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import DEVICE_NAME
 
 MAX_ERRORS = 20
-"""Maximum number of errors that are reported for a table."""
+"""Maximum number of reported errors of a table."""
 CELL_FILE = ".toml"
-"""Suffix of a cell that is a file beside the table."""
+"""Suffix in column ``cell`` that marks the name of a cell file beside the table."""
 _INTEGER_COLUMNS = ("series", "parallel")
 _TEXT_COLUMNS = ("pack", "cell", "protocol")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -30,7 +33,7 @@ class Line(NamedTuple):
     number: int
     kind: PackSpec
     data: bytes
-    """Row as ``stored`` encodes it."""
+    """Row as ``encode_row`` encodes it."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +75,11 @@ def check_models(path: Path, table: PackTable, cell_files: Mapping[str, str]) ->
     Raises:
         UserError: A line for each kind without a valid model, with its first line in the table.
     """
-    alike = dict[tuple[object, ...], list[Line]]()
+    lines_by_model = dict[tuple[object, ...], list[Line]]()
     for line in table.packs.values():
-        alike.setdefault(model_key(line.kind), []).append(line)
+        lines_by_model.setdefault(model_key(line.kind), []).append(line)
     errors = []
-    for lines in alike.values():
+    for lines in lines_by_model.values():
         first = lines[0]
         try:
             model_of(first.kind, cell_files.get(first.kind.cell))
@@ -95,7 +98,7 @@ class _Reader:
         self._files = dict[str, Path]()
 
     def table(self) -> PackTable:
-        """Read and return the table; errors as in ``read_table``."""
+        """Read and return the table. Errors are those of ``read_table``."""
         rows = csv.reader(io.StringIO(text := self._text(), newline=""), delimiter=_separator(text), strict=True)
         packs, errors = dict[str, Line](), list[str]()
         try:
@@ -150,7 +153,7 @@ class _Reader:
                 column: value for column, value in zip(columns, values, strict=True) if value and column != "pack"
             }
             kind = self._kind(filled)
-            self._kinds[key] = kind, stored(kind)
+            self._kinds[key] = kind, encode_row(kind)
         return name, *self._kinds[key]
 
     def _kind(self, filled: Mapping[str, str]) -> PackSpec:

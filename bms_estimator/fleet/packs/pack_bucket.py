@@ -1,4 +1,4 @@
-"""Table of packs on the server: one row a pack in the bucket ``packs``, cell files in the bucket ``cells``."""
+"""Table of packs on the server: one row per pack in the bucket ``packs``, cell files in the bucket ``cells``."""
 
 import asyncio
 from collections.abc import Callable, Collection, Mapping
@@ -11,7 +11,7 @@ from nats.aio.client import Client
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, Stored, StreamError, read_stream
+from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StoredMessage, StreamError, read_stream
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 
 POLL_S = 1.0
@@ -23,7 +23,7 @@ _REMOVING_OPERATIONS = frozenset({"DEL", "PURGE"})
 
 @dataclass(frozen=True)
 class Written:
-    """Numbers of rows by the effect of a table change."""
+    """Numbers of rows by the effect of a write."""
 
     new: int
     changed: int
@@ -34,7 +34,7 @@ class Written:
 
 
 class PackBucket:
-    """Copy of the table that follows its changes. Errors in a row make its packs unknown and are not raised.
+    """Copy of the table, updated by polling. An error in a row is not raised: it makes the row's pack unknown.
 
     Args:
         nc: Connection of the tenant.
@@ -42,7 +42,7 @@ class PackBucket:
     Attributes:
         packs: Registry of the packs.
         faults: Number of failed reads.
-        fault: Reason of the last failed read; empty after a successful one.
+        fault: Reason for the last failed read; empty after a successful read.
     """
 
     def __init__(self, nc: Client) -> None:
@@ -65,13 +65,13 @@ class PackBucket:
         return changed
 
     async def _read(self, bucket: str, set_value: Callable[[str, bytes | None], bool]) -> None:
-        """Read the changed keys of a bucket. They are kept for the next refresh if this one fails."""
+        """Read the changed keys of a bucket. They remain in ``_changed`` for the next refresh if this refresh fails."""
         try:
             state = (await self._nc.jetstream().stream_info(_stream(bucket))).state
         except nats.errors.Error as error:
             raise StreamError(f"the server rejects reading {_stream(bucket)}: {error_text(error)}") from None
         if state.last_seq + 1 < self._next[bucket]:
-            self._next[bucket] = 1  # recreated, or its end is lost: sequence numbers are used again
+            self._next[bucket] = 1  # the stream was recreated or has lost its end: sequence numbers are used again
         async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next[bucket]):
             for message in batch:
                 key, data = _entry(bucket, message)
@@ -120,7 +120,7 @@ async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, 
         nc: Connection of the tenant.
         bucket: Name of the bucket.
         values: Values by key.
-        remove: Whether to remove entries that are not in ``values``.
+        remove: True to remove entries that are not in ``values``.
 
     Raises:
         StreamError: The server does not respond or rejects the request.
@@ -147,7 +147,7 @@ async def remove_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
 async def put(
     nc: Client, bucket: str, values: Mapping[str, bytes], headers: Mapping[str, str] = MappingProxyType({})
 ) -> None:
-    """Write values by key, many at a time.
+    """Write values by key, up to ``MAX_PENDING`` at a time.
 
     Raises:
         StreamError: The server does not respond or rejects the request.
@@ -165,7 +165,7 @@ async def put(
         raise StreamError(f"the server does not store rows of {bucket}: {error}") from None
 
 
-def _entry(bucket: str, message: Stored) -> tuple[str, bytes | None]:
+def _entry(bucket: str, message: StoredMessage) -> tuple[str, bytes | None]:
     """Return key and value of a message; the value None means that the key was removed."""
     is_removed = message.headers.get("KV-Operation") in _REMOVING_OPERATIONS or "Nats-Marker-Reason" in message.headers
     return message.subject.removeprefix(_key(bucket, "")), None if is_removed else message.data

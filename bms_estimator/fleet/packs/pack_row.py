@@ -71,13 +71,13 @@ COLUMNS = ("pack", *PackSpec.model_fields)
 """Columns of a table in written order."""
 
 
-def stored(kind: PackSpec) -> bytes:
+def encode_row(kind: PackSpec) -> bytes:
     """Encode a pack's row for the server; equal values give equal bytes."""
     return kind.model_dump_json(exclude_defaults=True).encode()
 
 
 def kind_of(data: bytes) -> PackSpec:
-    """Decode a row encoded by ``stored``.
+    """Decode a row encoded by ``encode_row``.
 
     Raises:
         ValueError: The bytes are not a row; the message gives the reason.

@@ -25,7 +25,7 @@ from nats.nuid import NUID
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.stored_messages import stored
+from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.model.clock import iso_utc
 
 CHECKPOINTS_PER_PARTITION = 2
@@ -215,7 +215,7 @@ class CheckpointStore:
         info = await self._states.get_info(name)
         subject = f"$O.{subjects.STATES_BUCKET}.C.{info.nuid}"
         last = (await self._js.get_last_msg(_STREAM, subject)).seq or 0
-        data = b"".join([message.data async for message in stored(self._nc, _STREAM, subject, 1, last)])
+        data = b"".join([message.data async for message in read_messages(self._nc, _STREAM, subject, 1, last)])
         return data if len(data) == info.size and info.digest == _digest(hashlib.sha256(data).digest()) else None
 
     async def _remove_object(self, name: str) -> None:

@@ -1,6 +1,7 @@
-"""State of one pack in a worker: next block, totals, sums of the hour, estimator record.
+"""State of one pack in a worker: awaited block, totals, sums of the hour, estimator record.
 
-The record is stored packed (``kernels.packed_record``) in immutable bytes, so that a snapshot of a partition needs no copy.
+The record is stored packed (``kernels.packed_record``) in immutable bytes, so that a snapshot of a partition needs no
+copy. An edge's store is identified by its creation time [ns since 1970]; see ``edge.block``.
 """
 
 from collections.abc import Mapping
@@ -23,18 +24,32 @@ MAX_LOST_BLOCKS = 2**62
 
 DELIVERY = np.dtype(
     [
-        ("store", "u8"),  # the edge's store with the awaited blocks [ns since 1970]; 0: no block yet
-        ("awaited", "u8"),  # number of the next block
-        ("ahead", "i8"),  # number of received blocks behind a missing one
-        ("first_ahead", "u8"),  # lowest number of a block behind a missing one; 0: none
-        ("passed", "i8"),  # how often block ``first_ahead`` was received
-        ("blocks", "i8"),  # number of processed blocks
-        ("lost_blocks", "i8"),  # number of blocks that were never received
-        ("clock", "u8"),  # store of the last sample's block, the origin of its time stamps; 0: no sample yet
-        ("last_s", "f8"),  # the last sample's time stamp [s]
-        ("hour", "i8"),  # current hour [hours since 1970]; 0: no block yet
-        ("made_of", "u8", 2),  # ``PackType.config_digest``
-        ("meaning", "u8", 2),  # ``PackType.state_digest``
+        # creation time of the store with the awaited block [ns since 1970]; 0: no block yet
+        ("store", "u8"),
+        # number of the awaited block, the next to be processed
+        ("awaited", "u8"),
+        # count of blocks that were received with a number above the awaited one
+        ("ahead", "i8"),
+        # lowest number among these early blocks; 0: none
+        ("first_ahead", "u8"),
+        # number of times that block ``first_ahead`` was received; after ``block_order.MAX_EARLY_REPEATS`` of them the
+        # missing blocks count as lost
+        ("passed", "i8"),
+        # number of processed blocks
+        ("blocks", "i8"),
+        # number of blocks that were never received
+        ("lost_blocks", "i8"),
+        # creation time of the store of the last valid sample, from which its timestamp counts [ns since 1970]; 0: no
+        # sample yet
+        ("clock", "u8"),
+        # timestamp of the last valid sample [s since ``clock``]
+        ("last_s", "f8"),
+        # current hour [hours since 1970]; 0: no block yet
+        ("hour", "i8"),
+        # ``PackType.config_digest`` of the settings with which the state was computed
+        ("made_of", "u8", 2),
+        # ``PackType.state_digest`` of the settings on which the meaning of the state depends
+        ("meaning", "u8", 2),
     ],
     align=True,
 )
@@ -59,7 +74,7 @@ class StateError(ValueError):
 
 
 class WorkRecord:
-    """Work record: one unpacked record into which the packs of a partition are loaded in turn.
+    """Unpacked record into which the packs of a partition are loaded in turn.
 
     Attributes:
         record: Shape (1,), dtype ``PACK_STATE``.
@@ -68,7 +83,8 @@ class WorkRecord:
     def __init__(self, dtype: np.dtype[Any] = PACK_STATE) -> None:
         self.record: NDArray[np.void] = np.zeros(1, dtype)
         self._words = self.record.view(np.uint64)
-        self._mirror = symmetry_map(dtype)
+        # Words below the diagonal of a covariance usually equal their mirror words and are then not stored.
+        self._symmetric_words = symmetry_map(dtype)
         self._buffer = packed_buffer(self._words.size)
 
     @property
@@ -88,11 +104,11 @@ class WorkRecord:
             StateError: The bytes do not have this layout.
         """
         are_words = len(packed) % WORD_BYTES == 0
-        if not (are_words and unpack(np.frombuffer(packed, np.uint64), self._mirror, self._words)):
+        if not (are_words and unpack(np.frombuffer(packed, np.uint64), self._symmetric_words, self._words)):
             raise StateError(f"{len(packed)} bytes are not a packed record")
 
     def load_previous_layout(self, dtype: np.dtype[Any], packed: bytes) -> Fields:
-        """Unpack a pack's record of another layout into this one: the fields that exist here, except for the estimator.
+        """Unpack a pack's record of another layout. Copy the fields that exist here, except those of the estimator.
 
         Args:
             dtype: Dtype of the record.
@@ -124,4 +140,4 @@ class WorkRecord:
 
     def packed_bytes(self) -> bytes:
         """Return the packed record."""
-        return self._buffer[: pack(self._words, self._mirror, self._buffer)].tobytes()
+        return self._buffer[: pack(self._words, self._symmetric_words, self._buffer)].tobytes()

@@ -22,7 +22,7 @@ from nats.js.errors import NotFoundError
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.stored_messages import stored
+from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
@@ -231,7 +231,7 @@ class PartitionLease:
 
     async def _take_deferred(self, partition: Partition, pack: str, span: Span) -> None:
         """Process the next deferred message of a pack."""
-        js, subject = self._nc.jetstream(), subjects.kept(self.number, pack)
+        js, subject = self._nc.jetstream(), subjects.stored_raw(self.number, pack)
         try:
             message = await js.get_msg(subjects.RAW_STREAM, span.first, subject, next=True)
         except NotFoundError:  # the stream has dropped them; the reply to the edge's next block requests them again
@@ -277,7 +277,7 @@ class PartitionLease:
             return
         async with self._state_lock:
             partition = await self._take_over()
-        js, subject = self._nc.jetstream(), subjects.kept(self.number)
+        js, subject = self._nc.jetstream(), subjects.stored_raw(self.number)
         try:
             await js.get_msg(subjects.RAW_STREAM, partition.sequence + 1, subject, next=True)
         except NotFoundError:
@@ -330,8 +330,8 @@ class PartitionLease:
         if partition.sequence >= sequence:
             return
         latest: dict[str, BlockResult] = {}
-        subject = subjects.kept(self.number)
-        messages = stored(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
+        subject = subjects.stored_raw(self.number)
+        messages = read_messages(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
         async with aclosing(messages):
             async for message in messages:
                 pack = message.subject.rpartition(".")[2]

@@ -27,15 +27,15 @@ from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.line_protocol import lines
 
 MAX_WAITING = 10_000
-"""Maximum number of queued lines, hours of states at one a second; beyond it the oldest is dropped."""
+"""Maximum number of queued lines, hours of states at one a second. Beyond it, the oldest line is dropped."""
 BATCH = 1000
-"""Maximum number of lines in a request, about a megabyte."""
+"""Maximum number of lines in a request of about a megabyte."""
 RESPONSE_TIMEOUT_S = 10.0
 """Timeout of a server response [s]."""
 CLOSING_S = 3.0
 """Timeout of the last request [s]."""
 PERMANENT_ERRORS = (400, 413, 422)
-"""HTTP status codes of lines that the server will never accept. After any other code the lines are retried."""
+"""HTTP status codes for lines that the server will never accept. After any other code the lines are sent again."""
 MAX_LOGGED = 200
 """Maximum length of a response in the log [characters]."""
 
@@ -59,11 +59,11 @@ class Target(NamedTuple):
 
 
 class InfluxSink:
-    """Writes states and alarms of one pack.
+    """Sink that writes states and alarms of one pack to a server.
 
     Args:
         settings: Settings of the server.
-        first_delay_s: Delay before an unavailable server is retried; it grows as in ``Backoff`` [s].
+        first_delay_s: Delay before an unavailable server is retried [s]; it grows as in ``Backoff``.
 
     Raises:
         UserError: A file of ``settings`` cannot be used.

@@ -5,8 +5,10 @@ from datetime import datetime
 
 from bms_estimator.model.payloads import Alarm, Estimate, Snapshot
 
-STATE, ALARM = "bms_state", "bms_alarm"
-"""Names of the measurements. Their tag ``device`` is the pack."""
+STATE = "bms_state"
+"""Name of the measurement of states. The tag ``device`` is the pack."""
+ALARM = "bms_alarm"
+"""Name of the measurement of alarm changes. The tag ``device`` is the pack."""
 
 
 def lines(before: Snapshot | None, snapshot: Snapshot) -> list[str]:

@@ -21,7 +21,7 @@ CLOSING_S = 1.0
 
 
 class PrometheusSink(Collector):
-    """Serves metrics on its own address, in the event loop.
+    """Sink that serves metrics on its own address, in the event loop.
 
     Args:
         settings: Listening address.

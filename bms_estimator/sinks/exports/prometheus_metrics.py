@@ -17,7 +17,7 @@ class Unit(NamedTuple):
 
     name: str
     factor: float = 1.0
-    """Factor from the payload's unit to this one."""
+    """Factor from the payload's unit to the base unit."""
 
 
 UNITS = {
@@ -38,11 +38,11 @@ UNITS = {
 KINDS = {"line": "counters of the link", "samples": "samples by result", "requests": "requests by result"}
 """Help texts of the health payload's counters by kind."""
 LIST_ITEMS = {"cells_v": "cell"}
-"""Names of an item by list field."""
+"""Names of one item, by list field."""
 
 
 def metrics(snapshot: Snapshot) -> Iterator[Metric]:
-    """Yield all metrics of a pack; those of the state only while values are fresh."""
+    """Yield all metrics of a pack. Metrics of the state are included only while values are fresh."""
     device, health = snapshot.info.device, snapshot.health
     if snapshot.estimate is not None and health.sensor_online:
         yield from _fields(device, snapshot.estimate, Estimate)

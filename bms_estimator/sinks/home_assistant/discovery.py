@@ -22,7 +22,7 @@ from bms_estimator.sinks.home_assistant.entities import (
 )
 
 VALUES = "home_assistant"
-"""Topic of the values, below the device's."""
+"""Topic of the values, below the device's topic."""
 MIN_EXPIRY_S = 30
 """Minimum age at which Home Assistant shows a value as unavailable [s]."""
 _ALARM_CLASSES: Mapping[str, str] = {name: kind.device_class for name, kind in ALARM_KINDS.items()}
@@ -118,7 +118,10 @@ def discovery(
 
 
 def _removed(described: DiscoveryInputs) -> dict[str, dict[str, str]]:
-    """Return components that an earlier configuration may have had. Only a platform makes Home Assistant remove them."""
+    """Return components that an earlier configuration may have had, in the form that makes Home Assistant remove them.
+
+    Home Assistant removes a component of which the message contains only the platform.
+    """
     platforms = {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
     platforms |= {
         name: control("")["platform"] for name, control in _COMMANDS.items() if name not in described.commands
@@ -189,7 +192,7 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
 def _set_soc(root: str) -> dict[str, Any]:
     """Return the control that sets the SOC.
 
-    It shows the last set value, because the live SOC would add a row to the recorder with each change.
+    The control shows the last set value. The live SOC would add a row to the recorder with each change.
     """
     return {
         "platform": "number",

@@ -16,7 +16,8 @@ CHARGE_STATE = field_entities(Estimate, "batteries") | {
     "soh_percent": Entity("State of health", "%", 1, 0.2),
     "soh_std_percent": Entity("State of health, standard deviation", "%", 1, 0.2),
 }
-"""Entities of a battery that a fuel cell does not have. Those listed here are in another unit than the payloads."""
+"""Entities of a battery that a fuel cell does not have. The entities with their own values here are in another unit than
+the payloads."""
 CELL_VOLTAGES = field_entities(Estimate, "with cell voltages")
 """Entities of packs with measured cell voltages."""
 CELL = "cell_v"
@@ -50,9 +51,11 @@ def cell_key(number: int) -> str:
 
 def entities(info: Info, cells: int) -> dict[str, Entity]:
     """Return the numeric entities of a pack with ``cells`` measured cells, by key."""
-    common = FUEL_CELL if info.capacity_ah is None else BATTERY
+    without_cells = FUEL_CELL if info.capacity_ah is None else BATTERY
     if not cells:
-        return common
+        return without_cells
     return (
-        common | CELL_VOLTAGES | {cell_key(n): raw_entity(f"Cell {n}", "V", 3, "voltage") for n in range(1, cells + 1)}
+        without_cells
+        | CELL_VOLTAGES
+        | {cell_key(n): raw_entity(f"Cell {n}", "V", 3, "voltage") for n in range(1, cells + 1)}
     )

@@ -1,7 +1,7 @@
-"""Values for Home Assistant: a value is published if it has changed enough and its minimum interval has passed.
+"""Selection of values for Home Assistant. A value is published if it has changed enough and its minimum interval has passed.
 
-Home Assistant's recorder writes a row for each published value, so that the number of rows a minute is limited. If more
-entities change, those published longest ago come first.
+Home Assistant's recorder writes a row for each published value. Therefore this module limits the number of values a
+minute. If more entities change, those published longest ago come first.
 """
 
 import math
@@ -14,8 +14,10 @@ from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs
 from bms_estimator.sinks.home_assistant.entities import cell_key, entities
 
 MAX_ROWS = 18
-"""Maximum number of published values of default-enabled entities in a minute, so that two of 20 are left for alarms."""
+"""Maximum number of published values of default-enabled entities in a minute. With two values of alarms, the recorder
+writes at most 20 rows a minute."""
 MINUTE_S = 60.0
+"""Length of the window for ``MAX_ROWS`` [s]."""
 MESSAGE_INTERVAL_S = 5.0
 """Minimum interval between two messages with values [s]."""
 HEARTBEAT_S = 10.0
@@ -30,28 +32,29 @@ class EntityStates(NamedTuple):
     published_s: float = -math.inf
     """Time of the last message."""
     rows_s: tuple[float, ...] = ()
-    """Times at which values were published in the last minute."""
+    """Publish time of each value that was counted against ``MAX_ROWS`` in the last minute."""
 
 
 def values_to_publish(
-    shown: EntityStates, snapshot: Snapshot, described: DiscoveryInputs, now_s: float, *, sign: float = 1.0
+    shown: EntityStates, snapshot: Snapshot, discovery: DiscoveryInputs, now_s: float, *, sign: float = 1.0
 ) -> EntityStates:
     """Return the values to publish; ``shown`` itself if nothing changed enough.
 
     Args:
         shown: Values published last.
         snapshot: Snapshot with the current values.
-        described: Data that determine the entities.
+        discovery: Data that determine the entities.
         now_s: Monotonic clock [s].
         sign: Factor of signed values; -1 if charging is positive.
     """
     elapsed_s = now_s - shown.published_s
     if snapshot.estimate is None or elapsed_s < MESSAGE_INTERVAL_S:
         return shown
-    existing = entities(described.info, described.cells)
+    existing = entities(discovery.info, discovery.cells)
     values = _rounded(snapshot, existing, sign)
     changed = {key: value for key, value in values.items() if _is_due(shown, key, value, existing[key], now_s)}
     recent_s = tuple(at_s for at_s in shown.rows_s if now_s - at_s < MINUTE_S)
+    # first values are not limited, because all entities get one at once
     rows = [key for key in changed if existing[key].enabled and key in shown.values]
     rows.sort(key=lambda key: shown.changed_s[key])
     for postponed in rows[MAX_ROWS - len(recent_s) :]:

@@ -14,7 +14,7 @@ from bms_estimator.version import __version__
 Document = dict[str, Any]
 
 ADDRESSES = {"alarm": "alarm/{alarm}"}
-"""Topics below the device's that differ from the channel's name."""
+"""Topics below the device's topic, by channel name, if they differ from this name."""
 PARAMETERS = {
     "device": f"pack.name of the pack file, as {DEVICE_NAME}",
     "alarm": "as in [alarms] of the pack file",
@@ -24,13 +24,14 @@ AVAILABILITIES = {
     SENSOR_AVAILABILITY: "online while values are fresh",
 }
 TRANSACTION = {"type": ["string", "integer", "null"], "description": "repeated in the response"}
+"""JSON schema of the field ``transaction`` of requests and responses."""
 ARGUMENTS: dict[str, Document] = {
     "set_soc": {"soc": {"type": "number", "minimum": 0, "maximum": 1, "description": "state of charge"}},
     "current_zero": {},
     "acknowledge_alarm": {"name": {"type": ["string", "null"], "description": "name of an alarm; default: all"}},
     "publish_rate": {"rate_hz": {"type": "number", "minimum": MIN_RATE_HZ, "maximum": MAX_RATE_HZ}},
 }
-"""Fields of each command."""
+"""JSON schemas of the fields of each command."""
 OPTIONAL = ("name",)
 """Optional fields of commands."""
 RESPONSE = {

@@ -1,4 +1,7 @@
-"""Monitor of the two availability topics: detects and corrects messages of other clients on them."""
+"""Monitor of the availability topics of the service and of its pack's sensor.
+
+The monitor detects and corrects messages that other clients publish on these topics.
+"""
 
 import asyncio
 import math
@@ -13,7 +16,7 @@ from bms_estimator.mqtt.message import Message
 CORRECTION_S = 5.0
 """Minimum interval between two corrections of an availability that another client wrote [s]."""
 BURST_S = 60.0
-"""Maximum interval between corrections of one burst, for which one line is logged [s]."""
+"""Maximum interval between two corrections of one burst [s]. One line is logged for each burst."""
 ECHO_S = 10.0
 """Time after which a broker that has not returned ``online`` counts as denying the topic [s]."""
 
@@ -24,7 +27,7 @@ class AvailabilityMonitor:
     """Compares the availability messages that the broker returns with those that the service has published.
 
     Args:
-        own: Returns the correct messages, first that of the service itself.
+        own: Returns the correct messages, of which the first is that of the service itself.
         delivery: Statistics in which corrections are counted.
         denied: Denied topics, to which a missing echo is reported.
         wake: Called when ``correct`` is due.
@@ -46,7 +49,7 @@ class AvailabilityMonitor:
         self._corrected_s = -math.inf
 
     def begin(self) -> None:
-        """Reset for a new connection, over which both availabilities are published again."""
+        """Reset for a new connection, on which both availabilities are published again."""
         self._echoed.clear()
         self._is_wrong = False
 
@@ -57,6 +60,7 @@ class AvailabilityMonitor:
     def on_message(self, topic: str, payload: bytes) -> None:
         """Handle a received availability: our own echo, or another client's."""
         correct = {own.topic: own.payload for own in self._own()}
+        # the sensor's availability has no correct value before the first snapshot, and then cannot be wrong
         if correct.get(topic, payload) == payload:
             self._echoed.set()
         elif not self._is_wrong:

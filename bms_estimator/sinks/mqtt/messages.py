@@ -20,8 +20,10 @@ from bms_estimator.sinks.home_assistant.discovery import (
 from bms_estimator.sinks.home_assistant.entity_values import EntityStates, values_to_publish
 from bms_estimator.sinks.mqtt.topics import schema
 
-AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
-"""Topics below the device's."""
+AVAILABILITY = "availability"
+"""Topic of the service's availability, below the device's topic."""
+SENSOR_AVAILABILITY = "sensor/availability"
+"""Topic of the sensor's availability, below the device's topic."""
 
 
 class PublishedState(NamedTuple):
@@ -73,7 +75,7 @@ class MessageBuilder:
         return [self._retained(AVAILABILITY, b"online"), self._retained("schema", self._schema), *removed]
 
     def offline_messages(self) -> list[Message]:
-        """Return the last messages of a connection; the very last is also the will."""
+        """Return the last messages of a connection. The last of them is also the will."""
         return [self._retained(SENSOR_AVAILABILITY, b"offline"), self._retained(AVAILABILITY, b"offline")]
 
     def availability(self, sent: PublishedState) -> list[Message]:

@@ -1,7 +1,7 @@
-"""Requests to a running service from people and dashboards: bytes in, bytes out, over any transport.
+"""Requests to a running service from people and dashboards, over any transport that exchanges bytes.
 
-Any client of the transport may send requests. Names are therefore listed, the size of payloads and the rates of
-requests and log lines are limited, commands need a permission in the pack file, and no handler's exception ends the
+Any client of the transport may send requests. Therefore only listed names are accepted; the size of payloads and the
+rates of requests and log lines are limited; commands need a permission in the pack file. No handler's exception ends the
 service.
 """
 
@@ -19,18 +19,20 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.mqtt import Command
 
 COMMANDS = get_args(Command)
+"""Names of all commands."""
 FORMER_READS = ("state", "parameters", "health")
-"""Former requests for payloads that are published on topics of these names."""
+"""Former requests, whose payloads are now published on topics of these names."""
 MAX_PAYLOAD_BYTES = 4096
+"""Maximum size of a request's payload [bytes]."""
 REQUESTS_PER_MIN = 6.0
-"""Rate limit of the requests of all clients together, granted or not; as many may arrive at once [1/min]."""
+"""Rate limit of all clients' requests together, granted or not [1/min]. This number of requests may arrive at once."""
 LOG_S = 60.0
 """Minimum interval between two log lines for each kind of rejection [s]; all rejections are counted."""
 MAX_SHOWN = 40
 """Maximum length of a foreign name in the log [characters]."""
 
 Handler = Callable[[Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
-"""Function from the request's arguments to the response's data. Raises UserError if the request cannot be granted."""
+"""Function that returns the response's data for a request's arguments. It raises UserError if the request is rejected."""
 log = structlog.get_logger(__name__)
 
 
@@ -125,7 +127,7 @@ class RequestDispatcher:
 
 
 class RateLimiter:
-    """Rate limiter: a number of requests in a minute, at once or spread.
+    """Token bucket that admits a number of requests a minute, in a burst or spread.
 
     Args:
         per_minute: Number of requests.
@@ -133,17 +135,17 @@ class RateLimiter:
     """
 
     def __init__(self, per_minute: float, monotonic: Callable[[], float]) -> None:
-        self._most, self._monotonic = per_minute, monotonic
-        self._left, self._at_s = per_minute, monotonic()
+        self._per_minute, self._monotonic = per_minute, monotonic
+        self._tokens, self._updated_s = per_minute, monotonic()
 
     def take(self) -> bool:
-        """Return True and count one more if it is within the rate."""
+        """Remove a token for one request. Return False if the rate limit is exceeded."""
         now_s = self._monotonic()
-        self._left = min(self._left + (now_s - self._at_s) * self._most / 60.0, self._most)
-        self._at_s = now_s
-        if self._left < 1.0:
+        added = (now_s - self._updated_s) * self._per_minute / 60.0
+        self._tokens, self._updated_s = min(self._tokens + added, self._per_minute), now_s
+        if self._tokens < 1.0:
             return False
-        self._left -= 1.0
+        self._tokens -= 1.0
         return True
 
 

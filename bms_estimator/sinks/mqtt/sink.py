@@ -32,7 +32,8 @@ from bms_estimator.sinks.mqtt.requests import MAX_SHOWN, RequestDispatcher
 from bms_estimator.store.outbox import Outbox
 
 BIRTH_DELAY_S = 2.0
-"""Delay from Home Assistant's birth message to the retained messages [s], because it subscribes some time later."""
+"""Delay from Home Assistant's birth message to the retained messages [s], because Home Assistant subscribes some time
+after its birth message."""
 HANDOVER_S = 2.0
 """Time limit for sending queued messages at shutdown [s]."""
 CLOSING_S = 3.0
@@ -135,7 +136,7 @@ class MqttSink:
 
     async def _serve(self, connection: Connection) -> None:
         """Send and receive until the connection is lost or the sink closes."""
-        self._resend_retained = True  # the broker may have lost them
+        self._resend_retained = True  # the broker may have lost the retained messages
         self._denied.begin()
         self._availability.begin()
         try:

@@ -12,12 +12,13 @@ from bms_estimator.model.payloads import PAYLOAD_VERSION, Alarm, Estimate, Healt
 
 
 class Topic(NamedTuple):
-    """A topic with a model as payload."""
+    """Topic whose payload is a model."""
 
     model: type[Payload]
     qos: int
     retain: bool
     when: str
+    """Description of the publish times."""
 
 
 TOPICS = {

@@ -1,9 +1,9 @@
-"""Fields of a payload, each with the requested type: other versions or publishers may send anything. Pure."""
+"""Fields of a payload with the requested types, because other versions or publishers may send any value. Pure."""
 
-LARGEST = 1e12
-"""Largest accepted absolute value of a number: no quantity of a battery exceeds it, and longer text would fill a screen."""
+MAX_ABS_NUMBER = 1e12
+"""Maximum absolute value of an accepted number. No quantity of a battery exceeds it, and longer text would fill a screen."""
 MAX_TEXT = 400
-"""Maximum length of a text; the rest is cut [characters]."""
+"""Maximum length of a text [characters]. Longer texts are truncated."""
 
 
 class JsonFields:
@@ -22,7 +22,7 @@ class JsonFields:
     def number(self, name: str) -> float | None:
         """Return a number; None if missing."""
         value = self._values.get(name)
-        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST:
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > MAX_ABS_NUMBER:
             return None
         return float(value)
 

@@ -1,4 +1,4 @@
-"""Live view on standard output, drawn by a thread of its own: a screen on a terminal, otherwise a line per message."""
+"""Live view on standard output, drawn by a separate thread: a screen on a terminal, otherwise one line per message."""
 
 import asyncio
 import io
@@ -21,9 +21,9 @@ from bms_estimator.sinks.terminal.view_state import BrokerOutage, PackView, View
 REDRAW_S = 0.25
 """Minimum interval between two screens, at any publish rate [s]."""
 MAX_WAITING_LINES = 1000
-"""Maximum number of lines waiting for a pipe that is not read; then the oldest is dropped."""
+"""Maximum number of lines that wait for a blocked pipe. Beyond it, the oldest line is dropped."""
 CLOSE_S = 2.0
-"""Timeout of the last write to a terminal that does not read [s]."""
+"""Timeout of the last write to a blocked terminal [s]."""
 
 
 T = TypeVar("T")
@@ -34,7 +34,7 @@ class LiveView:
 
     Args:
         devices: Last publications of each pack.
-        log: Log lines, the last of which are shown, because the screen hides log output.
+        log: Log lines. The last of them are shown, because the screen hides log output.
         hint: Last line of the screen.
         true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
         outage: Returns the present outage of the broker; None without one.

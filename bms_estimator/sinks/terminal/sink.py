@@ -15,13 +15,13 @@ BASE_TOPIC = "bms"
 
 
 class TerminalSink:
-    """Sink that shows snapshots as a subscriber would see them. ``publish`` returns at once, also if stdout is blocked.
+    """Sink that shows snapshots as a subscriber would see them. ``publish`` does not wait for a blocked stdout.
 
     Args:
         log: Log lines, the last of which are shown.
         hint: Last line of the screen.
         true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
-        clock: The clocks.
+        clock: Wall clock and monotonic clock.
     """
 
     def __init__(

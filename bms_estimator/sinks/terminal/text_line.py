@@ -6,7 +6,7 @@ from bms_estimator.sinks.terminal.view_state import ALARM_PREFIX, soc_text
 
 
 def text_line(message: DeviceMessage, true_soc: float | None = None) -> str | None:
-    """Return one line; None for messages of no interest.
+    """Return one line; None for a message that is not printed.
 
     Args:
         message: A message of a pack.

@@ -12,7 +12,7 @@ MAX_SILENT_S = 10.0
 ALARM_PREFIX = "alarm/"
 """Prefix of alarm topics."""
 BAND_STDS = 2.0
-"""Half width of the band around the SOC [std]. The band contains the true SOC 19 times out of 20."""
+"""Half width of the SOC's confidence band [standard deviations]. The band contains the true SOC in 95 % of the cases."""
 
 
 class BrokerOutage(NamedTuple):

@@ -12,7 +12,7 @@ from bms_estimator.edge.block import Block, encode
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET, raw
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import put
-from bms_estimator.fleet.packs.pack_row import stored
+from bms_estimator.fleet.packs.pack_row import encode_row
 from tests.command_line import run
 from tests.fleet.identification.test_reidentify import KIND, WRONG, pack_samples
 from tests.fleet.nats_cluster import running
@@ -25,7 +25,7 @@ async def fill(url):
     async with await nats.connect(url) as nc:
         await make_streams(nc, partitions=1)
         await put(nc, CELLS_BUCKET, {"own": WRONG.encode()})
-        rows = {name: stored(KIND) for name in ("house", "silent", "young")}
+        rows = {name: encode_row(KIND) for name in ("house", "silent", "young")}
         await put(nc, PACKS_BUCKET, rows | {"wrong": b"{"})
         for number, rows in enumerate(np.array_split(samples, 100), 1):
             data = encode(Block(STORE, number, 1, STORE * 1e-9 + rows["time_s"][-1], rows))

@@ -4,7 +4,7 @@ import pytest
 
 from bms_estimator.fleet.packs.csv_table import check_models, read_table, table_lines
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK, PackRegistry
-from bms_estimator.fleet.packs.pack_row import COLUMNS, PackRow, PackSpec, known_cells, settings_of, stored
+from bms_estimator.fleet.packs.pack_row import COLUMNS, PackRow, PackSpec, encode_row, known_cells, settings_of
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.errors import UserError
@@ -137,7 +137,7 @@ def test_table_round_trip(table):
 def test_packs_of_one_kind_share_settings_and_model():
     registry = PackRegistry()
     for i in range(1000):
-        registry.set_row(f"p{i}", stored(LFP.model_copy(update={"series": 14 + i % 5})))
+        registry.set_row(f"p{i}", encode_row(LFP.model_copy(update={"series": 14 + i % 5})))
     entries = [registry(f"p{i}") for i in range(1000)]
     assert len({id(one) for one in entries}) == 5
     settings, model = entries[0]
@@ -174,8 +174,8 @@ def test_pack_becomes_known_with_its_row_and_cell():
     registry = PackRegistry()
     assert registry("house") is None
     assert registry.reason("house") == UNKNOWN_PACK
-    assert registry.set_row("house", stored(PackSpec(cell="own", series=2)))
-    assert not registry.set_row("house", stored(PackSpec(cell="own", series=2)))
+    assert registry.set_row("house", encode_row(PackSpec(cell="own", series=2)))
+    assert not registry.set_row("house", encode_row(PackSpec(cell="own", series=2)))
     assert registry("house") is None
     assert registry.set_cell("own", cell_text(load_cell("ncr18650")).encode())
     assert registry.packs_using({"own", "other"}) == {"house"}

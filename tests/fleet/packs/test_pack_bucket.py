@@ -6,16 +6,16 @@ import nats
 import pytest
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.nats.stream_reader import BATCH, StreamError
+from bms_estimator.fleet.nats.stream_reader import BATCH_MESSAGES, StreamError
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import PackBucket, Written, read_bucket, remove_keys, write_bucket
-from bms_estimator.fleet.packs.pack_row import PackSpec, stored
+from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from tests.fleet.nats_cluster import connected, running
 from tests.patience import LONG_S
 
-LFP = stored(PackSpec(cell="lfp", capacity_ah=100.0, series=16))
+LFP = encode_row(PackSpec(cell="lfp", capacity_ah=100.0, series=16))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ async def nc(cluster):
 
 
 async def test_only_differences_are_written_and_rows_are_removed_on_request(nc):
-    values = {f"p{i}": LFP for i in range(2 * BATCH + 5)}
+    values = {f"p{i}": LFP for i in range(2 * BATCH_MESSAGES + 5)}
     assert await write_bucket(nc, PACKS_BUCKET, values) == Written(len(values), 0, 0, 0, 0)
     assert await read_bucket(nc, PACKS_BUCKET) == values
     other = {"p0": LFP, "p1": b"{}", "more": LFP}
@@ -48,7 +48,7 @@ async def test_only_differences_are_written_and_rows_are_removed_on_request(nc):
 
 
 async def test_refresh_returns_all_rows_and_then_changes(nc):
-    await write_bucket(nc, PACKS_BUCKET, {"a": LFP, "b": b"{broken", "c": stored(PackSpec(cell="own"))})
+    await write_bucket(nc, PACKS_BUCKET, {"a": LFP, "b": b"{broken", "c": encode_row(PackSpec(cell="own"))})
     bucket = PackBucket(nc)
     assert await bucket.refresh() >= {"a", "b", "c"}
     assert await bucket.refresh() == set()
@@ -67,7 +67,7 @@ async def test_refresh_returns_all_rows_and_then_changes(nc):
 
 
 async def test_changes_are_reported_after_the_table_was_recreated(nc):
-    await write_bucket(nc, PACKS_BUCKET, {"a": stored(PackSpec(cell="own")), "b": LFP, "c": LFP})
+    await write_bucket(nc, PACKS_BUCKET, {"a": encode_row(PackSpec(cell="own")), "b": LFP, "c": LFP})
     bucket = PackBucket(nc)
     await bucket.refresh()
     await nc.jetstream().delete_stream(f"KV_{PACKS_BUCKET}")

@@ -55,7 +55,7 @@ async def stored(nc: Client, last: bytes) -> dict[str, int]:
 
 
 def subject(pack: str) -> str:
-    return subjects.kept(subjects.partition_of(pack, PARTITIONS), pack)
+    return subjects.stored_raw(subjects.partition_of(pack, PARTITIONS), pack)
 
 
 async def test_other_subjects_and_partitions_are_rejected(fleet: Tenant) -> None:
@@ -216,7 +216,7 @@ async def test_worker_rejects_a_block_in_the_wrong_partition(fleet: Tenant) -> N
         metadata={"bms.partitions": str(PARTITIONS)},
         allow_direct=True,
     )
-    await admin.jetstream().publish(subjects.kept(wrong, "p1"), block("p1", 1))
+    await admin.jetstream().publish(subjects.stored_raw(wrong, "p1"), block("p1", 1))
     with capture_logs() as logs:
         async with worker(fleet):
             await until(lambda: [line for line in logs if line["event"] == "a block is rejected"], lambda: logs)
