@@ -13,36 +13,38 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.version import __version__
 
 COMMANDS = {
-    "run": Entry("bms_estimator.cli.live.run:run", "Estimate live from a board and publish."),
+    "run": Entry("bms_estimator.cli.live.run:run", "Estimate live from a BMS, monitor or board, and publish."),
     "top": Entry("bms_estimator.cli.live.top:top", "Show all packs of a broker."),
     "edge": Entry(
         "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet's server, without estimating."
     ),
-    "replay": Entry("bms_estimator.cli.captures.replay:replay", "Estimate from a capture or a table."),
+    "replay": Entry("bms_estimator.cli.captures.replay:replay", "Estimate from a capture: raw bytes, CSV or Parquet."),
     "alarms": Entry("bms_estimator.cli.captures.alarms:alarms", "List the alarms that a capture would have raised."),
-    "record": Entry("bms_estimator.cli.live.record:record", "Record a board's raw bytes with their arrival times."),
-    "simulate": Entry("bms_estimator.cli.live.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
+    "record": Entry("bms_estimator.cli.live.record:record", "Record a source's raw bytes with their arrival times."),
+    "simulate": Entry("bms_estimator.cli.live.simulate:simulate", "Simulate a board, BMS or monitor for tests."),
     "ports": Entry("bms_estimator.cli.live.ports:ports", "List serial ports, and identify devices on them."),
-    "board": Entry("bms_estimator.cli.live.board:board", "Show a board, set its bandgap, gains and serial number."),
+    "board": Entry(
+        "bms_estimator.cli.live.board:board", "Show a sensor board, set its bandgap, gains and serial number."
+    ),
     "dashboard": Entry("bms_estimator.cli.live.dashboard:dashboard", "Serve the live page of all packs of a broker."),
-    "demo": Entry("bms_estimator.cli.live.demo:demo", "Run broker, board and service in one terminal."),
+    "demo": Entry("bms_estimator.cli.live.demo:demo", "Run a broker, a simulated board and the service."),
     "ocv": Entry(
         "bms_estimator.cli.cell.ocv:ocv",
-        "Write a cell file with the OCV from rests, slow curves or given curves.",
+        "Write a cell file with the OCV from rests, slow discharges or a table.",
     ),
     "identify": Entry(
         "bms_estimator.cli.cell.identify:identify_command", "Write a cell file with resistances from captures."
     ),
     "adapt": Entry(
-        "bms_estimator.cli.cell.adapt:adapt_command", "Write a cell file with a1..a15 by the thesis's steps."
+        "bms_estimator.cli.cell.adapt:adapt_command", "Write a cell file by the thesis's steps; identify is better."
     ),
     "capacity": Entry(
         "bms_estimator.cli.cell.capacity:capacity", "Measure the capacity from rests and the charge between them."
     ),
-    "cell": Entry("bms_estimator.cli.cell.export:app", "Write a cell file from the learned state of a pack's service."),
+    "cell": Entry("bms_estimator.cli.cell.export:app", "Export a cell file from the state of a pack's service."),
     "history": Entry("bms_estimator.cli.live.history:history", "Print the history of a pack as CSV."),
     "validate": Entry(
-        "bms_estimator.cli.captures.validate:validate_command", "Compare a cell's model with a capture, open loop."
+        "bms_estimator.cli.captures.validate:validate_command", "Compare a cell file with a capture, open loop."
     ),
     "thesis": Entry(
         "bms_estimator.cli.captures.thesis:thesis", "Recompute the thesis's tables and figures as a report."

@@ -137,6 +137,6 @@ class DemoResult:
         inside = "inside" if abs(error) <= band else "outside"
         return (
             f"{elapsed_s:.1f} s: {e.frames_received:,} frames, {e.frames_lost} lost, {e.crc_errors} CRC errors; "
-            f"SOC at first {self._first_error:+.2%} wrong, at last {error:+.2%}: the truth {self._last_true_soc:.2%} lies "
-            f"{inside} {e.soc:.2%} ± {band:.2%} (2 std); {'lock' if e.lock else 'no lock'}"
+            f"SOC error {self._first_error:+.2%} at the start, {error:+.2%} at the end: true SOC {self._last_true_soc:.2%} "
+            f"{inside} the estimate {e.soc:.2%} ± {band:.2%} (2 std); observer {'in lock' if e.lock else 'out of lock'}"
         )

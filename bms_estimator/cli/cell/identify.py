@@ -35,7 +35,7 @@ from bms_estimator.sources.captures.replay import load_capture
 
 def identify_command(
     captures: CapturesFromRest,
-    cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; its capacity and OCV", show_default=False)],
+    cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; gives capacity and OCV", show_default=False)],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
     soc: InitialSoc = None,
@@ -47,17 +47,22 @@ def identify_command(
             show_default=False,
         ),
     ] = None,
-    keep_ocv: Annotated[bool, typer.Option(help="do not correct the open-circuit voltage")] = False,
+    keep_ocv: Annotated[
+        bool, typer.Option(help="use the OCV of --cell unchanged; default: correct it", show_default=False)
+    ] = False,
     current_sign: SignOfCurrent = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Identify a cell's resistances from captures and write a cell file.
 
-    Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole SOC range are best. Run
-    `ocv` first. The file is written only if replays started in mid-load get at most 5 % worse.
+    Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole SOC range are best.
 
-    For a fuel cell use polarization curves (columns current_a, voltage_v) and records: docs/theory/fuel-cell.md.
+    Run `ocv` first, which writes a cell file with the OCV. Replays of the captures are scored with the cell file of --cell
+    and with the new one. The new file is written only if its score is at most 5 % worse (docs/cell/identify.md).
+
+    For a fuel cell use polarization curves (columns current_a, voltage_v) and recordings under load:
+    docs/theory/fuel-cell.md.
     """
     check_out(out, captures, force=force)
     check_once(captures)

@@ -9,8 +9,8 @@ COMMANDS = {
         "bms_estimator.cli.fleet.demo:demo", "Run server, simulated packs, workers and page in one terminal."
     ),
     "serve": Entry("bms_estimator.cli.fleet.serve:serve", "Run a node of the server, with its streams."),
-    "user": Entry("bms_estimator.cli.fleet.serve:user", "Print the token with which a tenant's pack connects."),
-    "worker": Entry("bms_estimator.cli.fleet.worker:worker", "Estimate the packs of some partitions."),
+    "user": Entry("bms_estimator.cli.fleet.serve:user", "Print the token with which a pack's edge connects."),
+    "worker": Entry("bms_estimator.cli.fleet.worker:worker", "Estimate packs; each worker takes a share of them."),
     "packs": Entry("bms_estimator.cli.fleet.packs:app", "Load, list, show or remove packs and their cells."),
     "capture": Entry("bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a table."),
     "identify": Entry("bms_estimator.cli.fleet.identify:identify", "Re-identify packs from their stored samples."),

@@ -34,7 +34,7 @@ def record(
     pack: Annotated[
         Path | None, typer.Option(help="settings of the pack, for its \\[sensor] or \\[source]", show_default=False)
     ] = None,
-    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
+    port: Annotated[str | None, typer.Option(help="serial port; overrides port in section [sensor]")] = None,
     baud: Annotated[int | None, typer.Option(parser=whole(1200), help="baud rate in place of sensor.baud")] = None,
     rate_hz: Annotated[
         int | None, typer.Option(parser=whole(1, 1000), help="sample rate in place of sensor.sample_rate_hz")

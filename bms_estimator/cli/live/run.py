@@ -31,18 +31,18 @@ from bms_estimator.sources.captures.recorder import CaptureRecorder
 
 def run(
     packs: Annotated[
-        list[Path] | None, typer.Argument(help="settings of the pack, or of each", show_default="pack.toml")
+        list[Path] | None, typer.Argument(help="settings file of each pack", show_default="pack.toml")
     ] = None,
-    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
+    port: Annotated[str | None, typer.Option(help="serial port; overrides port in section [sensor]")] = None,
     mqtt: Annotated[str | None, typer.Option(help="broker in place of mqtt.url, mqtt://host:port")] = None,
     record: Annotated[
-        Path | None, typer.Option(help="also record the board's raw bytes in this new file", show_default=False)
+        Path | None, typer.Option(help="also record the source's raw bytes in this new file", show_default=False)
     ] = None,
     view: Annotated[
         bool | None, typer.Option("--view/--no-view", help="live view on stdout; default: on a terminal")
     ] = None,
 ) -> None:
-    """Estimate live from a board and publish, until SIGINT or SIGTERM.
+    """Estimate live from a BMS, battery monitor or board, and publish, until SIGINT or SIGTERM.
 
     One process may serve several packs, each with its own source and broker connection.
     """

@@ -72,8 +72,8 @@ async def test_client_receives_states_from_start_to_offline():
     assert f"mosquitto_sub -p {port} -t 'bms/#' -v" in out
     assert re.search(r" soc \d+\.\d\d ± \d+\.\d\d %  true \d+\.\d\d %  ", out)
     assert re.search(
-        r"\d+\.\d s: \d+ frames, 0 lost, 0 CRC errors; SOC at first -20\.00% wrong, at last [+-]\d\.\d\d%: "
-        r"the truth \d+\.\d\d% lies inside \d+\.\d\d% ± \d+\.\d\d% \(2 std\); lock\n$",
+        r"\d+\.\d s: \d+ frames, 0 lost, 0 CRC errors; SOC error -20\.00% at the start, [+-]\d\.\d\d% at the end: "
+        r"true SOC \d+\.\d\d% inside the estimate \d+\.\d\d% ± \d+\.\d\d% \(2 std\); observer in lock\n$",
         out,
     )
     assert "Traceback" not in err

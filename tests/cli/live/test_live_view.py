@@ -48,7 +48,7 @@ def test_interrupted_demo_prints_a_summary_and_restores_the_terminal() -> None:
     last = terminal.output.split(ALTERNATE)[-1]
     assert BACK in last
     assert CURSOR in last
-    assert re.search(r"SOC at first -20\.00% wrong, at last", last.replace("\r\n", " "))
+    assert re.search(r"SOC error -20\.00% at the start, ", last.replace("\r\n", " "))
     assert "Traceback" not in terminal.output
 
 
