@@ -16,99 +16,115 @@ from bms_estimator import numba_cache
 from tests.patience import LONG_S
 
 PACKAGE = Path(bms_estimator.__file__).parent
-ELF, HEADER_BYTES = b"\x7fELF", 64
-"""First bytes of a kernel's object file; its machine code follows the header."""
+ELF = b"\x7fELF"
+"""First bytes of a kernel's object file."""
+HEADER_BYTES = 64
+"""Size of the header of a 64-bit object file, which machine code follows [bytes]."""
 
 
-def imported(source: Path) -> set[Path]:
+def imported_files(source: Path) -> set[Path]:
     """Return the files of the package that one of its files imports."""
     names = [node.module for node in ast.walk(ast.parse(source.read_text())) if isinstance(node, ast.ImportFrom)]
     paths = [PACKAGE.parent / f"{name.replace('.', '/')}.py" for name in names if name]
     return {path for path in paths if path.is_relative_to(PACKAGE) and path.is_file()}
 
 
-def test_every_file_with_compiled_code_is_in_the_caches_name() -> None:
+def test_the_cache_name_covers_every_file_with_compiled_code() -> None:
     compiled = {path for path in PACKAGE.rglob("*.py") if re.search(r"^@njit\b", path.read_text(), re.MULTILINE)}
     assert PACKAGE / "protocols" / "firmware" / "framing.py" in compiled
     assert compiled <= set(numba_cache.COMPILED_IN)
 
 
-def test_every_file_that_a_kernel_imports_is_in_the_caches_name() -> None:
-    found = set().union(*(imported(source) for source in numba_cache.COMPILED_IN)) - {PACKAGE / "numba_cache.py"}
-    assert PACKAGE / "model" / "input_faults.py" in found
-    assert found <= set(numba_cache.COMPILED_IN)
+def test_the_cache_name_covers_every_file_that_a_kernel_imports() -> None:
+    dependencies = set().union(*(imported_files(source) for source in numba_cache.COMPILED_IN)) - {
+        PACKAGE / "numba_cache.py"
+    }
+    assert PACKAGE / "model" / "input_faults.py" in dependencies
+    assert dependencies <= set(numba_cache.COMPILED_IN)
 
 
-def test_every_kernel_takes_njit_from_the_cache() -> None:
-    direct = {
+def test_only_numba_cache_imports_njit_from_numba() -> None:
+    direct_importers = {
         path for path in PACKAGE.rglob("*.py") if re.search(r"^from numba import njit", path.read_text(), re.MULTILINE)
     }
-    assert direct == {PACKAGE / "numba_cache.py"}
+    assert direct_importers == {PACKAGE / "numba_cache.py"}
 
 
-def crc16_with_cache_in(folder: Path) -> str:
-    """Compile a kernel in another process and check its result; return the text on stderr."""
-    homes = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), str(folder))
+CRC16_OF_FOUR_ZEROS = "33984\n"
+
+
+def run_crc16_with_cache_in(folder: Path) -> str:
+    """Run a kernel in another process with all cache folders at ``folder``, check its result, and return stderr."""
+    cache_variables = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), str(folder))
     script = "import numpy; from bms_estimator.protocols.firmware.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
     command = [sys.executable, "-c", script]
-    done = subprocess.run(command, env=os.environ | homes, capture_output=True, text=True, timeout=LONG_S, check=False)
-    assert (done.returncode, done.stdout) == (0, "33984\n"), done.stderr
-    return done.stderr
+    process = subprocess.run(
+        command, env=os.environ | cache_variables, capture_output=True, text=True, timeout=LONG_S, check=False
+    )
+    assert (process.returncode, process.stdout) == (0, CRC16_OF_FOUR_ZEROS), process.stderr
+    return process.stderr
 
 
 def test_a_kernel_runs_without_space_for_its_cache(full_disk: Path) -> None:
-    said = crc16_with_cache_in(full_disk)
-    assert "RuntimeWarning: compiled kernels are not kept: No space left on device" in said
+    warning = run_crc16_with_cache_in(full_disk)
+    assert "RuntimeWarning: compiled kernels are not kept: No space left on device" in warning
 
 
 def test_a_kernel_runs_without_a_folder_for_its_cache(disk_without_files: Path) -> None:
-    said = crc16_with_cache_in(disk_without_files)
-    assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in said
+    warning = run_crc16_with_cache_in(disk_without_files)
+    assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in warning
 
 
 def test_a_kernel_runs_for_a_user_without_a_home() -> None:
-    assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in crc16_with_cache_in(Path("~"))
+    assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in run_crc16_with_cache_in(
+        Path("~")
+    )
 
 
 @pytest.fixture(scope="module")
-def kept_kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with a compiled kernel."""
+def cached_kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a compiled kernel."""
     folder = tmp_path_factory.mktemp("kernel")
-    assert crc16_with_cache_in(folder) == ""
+    assert run_crc16_with_cache_in(folder) == ""
     return folder
 
 
-def cut(content: bytes) -> bytes:
+def truncate(content: bytes) -> bytes:
+    """Return the start of a file, which ends within its header."""
     return content[:20]
 
 
-def emptied(_: bytes) -> bytes:
+def empty(_: bytes) -> bytes:
+    """Return no bytes, as of a file that was created but not written."""
     return b""
 
 
-def zeros_in_its_code(content: bytes) -> bytes:
-    """Replace machine code with zeros, as a power failure may on a file system that preserves the length of files."""
-    code = content.index(ELF) + HEADER_BYTES
-    return content[:code] + bytes(64) + content[code + 64 :]
+def erase_machine_code(content: bytes) -> bytes:
+    """Replace machine code with zeros.
+
+    A power failure has this effect on a file system that saves the length of a file before its content.
+    """
+    begin, erased_bytes = content.index(ELF) + HEADER_BYTES, 64
+    return content[:begin] + bytes(erased_bytes) + content[begin + erased_bytes :]
 
 
 @pytest.mark.parametrize(
-    ("kind", "damaged"),
+    ("suffix", "damage"),
     [
-        ("nbi", cut),
-        pytest.param("nbi", emptied, marks=pytest.mark.thorough),
-        pytest.param("nbc", cut, marks=pytest.mark.thorough),
-        pytest.param("nbc", emptied, marks=pytest.mark.thorough),
-        ("nbc", zeros_in_its_code),
+        ("nbi", truncate),
+        pytest.param("nbi", empty, marks=pytest.mark.thorough),
+        pytest.param("nbc", truncate, marks=pytest.mark.thorough),
+        pytest.param("nbc", empty, marks=pytest.mark.thorough),
+        ("nbc", erase_machine_code),
     ],
 )
 def test_a_damaged_kernel_in_the_cache_is_compiled_again(
-    tmp_path: Path, kept_kernel: Path, kind: str, damaged: Callable[[bytes], bytes]
+    tmp_path: Path, cached_kernel: Path, suffix: str, damage: Callable[[bytes], bytes]
 ) -> None:
-    shutil.copytree(kept_kernel, tmp_path, dirs_exist_ok=True)
-    (kept,) = tmp_path.rglob(f"*.{kind}")
-    whole = kept.stat().st_size
-    kept.write_bytes(damaged(kept.read_bytes()))
-    assert "RuntimeWarning: a compiled kernel cannot be read" in crc16_with_cache_in(tmp_path)
-    assert kept.stat().st_size == whole
-    assert crc16_with_cache_in(tmp_path) == ""
+    shutil.copytree(cached_kernel, tmp_path, dirs_exist_ok=True)
+    (file,) = tmp_path.rglob(f"*.{suffix}")
+    size_before = file.stat().st_size
+    file.write_bytes(damage(file.read_bytes()))
+    assert "RuntimeWarning: a compiled kernel cannot be read" in run_crc16_with_cache_in(tmp_path)
+    assert file.stat().st_size == size_before
+    assert run_crc16_with_cache_in(tmp_path) == ""

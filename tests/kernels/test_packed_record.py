@@ -12,67 +12,76 @@ from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.cell import load_cell
 from tests.estimator.simulated_cell import pulses
 
+MATRIX_SIZE, MATRICES = 5, 2
 LAYOUT = np.dtype(
-    [("count", "i8"), ("part", [("matrix", "f8", (2, 5, 5)), ("row", "f8", 7)]), ("end", "f8"), ("long", "u8", 40)]
+    [
+        ("count", "i8"),
+        ("part", [("matrix", "f8", (MATRICES, MATRIX_SIZE, MATRIX_SIZE)), ("row", "f8", 7)]),
+        ("end", "f8"),
+        ("long", "u8", 40),
+    ]
 )
-MIRROR = symmetry_map(LAYOUT)
-SIZE = MIRROR.size
-BITMAP = -(-SIZE // WORD_BITS)
-words_of = hnp.arrays(np.uint64, SIZE, elements=st.sampled_from([0, 1, 2**63, 2**64 - 1]))
+"""Record with two symmetric matrices between other fields, longer than one word of the bitmap covers."""
+SYMMETRIC_WORDS = symmetry_map(LAYOUT)
+RECORD_WORDS = SYMMETRIC_WORDS.size
+WORDS_BELOW_DIAGONALS = MATRICES * MATRIX_SIZE * (MATRIX_SIZE - 1) // 2
+BITMAP_WORDS = -(-RECORD_WORDS // WORD_BITS)
+record_words = hnp.arrays(np.uint64, RECORD_WORDS, elements=st.sampled_from([0, 1, 2**63, 2**64 - 1]))
 
 
-def packed(words, mirror=MIRROR):
+def pack_words(words, symmetric_words=SYMMETRIC_WORDS):
+    """Return the packed form of the words of a record."""
     out = packed_buffer(words.size)
-    return out[: pack(words, mirror, out)].copy()
+    return out[: pack(words, symmetric_words, out)].copy()
 
 
 def test_words_below_a_diagonal_map_to_words_above() -> None:
     record = np.zeros(1, LAYOUT)
     words = record.view(np.uint64)
-    words[:] = np.arange(SIZE)
+    words[:] = np.arange(RECORD_WORDS)
     for matrix in record["part"]["matrix"][0].view(np.uint64):
-        for row, column in np.ndindex(5, 5):
+        for row, column in np.ndindex(MATRIX_SIZE, MATRIX_SIZE):
             below = row > column
-            assert MIRROR[matrix[row, column]] == (matrix[column, row] if below else -1)
-    assert np.count_nonzero(MIRROR >= 0) == 2 * 10
+            assert SYMMETRIC_WORDS[matrix[row, column]] == (matrix[column, row] if below else -1)
+    assert np.count_nonzero(SYMMETRIC_WORDS >= 0) == WORDS_BELOW_DIAGONALS
 
 
-@given(words_of)
+@given(record_words)
 def test_packing_is_lossless(words) -> None:
-    back = np.full_like(words, 77)
-    assert unpack(packed(words), MIRROR, back)
-    assert (back == words).all()
+    unpacked = np.full_like(words, 77)  # unpacking must also write zeros
+    assert unpack(pack_words(words), SYMMETRIC_WORDS, unpacked)
+    assert (unpacked == words).all()
 
 
-@given(words_of)
+@given(record_words)
 def test_a_symmetric_matrix_is_stored_once(words) -> None:
     record = words.view(LAYOUT)
     for matrix in record["part"]["matrix"][0]:
         matrix[...] = np.triu(matrix) + np.triu(matrix, 1).T
-    assert packed(words).size <= BITMAP + SIZE - 20
+    assert pack_words(words).size <= BITMAP_WORDS + RECORD_WORDS - WORDS_BELOW_DIAGONALS
 
 
-@given(words_of, st.data())
+@given(record_words, st.data())
 def test_truncated_or_lengthened_data_are_rejected(words, data) -> None:
-    whole = packed(words)
-    back = np.zeros_like(words)
-    assert not unpack(whole[: data.draw(st.integers(0, whole.size - 1))], MIRROR, back)
-    assert not unpack(np.append(whole, np.uint64(5)), MIRROR, back)
+    packed = pack_words(words)
+    unpacked = np.zeros_like(words)
+    assert not unpack(packed[: data.draw(st.integers(0, packed.size - 1))], SYMMETRIC_WORDS, unpacked)
+    assert not unpack(np.append(packed, np.uint64(5)), SYMMETRIC_WORDS, unpacked)
 
 
-@given(words_of, st.integers(0, BITMAP * WORD_BITS - 1))
+@given(record_words, st.integers(0, BITMAP_WORDS * WORD_BITS - 1))
 def test_a_flipped_bit_of_the_bitmap_is_rejected(words, bit: int) -> None:
-    whole = packed(words)
-    whole[bit // WORD_BITS] ^= np.uint64(1 << bit % WORD_BITS)
-    assert not unpack(whole, MIRROR, np.zeros_like(words))
+    packed = pack_words(words)
+    packed[bit // WORD_BITS] ^= np.uint64(1 << bit % WORD_BITS)
+    assert not unpack(packed, SYMMETRIC_WORDS, np.zeros_like(words))
 
 
-@given(hnp.arrays(np.uint64, st.integers(0, SIZE + 9)))
+@given(hnp.arrays(np.uint64, st.integers(0, RECORD_WORDS + 9)))
 def test_random_bytes_are_rejected_or_canonical(noise) -> None:
-    """Bytes that are accepted are the unique encoding of their record."""
-    back = np.zeros(SIZE, np.uint64)
-    if unpack(noise, MIRROR, back):
-        assert (packed(back) == noise).all()
+    """Accepted bytes are the only encoding of their record."""
+    unpacked = np.zeros(RECORD_WORDS, np.uint64)
+    if unpack(noise, SYMMETRIC_WORDS, unpacked):
+        assert (pack_words(unpacked) == noise).all()
 
 
 @pytest.mark.parametrize(
@@ -87,9 +96,9 @@ def test_a_converged_estimator_packs_to_a_fifth_of_its_record() -> None:
     estimator = Estimator(load_cell("ncr18650"))
     estimator.run(pulses(hours=1.0)[0])
     assert estimator.record["filter"]["count"] == 1
-    words, mirror = estimator.record.view(np.uint64), symmetry_map(ESTIMATOR_STATE)
-    kept = packed(words, mirror)
-    assert kept.nbytes < ESTIMATOR_STATE.itemsize / 5
-    back = np.ones_like(words)
-    assert unpack(kept, mirror, back)
-    assert (back == words).all()
+    words, symmetric_words = estimator.record.view(np.uint64), symmetry_map(ESTIMATOR_STATE)
+    packed = pack_words(words, symmetric_words)
+    assert packed.nbytes < ESTIMATOR_STATE.itemsize / 5
+    unpacked = np.ones_like(words)
+    assert unpack(packed, symmetric_words, unpacked)
+    assert (unpacked == words).all()

@@ -12,63 +12,70 @@ from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import TableOcv, load_cell
 
 CHEN_MORA = load_cell("chen_mora")
-A = CHEN_MORA.a
+PARAMETERS = CHEN_MORA.a
 
 
-def test_deltas_of_chen_and_mora_are_those_of_the_errata() -> None:
-    assert delta(A[8], A[9], A[7]) == pytest.approx(0.005013, abs=5e-7)  # (2.11), E13
-    assert delta(A[11], A[12], A[10]) == pytest.approx(0.011156, abs=5e-7)  # (2.12), E13
+def test_deltas_of_chen_and_mora_have_the_corrected_values() -> None:
+    assert delta(PARAMETERS[8], PARAMETERS[9], PARAMETERS[7]) == pytest.approx(
+        0.005013, abs=5e-7
+    )  # (2.11) of the thesis, erratum 13
+    assert delta(PARAMETERS[11], PARAMETERS[12], PARAMETERS[10]) == pytest.approx(
+        0.011156, abs=5e-7
+    )  # (2.12) of the thesis, erratum 13
 
 
-def test_deltas_of_table_5_are_those_of_the_errata() -> None:
+def test_deltas_of_table_5_have_the_corrected_values() -> None:
+    """The arguments are a8, a9, a7 and a11, a12, a10 of Table 5 of the thesis."""
     assert delta(10.6712, 684.61, 759.2573) == pytest.approx(0.009698, abs=5e-7)
     assert delta(27.5014, 3666.6, 5999.6) == pytest.approx(0.017906, abs=5e-7)
 
 
 def test_capacitances_are_zero_at_their_delta() -> None:
-    assert kernel.c_ts(delta(A[8], A[9], A[7]), A) == pytest.approx(0.0, abs=1e-9)
-    assert kernel.c_tl(delta(A[11], A[12], A[10]), A) == pytest.approx(0.0, abs=1e-8)
+    assert kernel.c_ts(delta(PARAMETERS[8], PARAMETERS[9], PARAMETERS[7]), PARAMETERS) == pytest.approx(0.0, abs=1e-9)
+    assert kernel.c_tl(delta(PARAMETERS[11], PARAMETERS[12], PARAMETERS[10]), PARAMETERS) == pytest.approx(
+        0.0, abs=1e-8
+    )
 
 
 def test_simulated_cell_agrees_with_an_independent_integration() -> None:
-    """(2.1)-(2.4) by solve_ivp with a tight tolerance under a load that changes every minute differ by at most 0.1 mV."""
-    time_s = np.arange(0.0, 3000.0, 1.0)
-    levels = np.random.default_rng(3).uniform(0.0, 0.5, 50)
-    current_a = levels[(time_s // 60).astype(int)]
+    """Under a load that changes every minute, (2.1)-(2.4) of the thesis by solve_ivp differ by at most 0.1 mV."""
+    levels, level_s = 50, 60
+    time_s = np.arange(0.0, levels * level_s, 1.0)
+    current_a = np.repeat(np.random.default_rng(3).uniform(0.0, 0.5, levels), level_s)
     capacity_as = 0.275 * 3600.0
-    voltage_v, _ = kernel.simulate_cell((1.0, 0.0, 0.0), time_s, current_a, capacity_as, A)
+    voltage_v, _ = kernel.simulate_cell((1.0, 0.0, 0.0), time_s, current_a, capacity_as, PARAMETERS)
 
     x = np.array([1.0, 0.0, 0.0])
-    worst = 0.0
-    for j in range(0, len(time_s), 60):
+    max_error_v = 0.0
+    for j in range(0, len(time_s), level_s):
         i = current_a[j]
 
         def slope(_t: float, x: np.ndarray, i: float = i) -> list[float]:
-            c_ts, c_tl = kernel.c_ts(x[0], A), kernel.c_tl(x[0], A)
+            c_ts, c_tl = kernel.c_ts(x[0], PARAMETERS), kernel.c_tl(x[0], PARAMETERS)
             return [
                 -i / capacity_as,
-                -x[1] / (kernel.r_ts(x[0], A) * c_ts) + i / c_ts,
-                -x[2] / (kernel.r_tl(x[0], A) * c_tl) + i / c_tl,
+                -x[1] / (kernel.r_ts(x[0], PARAMETERS) * c_ts) + i / c_ts,
+                -x[2] / (kernel.r_tl(x[0], PARAMETERS) * c_tl) + i / c_tl,
             ]
 
-        solved = solve_ivp(slope, (0.0, 60.0), x, t_eval=np.arange(61.0), rtol=1e-10, atol=1e-12)
-        for m in range(60):
-            y = kernel.terminal_voltage(tuple(solved.y[:, m]), i, A)
-            worst = max(worst, abs(y - voltage_v[j + m]))
-        x = solved.y[:, -1]
-    assert worst < 1e-4
+        solution = solve_ivp(slope, (0.0, level_s), x, t_eval=np.arange(level_s + 1.0), rtol=1e-10, atol=1e-12)
+        for m in range(level_s):
+            y = kernel.terminal_voltage(tuple(solution.y[:, m]), i, PARAMETERS)
+            max_error_v = max(max_error_v, abs(y - voltage_v[j + m]))
+        x = solution.y[:, -1]
+    assert max_error_v < 1e-4
 
 
 @given(st.floats(1e-3, 1e3), st.floats(-5, 5), st.floats(-0.5, 0.5), st.floats(1e-3, 1.0), st.floats(0.1, 1e4))
 def test_two_steps_equal_one_step_of_twice_the_length(dt: float, i: float, v: float, r: float, tau: float) -> None:
-    twice = kernel.rc_step(kernel.rc_step(v, i, r, tau, dt), i, r, tau, dt)
-    assert twice == pytest.approx(kernel.rc_step(v, i, r, tau, 2 * dt), abs=1e-12)
+    two_steps = kernel.rc_step(kernel.rc_step(v, i, r, tau, dt), i, r, tau, dt)
+    assert two_steps == pytest.approx(kernel.rc_step(v, i, r, tau, 2 * dt), abs=1e-12)
 
 
 def test_grid_agrees_with_the_formula_to_a_microvolt() -> None:
     value, slope = ocv_grid(CHEN_MORA)
     for soc in np.random.default_rng(1).uniform(0, 1, 500):
-        assert kernel.ocv(soc, value, slope) == pytest.approx(kernel.emf(soc, A), abs=1e-6)
+        assert kernel.ocv(soc, value, slope) == pytest.approx(kernel.emf(soc, PARAMETERS), abs=1e-6)
 
 
 @given(st.floats(0, 1))
@@ -88,5 +95,5 @@ def test_table_ocv_stays_monotone_between_its_points() -> None:
         update={"ocv": TableOcv(form="table", soc=(0.0, 0.01, 0.5, 0.9, 1.0), ocv_v=(2.5, 3.2, 3.6, 3.61, 4.2))}
     )
     value, slope = ocv_grid(cell)
-    fine = [kernel.ocv(x, value, slope) for x in np.linspace(0, 1, 2001)]
-    assert (np.diff(fine) > 0).all()
+    ocv_v = [kernel.ocv(x, value, slope) for x in np.linspace(0, 1, 2001)]
+    assert (np.diff(ocv_v) > 0).all()

@@ -12,118 +12,122 @@ from bms_estimator.kernels.cell_model import fuel_cell
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
 from bms_estimator.kernels.observer import chen_mora_sensitivity
 from bms_estimator.kernels.observer.learning_model import NAMES, Model
+from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")
 THETA = np.array([0.1, -0.05, 0.03, 0.2, 0.1, 0.05, 0.3, 0.0])
-"""Parameters that differ from the file's."""
+"""Logarithms of the parameters relative to those of the file."""
 STEPS = ((3.0, 0.01), (3.0, 0.02), (6.0, 0.005), (9.0, 0.1), (12.0, 0.1), (0.5, 0.03), (0.0, 0.5))
 """Currents [A], one beyond the limiting current, and durations [s]."""
-currents = st.floats(0.0, 8.0)
-lengths = st.floats(1e-4, 10.0)
+currents_a = st.floats(0.0, 8.0)
+durations_s = st.floats(1e-4, 10.0)
 
 
-def given_by_file() -> np.ndarray:
-    values = np.zeros(8)
+def file_constants() -> np.ndarray:
+    """Return the model's constants of the file at the temperature of the file."""
+    values = np.zeros(LEARNABLE)
     fuel_cell.load_file_constants(values, PEM.a, np.nan)
     return values
 
 
-def settled(current_a: float, theta: np.ndarray = THETA) -> tuple[np.ndarray, np.ndarray]:
-    x, dx = np.zeros(2), np.zeros((2, 8))
-    fuel_cell.steady_state(x, dx, theta, given_by_file(), current_a)
+def steady_state(current_a: float, theta: np.ndarray = THETA) -> tuple[np.ndarray, np.ndarray]:
+    """Return the states after a long time at ``current_a``, and their derivatives."""
+    x, dx = np.zeros(2), np.zeros((2, LEARNABLE))
+    fuel_cell.steady_state(x, dx, theta, file_constants(), current_a)
     return x, dx
 
 
 def voltages(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the voltage after each of ``STEPS`` and its derivatives."""
-    (x, dx), out, slopes = settled(0.0, theta), [], []
+    (x, dx), voltages_v, slopes = steady_state(0.0, theta), [], []
     for current_a, dt_s in STEPS:
-        fuel_cell.advance(x, dx, theta, given_by_file(), current_a, dt_s)
-        psi = np.zeros(8)
-        out.append(fuel_cell.output(x, dx, theta, given_by_file(), current_a, psi))
+        fuel_cell.advance(x, dx, theta, file_constants(), current_a, dt_s)
+        psi = np.zeros(LEARNABLE)
+        voltages_v.append(fuel_cell.output(x, dx, theta, file_constants(), current_a, psi))
         slopes.append(psi)
-    return np.array(out), np.array(slopes)
+    return np.array(voltages_v), np.array(slopes)
 
 
 def test_reversible_voltage_is_that_of_the_standard_state() -> None:
     assert fuel_cell.nernst(298.15, 1.0, 1.0) == 1.229
-    assert fuel_cell.nernst(343.15, 1.0, 1.0) == pytest.approx(
-        1.191, abs=5e-4
-    )  # 1.19 V at 70 C, Larminie and Dicks 2.2
+    # Larminie and Dicks, Fuel Cell Systems Explained, section 2.2: 1.19 V at 70 C
+    assert fuel_cell.nernst(343.15, 1.0, 1.0) == pytest.approx(1.191, abs=5e-4)
     assert fuel_cell.nernst(343.15, 1.0, 0.21) < fuel_cell.nernst(343.15, 1.0, 1.0) < fuel_cell.nernst(343.15, 2.0, 1.0)
 
 
 @pytest.mark.parametrize("j", range(len(fuel_cell.NAMES)), ids=fuel_cell.NAMES)
 def test_sensitivities_are_those_of_finite_differences(j: int) -> None:
-    step = 1e-6 * np.eye(8)[j]
+    step = 1e-6 * np.eye(LEARNABLE)[j]
     differences = (voltages(THETA + step)[0] - voltages(THETA - step)[0]) / 2e-6
     np.testing.assert_allclose(voltages(THETA)[1][:, j], differences, atol=1e-7)
-    assert np.abs(differences).max() > 1e-3, "the load shows it"
+    assert np.abs(differences).max() > 1e-3, "the load determines the parameter"
 
 
-@given(currents, currents, lengths, lengths)
+@given(currents_a, currents_a, durations_s, durations_s)
 def test_two_steps_under_one_current_equal_one_step(
     before_a: float, current_a: float, first_s: float, second_s: float
 ) -> None:
-    (x, dx), (y, dy) = settled(before_a), settled(before_a)
+    (x, dx), (y, dy) = steady_state(before_a), steady_state(before_a)
     for dt_s in (first_s, second_s):
-        fuel_cell.advance(x, dx, THETA, given_by_file(), current_a, dt_s)
-    fuel_cell.advance(y, dy, THETA, given_by_file(), current_a, first_s + second_s)
+        fuel_cell.advance(x, dx, THETA, file_constants(), current_a, dt_s)
+    fuel_cell.advance(y, dy, THETA, file_constants(), current_a, first_s + second_s)
     np.testing.assert_allclose(x, y, rtol=1e-9)
     np.testing.assert_allclose(dx, dy, rtol=1e-7, atol=1e-9)
 
 
 def test_the_step_agrees_with_an_independent_integration() -> None:
-    values = given_by_file()
+    values = file_constants()
     tafel_v, farad, internal_a = (values[i] for i in (fuel_cell.TAFEL, fuel_cell.C_DL, fuel_cell.INTERNAL))
-    x, dx = settled(0.2, np.zeros(8))
-    end_v = settled(5.0, np.zeros(8))[0][0]
+    x, dx = steady_state(0.2, np.zeros(LEARNABLE))
+    end_v = steady_state(5.0, np.zeros(LEARNABLE))[0][0]
 
-    def slope(_: float, v: np.ndarray) -> np.ndarray:
+    def voltage_rate(_: float, v: np.ndarray) -> np.ndarray:
         return (5.0 + internal_a) * -np.expm1((v - end_v) / tafel_v) / farad
 
-    way = solve_ivp(slope, (0.0, 0.02), [x[0]], rtol=1e-11, atol=1e-12).y[0, -1]
-    fuel_cell.advance(x, dx, np.zeros(8), values, 5.0, 0.02)
-    assert x[0] == pytest.approx(way, abs=1e-8)
-    assert 0.01 < end_v - x[0] < 2.0, "still on its way"
+    expected_v = solve_ivp(voltage_rate, (0.0, 0.02), [x[0]], rtol=1e-11, atol=1e-12).y[0, -1]
+    fuel_cell.advance(x, dx, np.zeros(LEARNABLE), values, 5.0, 0.02)
+    assert x[0] == pytest.approx(expected_v, abs=1e-8)
+    assert 0.01 < end_v - x[0] < 2.0, "the transient has not ended"
 
 
 @pytest.mark.parametrize("current_a", [0.5, 2.0, 5.0])
-def test_a_small_step_settles_with_the_resistance_of_tafel_s_slope(current_a: float) -> None:
-    """The time constant is C A / I, because the charge transfer resistance is A / I."""
-    values = given_by_file()
-    values[fuel_cell.B] = 1e-9  # without concentration loss
+def test_a_small_step_decays_with_the_charge_transfer_resistance_of_tafel(current_a: float) -> None:
+    """The time constant is C A / I, because the charge transfer resistance is A / I, with A of Tafel's equation."""
+    values = file_constants()
+    values[fuel_cell.B] = 1e-9  # almost no concentration loss
+    step = 1e-3
     reaction_a = current_a + values[fuel_cell.INTERNAL]
     tau_s = values[fuel_cell.C_DL] * values[fuel_cell.TAFEL] / reaction_a
-    x, dx = np.zeros(2), np.zeros((2, 8))
-    fuel_cell.steady_state(x, dx, np.zeros(8), values, current_a)
+    x, dx = np.zeros(2), np.zeros((2, LEARNABLE))
+    fuel_cell.steady_state(x, dx, np.zeros(LEARNABLE), values, current_a)
     start_v = x[0]
-    fuel_cell.advance(x, dx, np.zeros(8), values, 1.001 * current_a, tau_s)
-    reached = (x[0] - start_v) / (values[fuel_cell.TAFEL] / reaction_a * 0.001 * current_a)
-    assert reached == pytest.approx(1.0 - np.exp(-1.0), rel=2e-3)
+    fuel_cell.advance(x, dx, np.zeros(LEARNABLE), values, (1.0 + step) * current_a, tau_s)
+    response = (x[0] - start_v) / (values[fuel_cell.TAFEL] / reaction_a * step * current_a)
+    assert response == pytest.approx(1.0 - np.exp(-1.0), rel=2e-3)
 
 
 @given(st.lists(st.floats(-0.4, 0.4), min_size=7, max_size=7))
-def test_a_polarisation_curve_always_falls(of_file: list[float]) -> None:
-    theta = np.array([*of_file, 0.0])
+def test_a_polarisation_curve_always_falls(parameters: list[float]) -> None:
+    theta = np.array([*parameters, 0.0])
     current_a = np.linspace(0.0, 15.0, 200)
     voltage_v, _ = polarisation(PEM.a, theta, current_a, np.full(200, np.nan))
     assert np.isfinite(voltage_v).all()
     assert (np.diff(voltage_v) < 0.0).all()
 
 
-def test_a_settled_record_lies_on_the_polarisation_curve() -> None:
-    current_a, none = np.repeat([1.0, 4.0], 100), np.full(200, np.nan)
-    voltage_v, _ = open_loop(PEM.a, THETA, np.arange(200) * 0.1, current_a, none)
-    curve_v, _ = polarisation(PEM.a, THETA, np.array([1.0, 4.0]), none[:2])
+def test_a_constant_current_leads_to_the_polarisation_curve() -> None:
+    current_a, no_temperature = np.repeat([1.0, 4.0], 100), np.full(200, np.nan)
+    voltage_v, _ = open_loop(PEM.a, THETA, np.arange(200) * 0.1, current_a, no_temperature)
+    curve_v, _ = polarisation(PEM.a, THETA, np.array([1.0, 4.0]), no_temperature[:2])
     assert voltage_v[[99, 199]] == pytest.approx(curve_v, abs=1e-9)
 
 
 @pytest.mark.parametrize("celsius", [20.0, 60.0])
 def test_temperature_dependence_of_the_losses_agrees_with_mann(celsius: float) -> None:
-    values, kelvin = np.zeros(8), 273.15 + celsius
+    """The resistance is compared at the stack's rated current of 3.25 A and a water content of 14."""
+    values, kelvin = np.zeros(LEARNABLE), 273.15 + celsius
     fuel_cell.load_file_constants(values, PEM.a, celsius)
     cells = mann_stack.CELLS
     assert values[fuel_cell.TAFEL] == pytest.approx(-mann_stack.XI_4 * kelvin * cells, rel=1e-3)
@@ -134,16 +138,16 @@ def test_temperature_dependence_of_the_losses_agrees_with_mann(celsius: float) -
 
 def test_the_model_is_finite_under_charge_and_overload() -> None:
     for current_a in (-5.0, -1e-9, 0.0, 20.0):
-        x, dx = settled(current_a)
+        x, dx = steady_state(current_a)
         assert np.isfinite(x).all()
         assert np.isfinite(dx).all()
 
 
 def test_cell_and_fuel_cell_models_define_the_same_functions() -> None:
     for function in ("load_constants", "steady_state", "advance", "output", "write"):
-        shapes = [
+        parameter_names = [
             tuple(inspect.signature(getattr(m, function).py_func).parameters)
             for m in (chen_mora_sensitivity, fuel_cell)
         ]
-        assert shapes[0] == shapes[1], function
+        assert parameter_names[0] == parameter_names[1], function
     assert NAMES == {Model.CHEN_MORA: chen_mora_sensitivity.NAMES, Model.FUEL_CELL: fuel_cell.NAMES}

@@ -1,4 +1,7 @@
-"""Comparison of the simulated cell with PyBaMM's Thevenin model: equal elements, independent equations and solver."""
+"""Comparison of the simulated cell with PyBaMM's Thevenin model, which has independent equations and an own solver.
+
+Numbers in parentheses are equations of the thesis.
+"""
 
 import importlib.util
 import os
@@ -18,14 +21,14 @@ pytestmark = pytest.mark.skipif(
 CELL = load_cell("chen_mora")
 START_SOC = 0.95
 LOAD = ((0.4, 60), (0.0, 60), (-0.25, 60), (0.0, 60), (0.4, 600), (0.0, 600), (0.15, 300))
-"""Currents [A], positive on discharge, and durations [s]: pulses and rests shorter and longer than the time constants."""
+"""Currents [A], positive on discharge, and durations [s]. Some are shorter and some longer than the time constants."""
 ROUNDS = 3
-"""Number of repetitions, which lead to an SOC of 0.06, where every element is nonlinear."""
-AT_MOST_V = 1e-4
+"""Number of repetitions of the load. They end at an SOC of 0.06, at which every element is nonlinear."""
+MAX_ERROR_V = 1e-4
 
 
 def constant_elements() -> np.ndarray:
-    """Return Chen and Mora's cell with constant elements: amplitudes 0."""
+    """Return the parameters of Chen and Mora's cell with all amplitudes 0, so that elements do not depend on SOC."""
     a = CELL.a.copy()
     a[[1, 4, 7, 10, 13]] = 0.0
     return a
@@ -33,7 +36,7 @@ def constant_elements() -> np.ndarray:
 
 def thevenin_voltages(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the terminal voltage [V] and SOC at each second by PyBaMM."""
-    os.environ["PYBAMM_DISABLE_TELEMETRY"] = "true"  # before the import: nothing leaves this machine
+    os.environ["PYBAMM_DISABLE_TELEMETRY"] = "true"  # set before the import, which would send usage data
     import pybamm  # noqa: PLC0415 - takes seconds, and only the worker that runs this test needs it
 
     def over_soc(amplitude: float, exponent: float, offset: float) -> Callable[..., Any]:
@@ -68,10 +71,10 @@ def thevenin_voltages(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     simulation = pybamm.Simulation(
         model, parameter_values=values, experiment=pybamm.Experiment(steps * ROUNDS), solver=solver
     )
-    solved = simulation.solve(showprogress=False)
-    # the last value of a step is at the start of the next one, but under the previous current
-    voltage_v = [cycle["Voltage [V]"].entries[:-1] for cycle in solved.cycles]
-    soc = [cycle["SoC"].entries[:-1] for cycle in solved.cycles]
+    solution = simulation.solve(showprogress=False)
+    # The last value of a step has the time of the first value of the next step, but the previous current.
+    voltage_v = [cycle["Voltage [V]"].entries[:-1] for cycle in solution.cycles]
+    soc = [cycle["SoC"].entries[:-1] for cycle in solution.cycles]
     return np.concatenate(voltage_v), np.concatenate(soc)
 
 
@@ -87,4 +90,4 @@ def test_simulated_cell_agrees_with_the_thevenin_model_of_pybamm(a: np.ndarray) 
 
     assert soc[-1] < 0.06
     assert np.abs(soc - expected_soc).max() < 1e-8
-    assert np.abs(voltage_v - expected_v).max() < AT_MOST_V
+    assert np.abs(voltage_v - expected_v).max() < MAX_ERROR_V

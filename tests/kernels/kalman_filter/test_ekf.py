@@ -1,4 +1,4 @@
-"""Kalman filter compared with its definition: Jacobians, update, mixtures, and hours of operation."""
+"""Kalman filter: Jacobians, update and mixtures compared with their definitions, and operation over hours."""
 
 from itertools import pairwise
 
@@ -22,165 +22,176 @@ from tests.estimator.anywhere.cases import CASES, Case, capture
 
 CELL = load_cell("nmc", 3.0)
 BRANCH = slice(X, X + BRANCHES)
+"""States of the currents through the RC pairs."""
+MIDDLE_SOC = 0.55
+COOL_C = 12.0
+"""Temperature between two of the cell file [C]."""
+MEASUREMENT_V2 = 0.05**2
+"""Variance of the measurement in updates [V^2]."""
 
 
-def settings(**changes):
+def make_settings(**changes):
+    """Return the settings of a generic NMC cell with changed fields."""
     p = filter_settings(CELL, ocv_grid(CELL), IdentifierSettings(), 1e-3, None)[0]
     for name, value in changes.items():
         p[name] = value
     return p
 
 
-def somewhere(p, seed=1, time_s=1.0):
-    """Return a state in the middle of a drive with a random mean and covariance and a window of five samples."""
+def make_state(p, seed=1, time_s=1.0):
+    """Return a state during a drive with random mean and covariance and a window of five samples in ``time_s``."""
     rng = np.random.default_rng(seed)
     s = np.zeros(1, EKF_STATE)[0]
-    hypotheses.initialize_filter(s, p, 0.55, 1.5, 12.0)
+    hypotheses.initialize_filter(s, p, MIDDLE_SOC, 1.5, COOL_C)
     s["count"], s["best"] = 1, 0
     s["mean"][0] = 0.3 * rng.standard_normal(STATES) * np.sqrt(np.diag(s["covariance"][3]))
-    s["mean"][0, SOC] = 0.55
+    s["mean"][0, SOC] = MIDDLE_SOC
     mixed = rng.standard_normal((STATES, STATES))
     std = np.sqrt(np.diag(s["covariance"][3]))
     s["covariance"][0] = (mixed @ mixed.T / STATES) * std[:, None] * std
     s["x_a"] = rng.normal(1.0, 0.5, BRANCHES)
     for current_a, voltage_v in zip(rng.normal(1.5, 0.5, 5), rng.normal(3.6, 0.01, 5), strict=True):
-        window.integrate_current(s, p, time_s / 5, False, current_a, 12.0)
+        window.integrate_current(s, p, time_s / 5, False, current_a, COOL_C)
         window.add_to_window(s, current_a, voltage_v)
     return s
 
 
-def linearised(s, p):
+def linearise(s, p):
+    """Linearise about the first hypothesis; return its predicted voltage and its std from the curvature [V]."""
     return ekf.linearise(s, p, 0, s["mean"][0, SOC], s["covariance"][0, SOC, SOC])
 
 
-def predicted(s, p, mean):
+def predict_voltage(s, p, mean):
+    """Return the predicted voltage for the mean ``mean`` of the first hypothesis [V]."""
     s["mean"][0] = mean
-    return linearised(s, p)[0]
+    return linearise(s, p)[0]
 
 
-def test_h_is_the_derivative_of_the_voltage_by_every_state_but_the_soc() -> None:
-    p = settings()
-    s = somewhere(p)
+def test_h_is_the_derivative_of_the_voltage_by_every_state_except_the_soc() -> None:
+    p = make_settings()
+    s = make_state(p)
     mean = s["mean"][0].copy()
-    linearised(s, p)
+    linearise(s, p)
     h = s["h"].copy()
     for j in range(STATES):
         if j == SOC:
             continue
         step = np.zeros(STATES)
         step[j] = 1e-5
-        by_difference = (predicted(s, p, mean + step) - predicted(s, p, mean - step)) / 2e-5
+        by_difference = (predict_voltage(s, p, mean + step) - predict_voltage(s, p, mean - step)) / 2e-5
         assert h[j] == pytest.approx(by_difference, rel=1e-6, abs=1e-9), j
 
 
 def test_h_by_the_soc_is_the_secant_of_the_ocv_over_one_std() -> None:
-    p = settings(sensor_v2=0.0)
-    s = somewhere(p)
-    s["covariance"][0, SOC, SOC] = 0.1**2
-    linearised(s, p)
+    p = make_settings(sensor_v2=0.0)
+    s = make_state(p)
+    soc_std = 0.1
+    s["covariance"][0, SOC, SOC] = soc_std**2
+    linearise(s, p)
     w, grid = s["window"], np.linspace(0.0, 1.0, p["ocv_v"].size)
-    middle = s["mean"][0, SOC] + (w["charge_as"] - w["sum_as"] / w["samples"]) / p["capacity_as"]
-    below, above = np.interp([middle - 0.1, middle + 0.1], grid, p["ocv_v"])
-    assert s["h"][SOC] == pytest.approx((above - below) / 0.2, rel=1e-3)
+    mean_soc_of_window = s["mean"][0, SOC] + (w["charge_as"] - w["sum_as"] / w["samples"]) / p["capacity_as"]
+    below_v, above_v = np.interp([mean_soc_of_window - soc_std, mean_soc_of_window + soc_std], grid, p["ocv_v"])
+    assert s["h"][SOC] == pytest.approx((above_v - below_v) / (2 * soc_std), rel=1e-3)
 
 
 def test_p_is_propagated_by_the_derivative_of_the_mean() -> None:
-    """F P F' of the kernel, P with Q less P = 0 with Q, against F by finite differences.
+    """F P F' of the kernel is the prediction from P minus that from 0. It is compared with F by finite differences.
 
-    How fast the error of the OCV changes is itself another at another SOC, which is no part of F: here it is not.
+    ``curve_soc`` is large enough that the error of the OCV does not depend on the SOC, a dependence that F omits.
     """
-    p = settings(curve_soc=0.3)
+    p = make_settings(curve_soc=0.3)
 
-    def after(mean, covariance):
-        s = somewhere(p, time_s=20.0)
+    def predict(mean, covariance):
+        s = make_state(p, time_s=20.0)
         s["mean"][0], s["covariance"][0] = mean, covariance
         ekf.transition_diagonal(s, p)
         ekf.predict(s, p, 0)
         return s["mean"][0].copy(), s["covariance"][0].copy()
 
-    s = somewhere(p, time_s=20.0)
+    s = make_state(p, time_s=20.0)
     mean, covariance = s["mean"][0].copy(), s["covariance"][0].copy()
-    nothing = np.zeros((STATES, STATES))
+    zero = np.zeros((STATES, STATES))
     f = np.empty((STATES, STATES))
     for j in range(STATES):
         step = np.zeros(STATES)
         step[j] = 1e-4
-        f[:, j] = (after(mean + step, nothing)[0] - after(mean - step, nothing)[0]) / 2e-4
+        f[:, j] = (predict(mean + step, zero)[0] - predict(mean - step, zero)[0]) / 2e-4
     assert f[SOC, OFFSET] > 0.0
     assert f[SOC, LN_Q] > 0.0
     assert f[X, OFFSET] < -0.9
-    by_kernel = after(mean, covariance)[1] - after(mean, nothing)[1]
+    by_kernel = predict(mean, covariance)[1] - predict(mean, zero)[1]
     expected, nodes = f @ covariance @ f.T, np.arange(NODE, STATES)
-    assert by_kernel[nodes, nodes] == pytest.approx(
-        expected[nodes, nodes], abs=1.0 / ekf_noise.AGED_SOC
-    )  # Q of these states depends on P
+    # Q of the nodes depends on P, so that their variances are compared with a tolerance.
+    assert by_kernel[nodes, nodes] == pytest.approx(expected[nodes, nodes], abs=1.0 / ekf_noise.AGED_SOC)
     by_kernel[nodes, nodes] = expected[nodes, nodes]
     assert by_kernel == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
 def test_the_update_equals_the_kalman_update() -> None:
-    p = settings()
-    s = somewhere(p)
-    _, curved_v = linearised(s, p)
+    p = make_settings()
+    s = make_state(p)
+    _, curvature_v = linearise(s, p)
     mean, covariance, h = (np.array(x) for x in (s["mean"][0], s["covariance"][0], s["h"]))
-    r = 0.05**2
-    total = h @ covariance @ h + r + curved_v**2
-    s["window"]["sum_v"] = s["window"]["samples"] * (linearised(s, p)[0] + 0.3 * np.sqrt(total))
-    innovation_v, variance_v2, straight_v2 = ekf.update(s, p, 0, r)
-    gain = covariance @ h / total
-    assert (innovation_v, variance_v2) == pytest.approx((0.3 * np.sqrt(total), total))
-    assert straight_v2 == pytest.approx(total - curved_v**2)
+    innovation_variance_v2 = h @ covariance @ h + MEASUREMENT_V2 + curvature_v**2
+    s["window"]["sum_v"] = s["window"]["samples"] * (linearise(s, p)[0] + 0.3 * np.sqrt(innovation_variance_v2))
+    innovation_v, variance_v2, linear_variance_v2 = ekf.update(s, p, 0, MEASUREMENT_V2)
+    gain = covariance @ h / innovation_variance_v2
+    assert (innovation_v, variance_v2) == pytest.approx((0.3 * np.sqrt(innovation_variance_v2), innovation_variance_v2))
+    assert linear_variance_v2 == pytest.approx(innovation_variance_v2 - curvature_v**2)
     assert s["mean"][0] == pytest.approx(mean + gain * innovation_v, rel=1e-9, abs=1e-12)
     assert s["covariance"][0] == pytest.approx(covariance - np.outer(gain, h @ covariance), rel=1e-9, abs=1e-15)
 
 
 @pytest.mark.parametrize(
-    ("name", "before", "std", "true_soc"),
+    ("name", "prior_soc", "prior_std", "true_soc"),
     [*(("chen_mora", 0.045, 0.035, true) for true in (0.06, 0.08, 0.1, 0.13)), ("lfp", 0.037, 0.1, 0.21)],
 )
 def test_an_update_over_the_knee_near_empty_agrees_with_bayes(
-    name: str, before: float, std: float, true_soc: float
+    name: str, prior_soc: float, prior_std: float, true_soc: float
 ) -> None:
-    """SOC alone, compared with the posterior on a grid. The OCV is ten times as steep at the initial SOC."""
+    """The update of the SOC alone is compared with the posterior on a grid.
+
+    The OCV is ten times as steep at the prior SOC as at the true one.
+    """
     cell, noise_v = load_cell(name, None if name == "chen_mora" else 3.0), 0.03
     p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(), 1e-3, None)[0]
     s = np.zeros(1, EKF_STATE)[0]
-    hypotheses.initialize_filter(s, p, before, 0.0, 25.0)
+    hypotheses.initialize_filter(s, p, prior_soc, 0.0, 25.0)
     s["count"], s["best"] = 1, 0
     s["mean"][0], s["covariance"][0] = 0.0, 0.0
-    s["mean"][0, SOC], s["covariance"][0, SOC, SOC] = before, std**2
+    s["mean"][0, SOC], s["covariance"][0, SOC, SOC] = prior_soc, prior_std**2
     grid = np.linspace(-0.05, 0.6, 4000)
     ocv_v = np.interp(grid, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
     voltage_v = np.interp(true_soc, grid, ocv_v)
     window.add_to_window(s, 0.0, voltage_v)
     ekf.update(s, p, 0, noise_v**2)
-    weight = np.exp(-0.5 * ((grid - before) / std) ** 2 - 0.5 * ((ocv_v - voltage_v) / noise_v) ** 2)
+    weight = np.exp(-0.5 * ((grid - prior_soc) / prior_std) ** 2 - 0.5 * ((ocv_v - voltage_v) / noise_v) ** 2)
     mean = np.average(grid, weights=weight)
     exact_std = np.sqrt(np.average((grid - mean) ** 2, weights=weight))
     assert abs(s["mean"][0, SOC] - mean) < exact_std
     assert 0.6 < np.sqrt(s["covariance"][0, SOC, SOC]) / exact_std < 1.6
 
 
-def test_an_innovation_of_many_std_counts_as_one_of_two() -> None:
-    p = settings()
-    moved = []
+def test_an_innovation_of_many_std_is_limited_to_two() -> None:
+    """Its effect on the slow bias is as large as that of an innovation of two std."""
+    p = make_settings()
+    corrections_v = []
     for stds in (2.0, 8.0):
-        s = somewhere(p)
-        s["covariance"][0][SOC] = s["covariance"][0][:, SOC] = (
-            0.0  # otherwise the update would be linearized about another SOC
-        )
-        _, curved_v = linearised(s, p)
+        s = make_state(p)
+        # A certain SOC, because the update would otherwise be linearized about another SOC.
+        s["covariance"][0][SOC] = s["covariance"][0][:, SOC] = 0.0
+        _, curvature_v = linearise(s, p)
         h, covariance, before = (np.array(x) for x in (s["h"], s["covariance"][0], s["mean"][0]))
-        std = np.sqrt(h @ covariance @ h + 0.05**2 + curved_v**2)
-        s["window"]["sum_v"] = s["window"]["samples"] * (linearised(s, p)[0] + stds * std)
-        ekf.update(s, p, 0, 0.05**2)
-        moved.append(s["mean"][0, B_SLOW] - before[B_SLOW])
-    assert moved[1] == pytest.approx(moved[0] * 2.0 / 8.0)
+        std = np.sqrt(h @ covariance @ h + MEASUREMENT_V2 + curvature_v**2)
+        s["window"]["sum_v"] = s["window"]["samples"] * (linearise(s, p)[0] + stds * std)
+        ekf.update(s, p, 0, MEASUREMENT_V2)
+        corrections_v.append(s["mean"][0, B_SLOW] - before[B_SLOW])
+    assert corrections_v[1] == pytest.approx(corrections_v[0] * 2.0 / 8.0)
 
 
 def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
-    """The covariance is compared with the solution of the Lyapunov equation of load and RC pairs."""
-    p = settings()
+    """Its covariance is compared with the solution of the Lyapunov equation of load and RC pairs, given a current of 2 A."""
+    p = make_settings()
     s = np.zeros(1, EKF_STATE)[0]
     mean, covariance = s["mean"][0], s["covariance"][0]
     ekf_noise.initial_branch_currents(p, 2.0, mean, covariance)
@@ -190,16 +201,16 @@ def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
     noise = np.zeros((size, size))
     noise[0, 0] = 2.0 * (p["load_c"] * one_c) ** 2 / p["load_s"]
     joint = solve_continuous_lyapunov(a, -noise) + (p["load_level_c"] * one_c) ** 2
-    known = joint[1:, 0] / joint[0, 0]
-    expected_a = p["load_mean_c"] * one_c + known * (2.0 - p["load_mean_c"] * one_c)
+    gain = joint[1:, 0] / joint[0, 0]
+    expected_a = p["load_mean_c"] * one_c + gain * (2.0 - p["load_mean_c"] * one_c)
     assert mean[BRANCH] == pytest.approx(expected_a)
-    assert covariance[BRANCH, BRANCH] == pytest.approx(joint[1:, 1:] - np.outer(known, joint[0, 1:]))
+    assert covariance[BRANCH, BRANCH] == pytest.approx(joint[1:, 1:] - np.outer(gain, joint[0, 1:]))
 
 
 @pytest.mark.parametrize(("first_c", "rms_c"), [(0.0, 0.3), (-0.2, 0.3), (1.0, 1.0), (2.5, 1.285), (-6.0, 1.285)])
 def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float) -> None:
     """The model's error follows the RMS of the load. The first sample increases it at most to the RMS before switch-on."""
-    p = settings()
+    p = make_settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
     hypotheses.initialize_filter(s, p, 0.55, first_c * one_c, 12.0)
@@ -209,18 +220,18 @@ def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float)
 
 @pytest.mark.parametrize("first_c", [1.5, 3.0, 6.0])
 def test_the_load_in_a_gap_after_a_peak_may_have_continued_or_ended(first_c: float) -> None:
-    """The std is that of the long-term RMS load, 1.285 C."""
-    p = settings()
+    """The std of the unknown current includes that of the long-term RMS load, 1.285 C."""
+    p = make_settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
     hypotheses.initialize_filter(s, p, 0.55, first_c * one_c, 12.0)
-    unknown_c = gap_charge.gap_charge_std(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
-    assert first_c - 1.29 < unknown_c < first_c
+    unknown_std_c = gap_charge.gap_charge_std(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
+    assert first_c - 1.29 < unknown_std_c < first_c
 
 
-def test_outside_the_temperatures_of_the_cell_file_r_grows() -> None:
-    p = settings(low_c=0.0, high_c=30.0, model_j=0.0, sensor_v2=0.0)
-    s = somewhere(p)
+def test_measurement_variance_grows_outside_the_temperatures_of_the_cell_file() -> None:
+    p = make_settings(low_c=0.0, high_c=30.0, model_j=0.0, sensor_v2=0.0)
+    s = make_state(p)
     variances = []
     for s["temperature_c"] in (10.0, 30.0, 60.0, -60.0):
         variances.append(ekf_noise.measurement_variance(s, p, 1.0, 5) / p["model_v"] ** 2)
@@ -228,25 +239,26 @@ def test_outside_the_temperatures_of_the_cell_file_r_grows() -> None:
 
 
 def test_errors_do_not_decrease_above_the_temperatures_of_the_cell_file() -> None:
-    """Resistances decrease there, but errors of the model do not."""
-    p = settings(low_c=0.0, high_c=30.0)
-    s = somewhere(p)
-    sizes = []
+    """Resistances decrease at high temperatures, but errors of the model do not."""
+    p = make_settings(low_c=0.0, high_c=30.0)
+    s = make_state(p)
+    variances = []
     for s["temperature_c"] in (30.0, 45.0, 60.0):
         temperature.update_arrhenius_factors(s)
-        sizes.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0)))
-    assert sizes[1] == pytest.approx(1.5**2 * np.array(sizes[0]), rel=0.01)
-    assert sizes[2] == pytest.approx(2.0**2 * np.array(sizes[0]), rel=0.01)
+        variances.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0)))
+    assert variances[1] == pytest.approx(1.5**2 * np.array(variances[0]), rel=0.01)
+    assert variances[2] == pytest.approx(2.0**2 * np.array(variances[0]), rel=0.01)
 
 
 def test_inflation_is_one_for_white_innovations_and_grows_for_persistent_ones() -> None:
     s = np.zeros(1, EKF_STATE)[0]
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
-    rng, slow = np.random.default_rng(3), []
+    rng, slow_inflations = np.random.default_rng(3), []
     for u in rng.standard_normal(20_000):
         ekf.adapt_bias_inflation(s, 0, 1.0, u)
-        slow.append(s["slow_inflation"][0])
-    assert np.mean(slow) == pytest.approx(1.3, abs=0.3)  # ratios below 1 count as 1
+        slow_inflations.append(s["slow_inflation"][0])
+    # The mean is above 1, because ratios below 1 count as 1.
+    assert np.mean(slow_inflations) == pytest.approx(1.3, abs=0.3)
     for _ in range(7200):
         ekf.adapt_bias_inflation(s, 0, 1.0, 0.2)
     assert s["slow_inflation"][0] > 30.0
@@ -257,15 +269,15 @@ def test_inflation_is_one_for_white_innovations_and_grows_for_persistent_ones() 
 def test_inflation_of_white_innovations_is_small_for_any_sample_period(dt_s: float) -> None:
     s = np.zeros(1, EKF_STATE)[0]
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
-    rng, both = np.random.default_rng(4), []
+    rng, inflations = np.random.default_rng(4), []
     for u in rng.standard_normal(20_000):
         ekf.adapt_bias_inflation(s, 0, dt_s, u)
-        both.append((s["fast_inflation"][0], s["slow_inflation"][0]))
-    assert np.mean(both, axis=0) == pytest.approx([1.3, 1.3], abs=0.3)
+        inflations.append((s["fast_inflation"][0], s["slow_inflation"][0]))
+    assert np.mean(inflations, axis=0) == pytest.approx([1.3, 1.3], abs=0.3)
 
 
 def test_a_single_innovation_after_a_gap_causes_no_inflation(drive) -> None:
-    estimator = start(drive)
+    estimator = make_estimator(drive)
     f = estimator.record[0]["filter"]
     estimator.run(drive.samples[:1800])
     assert f["count"] == 1
@@ -279,13 +291,14 @@ def test_a_single_innovation_after_a_gap_causes_no_inflation(drive) -> None:
 
 def test_rc_pairs_after_a_gap_have_the_covariance_of_an_unknown_load() -> None:
     """The covariance is compared with 4000 draws of a load with a level and a Gauss-Markov process over three minutes."""
-    p, rng, load_a, t, gap_s = settings(), np.random.default_rng(6), 2.0, settings()["load_s"], 180
-    level_a = load_a * rng.standard_normal(4000)
-    process_a, x = load_a * rng.standard_normal(4000), np.zeros((BRANCHES, 4000))
+    p, rng = make_settings(), np.random.default_rng(6)
+    load_a, correlation_s, gap_s, draws = 2.0, p["load_s"], 180, 4000
+    level_a = load_a * rng.standard_normal(draws)
+    process_a, x = load_a * rng.standard_normal(draws), np.zeros((BRANCHES, draws))
     for _ in range(gap_s):
         x += (1.0 - np.exp(-1.0 / TAUS))[:, None] * (level_a + process_a - x)
-        process_a += -process_a * (1.0 - np.exp(-1.0 / t))
-        process_a += load_a * np.sqrt(1.0 - np.exp(-2.0 / t)) * rng.standard_normal(4000)
+        process_a += -process_a * (1.0 - np.exp(-1.0 / correlation_s))
+        process_a += load_a * np.sqrt(1.0 - np.exp(-2.0 / correlation_s)) * rng.standard_normal(draws)
     covariance, f = np.zeros((STATES, STATES)), np.ones(STATES)
     f[BRANCH] = np.exp(-gap_s / TAUS)
     ekf_noise.add_gap_noise(p, covariance, f, load_a, gap_s / p["capacity_as"])
@@ -294,7 +307,7 @@ def test_rc_pairs_after_a_gap_have_the_covariance_of_an_unknown_load() -> None:
 
 @pytest.mark.parametrize("gap_s", [1.0, 6.0, 10.0, 30.0, 180.0, 3600.0])
 def test_the_noise_of_a_gap_is_a_covariance(gap_s: float) -> None:
-    p, covariance, f = settings(), np.zeros((STATES, STATES)), np.ones(STATES)
+    p, covariance, f = make_settings(), np.zeros((STATES, STATES)), np.ones(STATES)
     f[BRANCH] = np.exp(-gap_s / TAUS)
     ekf_noise.add_gap_noise(p, covariance, f, 2.0, gap_s / p["capacity_as"])
     assert covariance == pytest.approx(covariance.T)
@@ -302,15 +315,17 @@ def test_the_noise_of_a_gap_is_a_covariance(gap_s: float) -> None:
 
 
 def mixture(mean, covariance, weight):
-    """Return mean and covariance of a mixture of normal distributions by definition."""
+    """Return mean and covariance of a mixture of normal distributions."""
     weight = weight / weight.sum()
-    total = weight @ mean
-    away = mean - total
-    return total, np.einsum("q,qjk->jk", weight, covariance) + np.einsum("q,qj,qk->jk", weight, away, away)
+    mixture_mean = weight @ mean
+    deviation = mean - mixture_mean
+    between = np.einsum("q,qj,qk->jk", weight, deviation, deviation)
+    return mixture_mean, np.einsum("q,qjk->jk", weight, covariance) + between
 
 
-def several(p, count=3):
-    s = somewhere(p)
+def make_hypotheses(p, count=3):
+    """Return a state with several random hypotheses, 0.1 of SOC socs, and their weights."""
+    s = make_state(p)
     rng = np.random.default_rng(4)
     for q in range(count):
         mixed = rng.standard_normal((STATES, STATES))
@@ -324,8 +339,8 @@ def several(p, count=3):
 
 @pytest.mark.parametrize("series", [1.0, 6.0])
 def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
-    p = settings(series=series)
-    s, weight = several(p)
+    p = make_settings(series=series)
+    s, weight = make_hypotheses(p)
     mean, covariance = mixture(s["mean"][:3], s["covariance"][:3], weight)
     mixture_moments(s)
     assert s["soc"] == pytest.approx(mean[SOC])
@@ -335,7 +350,7 @@ def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
 
 
 def test_merging_preserves_mean_and_covariance() -> None:
-    s, weight = several(settings(), 2)
+    s, weight = make_hypotheses(make_settings(), 2)
     mean, covariance = mixture(s["mean"][:2], s["covariance"][:2], weight)
     merge_pair(s, 0, 1)
     assert s["mean"][0] == pytest.approx(mean)
@@ -344,7 +359,7 @@ def test_merging_preserves_mean_and_covariance() -> None:
 
 
 def test_unlikely_hypotheses_are_removed_and_similar_ones_merged() -> None:
-    s, _ = several(settings(), 4)
+    s, _ = make_hypotheses(make_settings(), 4)
     s["covariance"][:4, SOC, SOC] = 0.02**2
     s["mean"][:4, SOC] = 0.3, 0.5, 0.505, 0.7
     s["ln_weight"][:4] = 0.0, -0.1, -0.1, -20.0
@@ -355,15 +370,15 @@ def test_unlikely_hypotheses_are_removed_and_similar_ones_merged() -> None:
 
 @pytest.mark.parametrize("true", [0, 1])
 def test_a_hypothesis_with_a_large_bias_loses_weight(true: int) -> None:
-    """Its biases of 0.2 V have absorbed the errors, so that its innovations are small."""
-    p, apart = settings(), (0.4, 0.7)
-    s, _ = several(p, 2)
+    """The biases of the soc_error hypothesis, 0.2 V, have absorbed its error, so that its innovations are small."""
+    p, socs = make_settings(), (0.4, 0.7)
+    s, _ = make_hypotheses(p, 2)
     voltage_v = 0.0
     for q in (1 - true, true):
         s["mean"][q], s["covariance"][q] = 0.0, 1e-6 * np.eye(STATES)
-        s["mean"][q, SOC] = apart[q]
-        voltage_v = ekf.linearise(s, p, q, apart[q], 1e-6)[0]
-    s["mean"][1 - true, B_SLOW] = voltage_v - ekf.linearise(s, p, 1 - true, apart[1 - true], 1e-6)[0]
+        s["mean"][q, SOC] = socs[q]
+        voltage_v = ekf.linearise(s, p, q, socs[q], 1e-6)[0]
+    s["mean"][1 - true, B_SLOW] = voltage_v - ekf.linearise(s, p, 1 - true, socs[1 - true], 1e-6)[0]
     s["ln_weight"][:2] = 0.0
     assert abs(s["mean"][1 - true, B_SLOW]) > 0.2
     for _ in range(60):
@@ -372,15 +387,16 @@ def test_a_hypothesis_with_a_large_bias_loses_weight(true: int) -> None:
         window.add_to_window(s, s["current_a"], voltage_v)
         hypotheses.update_hypotheses(s, p)
     likely = s["mean"][: s["count"], SOC][s["ln_weight"][: s["count"]] > -3.0]
-    assert likely == pytest.approx([apart[true]], abs=0.05)
+    assert likely == pytest.approx([socs[true]], abs=0.05)
 
 
 DRIVE = next(case for case in CASES if case.name == "oxide 25C")
 FAST = Case("100 Hz", rate_hz=100.0, hours=0.25, unseen_h=0.3, seed=5)
 
 
-def start(seen, wrong=0.2):
-    return Estimator(seen.cell, initial_soc=float(seen.soc[0] + wrong))
+def make_estimator(drive, soc_error=0.2):
+    """Return an estimator with a soc_error initial SOC."""
+    return Estimator(drive.cell, initial_soc=float(drive.soc[0] + soc_error))
 
 
 @pytest.mark.parametrize("dt_s", [1.0, 10.0, 60.0])
@@ -412,25 +428,27 @@ def test_the_covariance_stays_valid_at_any_rate(drive, fast, rate_hz: float) -> 
     samples = {0.1: drive.samples[::10], 1.0: drive.samples, 100.0: fast.samples, 1000.0: fast.samples.copy()}[rate_hz]
     if rate_hz == 1000.0:
         samples["time_s"] = samples["time_s"][0] + np.arange(samples.size) / rate_hz
-    stays_a_covariance(start(drive if rate_hz <= 1.0 else fast), np.array_split(samples, 40))
+    assert_covariance_stays_valid(make_estimator(drive if rate_hz <= 1.0 else fast), np.array_split(samples, 40))
 
 
 @pytest.mark.parametrize("gap_s", [2, 6, 12, 60])
 def test_the_covariance_stays_valid_through_gaps(drive, gap_s: int) -> None:
     parts = [part[: part.size - gap_s] for part in np.split(drive.samples[:3600], range(gap_s + 30, 3600, gap_s + 30))]
-    stays_a_covariance(start(drive), parts)
+    assert_covariance_stays_valid(make_estimator(drive), parts)
 
 
-def stays_a_covariance(estimator: Estimator, parts: list[SampleBlock]) -> None:
+def assert_covariance_stays_valid(estimator: Estimator, parts: list[SampleBlock]) -> None:
+    """Assert that the covariance is valid at the first and the last sample of each part, and that nothing is reset."""
     f = estimator.record[0]["filter"]
     for part in parts:
         for samples in (part[:1], part[1:]):
             estimator.run(samples)
-            is_covariance(f)
+            assert_valid_covariances(f)
     assert estimator.record[0]["counters"]["reset"] == 0
 
 
-def is_covariance(f) -> None:
+def assert_valid_covariances(f) -> None:
+    """Assert that the covariance of each hypothesis is symmetric, finite and, except for rounding, positive definite."""
     assert 1 <= f["count"] <= len(f["mean"])
     for covariance in f["covariance"][: f["count"]]:
         assert np.array_equal(covariance, covariance.T)
@@ -440,10 +458,10 @@ def is_covariance(f) -> None:
         assert np.linalg.eigvalsh(covariance / scale[:, None] / scale).min() > -1e-9
 
 
-def test_100_samples_a_second_give_the_result_of_one(fast) -> None:
-    """The mean of a second's samples is one update for any number of samples."""
+def test_100_samples_a_second_give_the_result_of_one_sample_a_second(fast) -> None:
+    """The mean of all samples of a second is used in a single update."""
     slow = fast.samples[::100]
-    many, few = (start(fast).run(samples).copy() for samples in (fast.samples, slow))
+    many, few = (make_estimator(fast).run(samples).copy() for samples in (fast.samples, slow))
     many = many[::100]
     assert many["time_s"] == pytest.approx(few["time_s"])
     late = slice(300, None)
@@ -452,7 +470,7 @@ def test_100_samples_a_second_give_the_result_of_one(fast) -> None:
 
 
 def test_hypotheses_converge_to_one(drive) -> None:
-    estimator = start(drive)
+    estimator = make_estimator(drive)
     f = estimator.record[0]["filter"]
     estimator.run(drive.samples[:1])
     assert f["count"] > 3
@@ -465,8 +483,8 @@ def test_hypotheses_converge_to_one(drive) -> None:
 
 
 def test_rows_of_removed_hypotheses_are_zero(drive) -> None:
-    """Rows of merged and removed hypotheses are zero, and all rows but one after convergence."""
-    estimator = start(drive)
+    """The rows of merged and removed hypotheses are zero. After convergence these are all rows except one."""
+    estimator = make_estimator(drive)
     f = estimator.record[0]["filter"]
     rows = "mean", "covariance", "ln_weight", "minute_u", "ten_minutes_u", "fast_inflation", "slow_inflation"
     counts = set()
@@ -483,7 +501,7 @@ def test_rows_of_removed_hypotheses_are_zero(drive) -> None:
 
 @pytest.mark.parametrize("soc", [0.0, 0.5, 1.0])
 def test_an_soc_set_by_the_user_is_published(drive, soc: float) -> None:
-    estimator = start(drive)
+    estimator = make_estimator(drive)
     estimator.run(drive.samples[:600])
     estimator.set_soc(soc)
     f = estimator.record[0]["filter"]
@@ -491,12 +509,12 @@ def test_an_soc_set_by_the_user_is_published(drive, soc: float) -> None:
     assert 0.03 < f["soc_std"] < 0.06
 
 
-@pytest.mark.parametrize("wrong", [-0.3, -0.1, 0.0, 0.1, 0.3])
-def test_an_soc_set_by_the_user_is_corrected_if_the_voltage_contradicts(drive, wrong: float) -> None:
+@pytest.mark.parametrize("soc_error", [-0.3, -0.1, 0.0, 0.1, 0.3])
+def test_an_soc_set_by_the_user_is_corrected_if_the_voltage_contradicts(drive, soc_error: float) -> None:
     """After 5 min the true SOC is inside the interval, and after 20 min the estimate is near it."""
-    estimator = start(drive)
+    estimator = make_estimator(drive)
     estimator.run(drive.samples[:600])
-    estimator.set_soc(float(drive.soc[600]) + wrong)
+    estimator.set_soc(float(drive.soc[600]) + soc_error)
     trace = estimator.run(drive.samples[600:2400])
     error = np.abs(trace["soc"] - drive.soc[600:2400])
     assert (error < 2.0 * trace["soc_std"])[300:].all()
@@ -504,9 +522,11 @@ def test_an_soc_set_by_the_user_is_corrected_if_the_voltage_contradicts(drive, w
 
 
 def test_a_certain_but_wrong_soc_is_reinitialized(drive) -> None:
-    """The SOC is 0.3 too low with a std of 0.01. Within 10 min the true SOC is inside the interval, and after 20 min
-    the estimate is near it."""
-    estimator = start(drive)
+    """The SOC is 0.3 too low with a std of 0.01.
+
+    Within 10 min the true SOC is inside the interval, and after 20 min the estimate is near it.
+    """
+    estimator = make_estimator(drive)
     estimator.run(drive.samples[:600])
     hypotheses.spawn_hypotheses(
         estimator.record[0]["filter"], estimator.settings_record[0]["filter"], float(drive.soc[600]) - 0.3, 0.01
@@ -519,7 +539,7 @@ def test_a_certain_but_wrong_soc_is_reinitialized(drive) -> None:
 
 
 def test_a_non_finite_temperature_is_replaced_by_the_next_sample(drive) -> None:
-    estimator, samples = start(drive), drive.samples[:700].copy()
+    estimator, samples = make_estimator(drive), drive.samples[:700].copy()
     samples["temperature_c"] = 8.0
     estimator.run(samples[:600])
     f = estimator.record[0]["filter"]
@@ -530,26 +550,26 @@ def test_a_non_finite_temperature_is_replaced_by_the_next_sample(drive) -> None:
 
 
 def test_single_temperatures_of_85_degrees_are_limited(drive) -> None:
-    estimator, samples = start(drive), drive.samples[:1200].copy()
+    estimator, samples = make_estimator(drive), drive.samples[:1200].copy()
     samples["temperature_c"] = 25.0
     samples["temperature_c"][[0, 1]] = samples["temperature_c"][600:630] = 85.0
-    taken_c = []
+    used_c = []
     for sample in samples:
         estimator.run(sample[None])
-        taken_c.append(float(estimator.record[0]["filter"]["temperature_c"]))
-    assert max(taken_c[60:]) < 28.5
-    assert taken_c[-1] == pytest.approx(25.0, abs=0.1)
+        used_c.append(float(estimator.record[0]["filter"]["temperature_c"]))
+    assert max(used_c[60:]) < 28.5
+    assert used_c[-1] == pytest.approx(25.0, abs=0.1)
 
 
-@pytest.mark.parametrize("unseen_s", [7200.0, np.inf])
-def test_the_measured_temperature_is_used_at_once_after_a_restart(drive, unseen_s: float) -> None:
-    """The errors of the hypotheses are those of the cold cell, not of the warm cell before the restart."""
+@pytest.mark.parametrize("downtime_s", [7200.0, np.inf])
+def test_the_measured_temperature_is_used_at_once_after_a_restart(drive, downtime_s: float) -> None:
+    """The bias std after the restart is that of the cold cell, whatever the temperature was before."""
     bias_v = []
     for before_c in (25.0, -15.0):
-        estimator, samples = start(drive), drive.samples[:602].copy()
+        estimator, samples = make_estimator(drive), drive.samples[:602].copy()
         samples["temperature_c"][:600], samples["temperature_c"][600:] = before_c, -15.0
         estimator.run(samples[:600])
-        estimator.resume(unseen_s)
+        estimator.resume(downtime_s)
         estimator.run(samples[600:])
         f = estimator.record[0]["filter"]
         assert f["temperature_c"] == pytest.approx(-15.0, abs=0.1)
@@ -559,7 +579,7 @@ def test_the_measured_temperature_is_used_at_once_after_a_restart(drive, unseen_
 
 @pytest.mark.parametrize("field", ["mean", "covariance", "ln_weight"])
 def test_non_finite_values_are_reset_and_counted(drive, field: str) -> None:
-    estimator = start(drive)
+    estimator = make_estimator(drive)
     estimator.run(drive.samples[:1800])
     before = estimator.state["soc"][0]
     estimator.record[0]["filter"][field][0] = np.nan
@@ -571,30 +591,32 @@ def test_non_finite_values_are_reset_and_counted(drive, field: str) -> None:
     assert estimator.record[0]["filter"]["mean"][0, LN_R] != 0.0
 
 
-@pytest.mark.parametrize(("soc", "held"), [(1.02, True), (-0.02, True), (0.6, False)])
-def test_a_limited_soc_does_not_update_offset_capacity_and_curve(soc: float, held: bool) -> None:
-    p = settings()
-    s = somewhere(p)
+@pytest.mark.parametrize(("soc", "is_limited"), [(1.02, True), (-0.02, True), (0.6, False)])
+def test_a_limited_soc_does_not_update_offset_capacity_and_curve(soc: float, is_limited: bool) -> None:
+    p = make_settings()
+    s = make_state(p)
     s["mean"][0, SOC] = soc
     before, std = s["mean"][0].copy(), np.sqrt(np.diag(s["covariance"][0]))
     ekf.update(s, p, 0, 1e-4)
-    taught = [OFFSET, LN_Q, *range(NODE, STATES)]
-    assert not held or np.array_equal(s["mean"][0, taught], before[taught])
-    assert not held or np.array_equal(np.sqrt(np.diag(s["covariance"][0]))[taught], std[taught])
-    assert held or np.all(s["mean"][0, taught] != before[taught])
+    states = [OFFSET, LN_Q, *range(NODE, STATES)]
+    if is_limited:
+        assert np.array_equal(s["mean"][0, states], before[states])
+        assert np.array_equal(np.sqrt(np.diag(s["covariance"][0]))[states], std[states])
+    else:
+        assert np.all(s["mean"][0, states] != before[states])
     assert s["mean"][0, LN_R] != before[LN_R]
 
 
 @pytest.mark.parametrize(
-    ("trend_c", "r_std", "held"), [(0.9, 0.7, True), (-0.9, 0.7, True), (0.1, 0.7, False), (0.9, 0.1, False)]
+    ("current_c", "r_std", "is_unchanged"), [(0.9, 0.7, True), (-0.9, 0.7, True), (0.1, 0.7, False), (0.9, 0.1, False)]
 )
 def test_a_constant_current_does_not_update_the_capacity_with_uncertain_resistances(
-    trend_c: float, r_std: float, held: bool
+    current_c: float, r_std: float, is_unchanged: bool
 ) -> None:
-    p = settings(r_std=r_std)
-    s = somewhere(p)
-    s["x_a"][:] = s["mean_a"] = 3.0 * trend_c
+    p = make_settings(r_std=r_std)
+    s = make_state(p)
+    s["x_a"][:] = s["mean_a"] = CELL.cell.capacity_ah * current_c
     s["rms_a2"] = s["mean_a"] ** 2
     before = s["mean"][0, LN_Q]
     ekf.update(s, p, 0, 1e-4)
-    assert (s["mean"][0, LN_Q] == before) == held
+    assert (s["mean"][0, LN_Q] == before) == is_unchanged

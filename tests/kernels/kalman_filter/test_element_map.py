@@ -1,4 +1,4 @@
-"""Fits to the map return the functions that it was filled from, and no information for unvisited SOC."""
+"""Fits to the map of circuit elements over SOC: accuracy, standard errors, limits, and forgetting."""
 
 import math
 
@@ -8,6 +8,7 @@ from numba.core.runtime import _nrt_python, rtsys
 
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.kalman_filter.element_map import (
+    BINS,
     ELEMENT_FIT,
     ELEMENT_MAP,
     ELEMENTS,
@@ -20,19 +21,28 @@ from bms_estimator.kernels.kalman_filter.element_map import (
 from bms_estimator.model.cell import load_cell
 
 TRUTH = load_cell("chen_mora").a
+WRONG_PRIOR = TRUTH * 1.5
+EXPONENTS = [2, 5, 8, 11, 14]
+"""Indices of the exponents in ``a``."""
+OFFSETS = (3, 6, 9, 12, 15)
+"""Indices of the offsets in ``a``."""
+
 FUNCTIONS = (chen_mora.r_ts, chen_mora.r_tl, chen_mora.c_ts, chen_mora.c_tl, chen_mora.r_s)
 
 
-def filled(low: float, high: float, noise: float = 0.0) -> np.ndarray:
+def fill_map(low: float, high: float, noise: float = 0.0) -> np.ndarray:
+    """Return a map of the true elements between two SOCs, with ``noise`` of their logarithms."""
     rng = np.random.default_rng(2)
     table = np.zeros(1, dtype=ELEMENT_MAP)
     for soc in np.arange(low, high, 0.001):
         for e, function in enumerate(FUNCTIONS):
-            add_observation(table[0], e, soc, math.log(function(soc, TRUTH)) + rng.normal(0, noise), 0.02**2, 1.0)
+            ln_value = math.log(function(soc, TRUTH)) + rng.normal(0, noise)
+            add_observation(table[0], e, soc, ln_value, 0.02**2, 1.0)
     return table
 
 
-def fitted(table: np.ndarray, prior: np.ndarray) -> np.void:
+def fit_map(table: np.ndarray, prior: np.ndarray) -> np.void:
+    """Return the parameters that fit the map best."""
     fit = np.zeros(1, dtype=ELEMENT_FIT)
     for e in range(ELEMENTS):
         fit_element(table[0], e, prior, fit[0])
@@ -40,58 +50,61 @@ def fitted(table: np.ndarray, prior: np.ndarray) -> np.void:
 
 
 def test_a_map_of_the_whole_range_gives_the_true_elements() -> None:
-    fit = fitted(filled(0.02, 1.0, 0.01), TRUTH * 1.5)
+    fit = fit_map(fill_map(0.02, 1.0, noise=0.01), WRONG_PRIOR)
     for e, function in enumerate(FUNCTIONS):
-        assert fit["bins"][e] == 25
+        assert fit["bins"][e] == BINS
         for soc in (0.1, 0.3, 0.6, 0.95):
             assert function(soc, fit["a"]) == pytest.approx(function(soc, TRUTH), rel=0.04), (e, soc)
 
 
 def test_true_offsets_lie_within_three_standard_errors() -> None:
-    fit = fitted(filled(0.02, 1.0, 0.01), TRUTH * 1.5)
-    for i in (3, 6, 9, 12, 15):
+    fit = fit_map(fill_map(0.02, 1.0, noise=0.01), WRONG_PRIOR)
+    for i in OFFSETS:
         assert abs(fit["a"][i] - TRUTH[i]) < 3 * fit["std"][i] < 0.2 * TRUTH[i]
 
 
 def test_an_empty_map_gives_the_configured_values_without_std() -> None:
-    fit = fitted(np.zeros(1, dtype=ELEMENT_MAP), TRUTH)
+    fit = fit_map(np.zeros(1, dtype=ELEMENT_MAP), TRUTH)
     assert list(fit["bins"]) == [0] * ELEMENTS
     assert fit["a"][1:] == pytest.approx(TRUTH[1:16])
     assert np.isnan(fit["std"][1:]).all()
 
 
 def test_exponents_are_uncertain_with_data_at_high_soc_only() -> None:
-    narrow, wide = fitted(filled(0.6, 1.0), TRUTH), fitted(filled(0.02, 1.0), TRUTH)
+    narrow, wide = fit_map(fill_map(0.6, 1.0), TRUTH), fit_map(fill_map(0.02, 1.0), TRUTH)
     assert narrow["std"][2] > 3 * wide["std"][2]
 
 
-@pytest.mark.parametrize(("exponent", "end"), [(1e4, EXPONENT_MAX), (1e-3, EXPONENT_MIN)])
-def test_an_exponent_beyond_the_searched_range_is_limited(exponent: float, end: float) -> None:
+@pytest.mark.parametrize(("exponent", "limit"), [(1e4, EXPONENT_MAX), (1e-3, EXPONENT_MIN)])
+def test_an_exponent_beyond_the_searched_range_is_limited(exponent: float, limit: float) -> None:
     prior = TRUTH.copy()
-    prior[[2, 5, 8, 11, 14]] = exponent
-    fit = fitted(filled(0.6, 0.61), prior)  # no data determine the exponent: the fit tends to the configured one
-    found = fit["a"][[2, 5, 8, 11, 14]]
-    assert (found >= EXPONENT_MIN).all()
-    assert (found <= EXPONENT_MAX).all()
-    assert np.abs(np.log(found / end)).min() < 0.05
+    prior[EXPONENTS] = exponent
+    # Data at a single SOC do not determine the exponent, so that the fit tends to the configured one.
+    fit = fit_map(fill_map(0.6, 0.61), prior)
+    exponents = fit["a"][EXPONENTS]
+    assert (exponents >= EXPONENT_MIN).all()
+    assert (exponents <= EXPONENT_MAX).all()
+    assert np.abs(np.log(exponents / limit)).min() < 0.05
 
 
 def test_a_singular_fit_has_no_standard_errors() -> None:
     table = np.zeros(1, dtype=ELEMENT_MAP)
     add_observation(table[0], 0, 0.5, -3.0, 0.1**2, 10.0)
-    table["moment"][0, 0, 12] = math.nan
-    fit = fitted(table, TRUTH)
+    table["moment"][0, 0, int(0.5 * BINS)] = math.nan
+    fit = fit_map(table, TRUTH)
     assert np.isnan(fit["std"][1:4]).all()
 
 
 def test_a_fit_allocates_no_memory() -> None:
-    table, fit = filled(0.02, 1.0), np.zeros(1, dtype=ELEMENT_FIT)
+    table, fit = fill_map(0.02, 1.0), np.zeros(1, dtype=ELEMENT_FIT)
     fit_element(table[0], 0, TRUTH, fit[0])
     _nrt_python.memsys_enable_stats()
     before = rtsys.get_allocation_stats().alloc
-    for _ in range(100):
+    calls = 100
+    for _ in range(calls):
         fit_element(table[0], 0, TRUTH, fit[0])
-    assert rtsys.get_allocation_stats().alloc - before <= 100  # one for each call, for passing the prior from Python
+    # Passing the prior from Python allocates once for each call.
+    assert rtsys.get_allocation_stats().alloc - before <= calls
 
 
 def test_an_uncertain_value_is_not_added() -> None:
@@ -102,9 +115,9 @@ def test_an_uncertain_value_is_not_added() -> None:
 
 
 def test_new_evidence_outweighs_aged_evidence() -> None:
-    table = np.zeros(1, dtype=ELEMENT_MAP)
-    add_observation(table[0], 4, 0.5, math.log(0.1), 0.01**2, 100.0)
-    decay_weights(table[0], 4, 0.01)
-    add_observation(table[0], 4, 0.5, math.log(0.2), 0.01**2, 100.0)
-    value = math.exp(table["moment"][0, 4, 12] / table["weight"][0, 4, 12])
+    table, r_s, soc_bin = np.zeros(1, dtype=ELEMENT_MAP), FUNCTIONS.index(chen_mora.r_s), int(0.5 * BINS)
+    add_observation(table[0], r_s, 0.5, math.log(0.1), 0.01**2, 100.0)
+    decay_weights(table[0], r_s, 0.01)
+    add_observation(table[0], r_s, 0.5, math.log(0.2), 0.01**2, 100.0)
+    value = math.exp(table["moment"][0, r_s, soc_bin] / table["weight"][0, r_s, soc_bin])
     assert value == pytest.approx(0.2, rel=0.02)
