@@ -13,13 +13,18 @@ from tests.fleet.nats_cluster import NatsCluster, running
 from tests.sinks.service import STATE, Sink, assert_all_in_order, state, until
 
 COUNT = 400
-"""Number of published states."""
-MESSAGES = "$MQTT_msgs"
+"""Number of published states, whose ``frames_received`` are 0 to ``COUNT`` - 1."""
+MESSAGE_STREAM = "$MQTT_msgs"
 """Stream in which the server stores QoS 1 messages until all subscribers have them."""
 
 
 class Collector:
-    """Receives the pack's messages from any live node without loss, because the cluster stores its session."""
+    """Subscriber to the pack's messages at any live node. It loses none, because the cluster stores its session.
+
+    Attributes:
+        states: Numbers of the received states.
+        availability: Received payloads of the service's availability.
+    """
 
     def __init__(self, server: NatsCluster) -> None:
         self._ports = server.mqtt_ports
@@ -44,20 +49,22 @@ class Collector:
                         await client.subscribe([(STATE, 1), ("bms/pack/availability", 1)])
                         self._listening.set()
                         async for message in client.messages:
-                            self._take(message)
+                            self._record(message)
                 except aiomqtt.MqttError:
                     await asyncio.sleep(0.1)
 
-    def _take(self, message: aiomqtt.Message) -> None:
+    def _record(self, message: aiomqtt.Message) -> None:
         assert isinstance(message.payload, bytes)
         if message.topic.value == STATE:
+            # ``state(number)`` stores its number in this field
             self.states.append(json.loads(message.payload)["frames_received"])
         else:
             self.availability.append(message.payload)
 
 
-async def publish(sink: Sink, first: int, after: int) -> None:
-    for number in range(first, after):
+async def publish(sink: Sink, first: int, end: int) -> None:
+    """Publish the states ``first`` to ``end`` - 1 at 200 Hz."""
+    for number in range(first, end):
         sink.mqtt.publish(state(number))
         await asyncio.sleep(0.005)
 
@@ -79,17 +86,17 @@ async def test_restarted_node_receives_all_states(tmp_path: Path) -> None:
     assert_all_in_order(live.states, COUNT)
 
 
-@pytest.mark.parametrize("serving", [pytest.param(True, id="serves us"), pytest.param(False, id="serves others")])
-@pytest.mark.parametrize("leading", [pytest.param(True, id="leads"), pytest.param(False, id="follows")])
-async def test_killed_cluster_node_loses_no_state(tmp_path: Path, *, serving: bool, leading: bool) -> None:
+@pytest.mark.parametrize("serves_client", [pytest.param(True, id="serves us"), pytest.param(False, id="serves others")])
+@pytest.mark.parametrize("is_leader", [pytest.param(True, id="leads"), pytest.param(False, id="follows")])
+async def test_killed_cluster_node_loses_no_state(tmp_path: Path, *, serves_client: bool, is_leader: bool) -> None:
     if "CLUSTER" not in os.environ:
         pytest.skip("takes 6 to 30 s: part of `make nats`")
     with running(tmp_path, 3) as server:
         async with Collector(server) as live:
-            await until(lambda: server.leader(MESSAGES) >= 0)
-            leader = server.leader(MESSAGES)
-            victim = leader if leading else (leader + 1) % 3
-            first = victim if serving else (victim + 1) % 3
+            await until(lambda: server.leader(MESSAGE_STREAM) >= 0)
+            leader = server.leader(MESSAGE_STREAM)
+            victim = leader if is_leader else (leader + 1) % 3
+            first = victim if serves_client else (victim + 1) % 3
             urls = tuple(mqtt_url(server, (first + i) % 3) for i in range(3))
             async with Sink(urls, most_kept=10_000) as sink:
                 await until(lambda: live.availability == [b"online"])

@@ -7,7 +7,8 @@ from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.identification.block_capture import BlockCapture
 from bms_estimator.model.sample import SAMPLE
 
-STORE = 1_700_000_000 * 10**9
+STORE_ID_NS = 1_700_000_000 * 10**9
+"""Creation time of the edge's block store, which identifies it [ns since 1970]."""
 
 
 def samples(first_s, count=60):
@@ -19,9 +20,10 @@ def samples(first_s, count=60):
     return block
 
 
-def block(number, store=STORE, first_s=None):
+def encoded_block(number, store=STORE_ID_NS, first_s=None):
     rows = samples(60.0 * number if first_s is None else first_s)
-    return encode(Block(store, number, 1, store * 1e-9 + rows["time_s"][-1], rows))
+    arrival_s = store * 1e-9 + rows["time_s"][-1]
+    return encode(Block(store=store, number=number, oldest=1, arrival_s=arrival_s, samples=rows))
 
 
 def make_capture(*blocks, **span):
@@ -36,26 +38,36 @@ def rows(capture):
 
 
 def test_resent_and_late_blocks_appear_once_in_order():
-    capture = make_capture(block(1), block(2), block(5), block(3), block(4), block(5), block(4))
+    capture = make_capture(
+        encoded_block(1),
+        encoded_block(2),
+        encoded_block(5),
+        encoded_block(3),
+        encoded_block(4),
+        encoded_block(5),
+        encoded_block(4),
+    )
     assert (rows(capture) == samples(60.0, 300)).all()
     assert (capture.blocks, capture.again, capture.damaged, capture.missing) == (5, 2, 0, [])
 
 
 def test_missing_and_damaged_blocks_are_counted():
-    capture = make_capture(b"", block(1)[:-1], block(1), block(4), block(9))
+    capture = make_capture(b"", encoded_block(1)[:-1], encoded_block(1), encoded_block(4), encoded_block(9))
     assert (capture.damaged, capture.missing) == (2, [(2, 3), (5, 8)])
 
 
 def test_time_span_is_cut_at_samples():
-    capture = make_capture(*map(block, range(1, 10)), since_s=STORE * 1e-9 + 130.0, until_s=STORE * 1e-9 + 200.0)
+    capture = make_capture(
+        *map(encoded_block, range(1, 10)), since_s=STORE_ID_NS * 1e-9 + 130.0, until_s=STORE_ID_NS * 1e-9 + 200.0
+    )
     assert rows(capture)["time_s"].tolist() == list(range(130, 200))
     assert capture.blocks == 2
 
 
 @pytest.mark.parametrize(("later_s", "first_s"), [(1000.0, 1060.0), (10.0, 179.0)])
 def test_time_continues_by_the_wall_clock_and_never_steps_back(later_s, first_s):
-    other = STORE + round(later_s * 1e9)
-    capture = make_capture(block(1), block(2), block(1, other), block(3))
+    new_store = STORE_ID_NS + round(later_s * 1e9)
+    capture = make_capture(encoded_block(1), encoded_block(2), encoded_block(1, new_store), encoded_block(3))
     time_s = rows(capture)["time_s"]
     assert (time_s.size, time_s[119], time_s[120]) == (180, 179.0, first_s)
     assert capture.again == 1, "a block of the former store"

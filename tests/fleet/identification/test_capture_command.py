@@ -11,18 +11,19 @@ import pytest
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.sources.captures.replay import load_capture
 from tests.command_line import run
-from tests.fleet.identification.test_block_capture import STORE, block, samples
+from tests.fleet.identification.test_block_capture import STORE_ID_NS, encoded_block, samples
 from tests.fleet.nats_cluster import running
 from tests.patience import LONG_S
 
 
 async def send(cluster):
+    """Send blocks of two packs: block 5 is missing, 3 and 4 are out of order, and 4 is repeated."""
     async with await nats.connect(cluster.url) as nc:
         await make_streams(nc)
     async with aiomqtt.Client("127.0.0.1", cluster.mqtt_port, timeout=LONG_S) as client:
         for number in (1, 2, 4, 3, 4, 6):
-            await client.publish("raw/house", block(number), qos=1)
-            await client.publish("raw/other", block(number), qos=1)
+            await client.publish("raw/house", encoded_block(number), qos=1)
+            await client.publish("raw/other", encoded_block(number), qos=1)
         await client.publish("raw/house", b"no block", qos=1)
 
 
@@ -54,8 +55,8 @@ def test_capture_has_each_block_once_in_order(cluster, tmp_path, capsys, name):
 
 def test_time_span_is_cut_and_missing_data_are_reported(cluster, tmp_path, capsys):
     out = tmp_path / "out.csv"
-    first = datetime.fromtimestamp(STORE * 1e-9 - 3600.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    last = datetime.fromtimestamp(STORE * 1e-9 + 100.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    first = datetime.fromtimestamp(STORE_ID_NS * 1e-9 - 3600.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    last = datetime.fromtimestamp(STORE_ID_NS * 1e-9 + 100.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     arguments = ["fleet", "capture", "house", out, "--from", first, "--to", last, "--server", cluster.url]
     code, stdout, err = run(capsys, *arguments)
     assert (code, stdout.startswith(f"{out}: 40 samples in 1 blocks of house")) == (0, True)

@@ -8,37 +8,40 @@ import numpy as np
 import pytest
 
 from bms_estimator.cli.options.pack_options import load_pack
+from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET, raw
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import put
 from bms_estimator.fleet.packs.pack_row import encode_row
 from tests.command_line import run
-from tests.fleet.identification.test_reidentify import KIND, WRONG, pack_samples
+from tests.fleet.identification.test_reidentify import PACK_SPEC, WRONG_CELL_TOML, pack_samples
 from tests.fleet.nats_cluster import running
 
-STORE = 1_700_000_000 * 10**9
+STORE_ID_NS = 1_700_000_000 * 10**9
+"""Creation time of the edge's block store, which identifies it [ns since 1970]."""
 
 
-async def fill(url):
+async def upload(url):
+    """Upload pack rows and a cell file, and publish 8 h of samples of ``house`` and less than 6 h of ``young``."""
     samples = pack_samples(8, rests=False)  # a driving load without rests
     async with await nats.connect(url) as nc:
         await make_streams(nc, partitions=1)
-        await put(nc, CELLS_BUCKET, {"own": WRONG.encode()})
-        rows = {name: encode_row(KIND) for name in ("house", "silent", "young")}
-        await put(nc, PACKS_BUCKET, rows | {"wrong": b"{"})
+        await put(nc, subjects.CELLS_BUCKET, {"own": WRONG_CELL_TOML.encode()})
+        rows = {name: encode_row(PACK_SPEC) for name in ("house", "silent", "young")}
+        await put(nc, subjects.PACKS_BUCKET, rows | {"wrong": b"{"})
         for number, rows in enumerate(np.array_split(samples, 100), 1):
-            data = encode(Block(STORE, number, 1, STORE * 1e-9 + rows["time_s"][-1], rows))
-            await nc.publish(raw("house"), data)
+            arrival_s = STORE_ID_NS * 1e-9 + rows["time_s"][-1]
+            data = encode(Block(store=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=rows))
+            await nc.publish(subjects.raw("house"), data)
             if number < 10:
-                await nc.publish(raw("young"), data)
+                await nc.publish(subjects.raw("young"), data)
         await nc.flush()
 
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory):
     with running(tmp_path_factory.mktemp("cluster"), partitions=1) as cluster:
-        asyncio.run(fill(cluster.url))
+        asyncio.run(upload(cluster.url))
         yield cluster.url
 
 
@@ -73,7 +76,7 @@ def test_better_cells_are_written_and_uploaded(url, tmp_path, capsys):
     run(capsys, "fleet", "packs", "show", "house", "--out", tmp_path / "shown", "--server", url)
     settings, model = load_pack(tmp_path / "shown" / "pack.toml")
     assert (settings.pack.cell, settings.pack.capacity_ah) == ("of-house.toml", None)
-    assert model.cell.capacity_ah == pytest.approx(KIND.parallel * float(rows["house"]["capacity_ah"]))
+    assert model.cell.capacity_ah == pytest.approx(PACK_SPEC.parallel * float(rows["house"]["capacity_ah"]))
     assert "results.csv: exists already" in run(capsys, *command)[2]
 
 

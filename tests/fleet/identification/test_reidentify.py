@@ -11,10 +11,11 @@ from bms_estimator.model.config_file import parse_toml
 from tests.calibration.simulated_load import TRUTH, capture, wrong_start
 
 SERIES, PARALLEL = 14, 4
-KIND = PackSpec(
+PACK_SPEC = PackSpec(
     cell="own", series=SERIES, parallel=PARALLEL, voltage_resolution_v=0.01, current_resolution_a=0.01, period_s=5.0
 )
-WRONG = cell_text(wrong_start(1.3, 0.8))
+WRONG_CELL_TOML = cell_text(wrong_start(1.3, 0.8))
+"""Cell file with wrong circuit elements."""
 PERIOD_S = 5
 """Interval between two samples [s]; at 1 s the test would take five times as long."""
 CAPACITY_FADE = 0.88
@@ -54,7 +55,7 @@ def samples():
 
 
 def test_aged_pack_gets_a_better_cell(samples):
-    result = reidentify("house", samples, KIND, WRONG)
+    result = reidentify("house", samples, PACK_SPEC, WRONG_CELL_TOML)
     assert result.reason == ""
     assert result.rms_v < 0.3 * result.rms_before_v
     assert result.capacity_before_ah == pytest.approx(3.0)
@@ -67,7 +68,7 @@ def test_aged_pack_gets_a_better_cell(samples):
 
 def test_cell_that_is_not_better_is_not_used(samples):
     right = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": CAPACITY_FADE * 3.0})})
-    result = reidentify("house", samples, KIND, cell_text(right))
+    result = reidentify("house", samples, PACK_SPEC, cell_text(right))
     assert (result.cell_file, result.reason) == ("", "not better than the present cell")
     assert result.rms_v > 0.97 * result.rms_before_v
 
@@ -75,16 +76,16 @@ def test_cell_that_is_not_better_is_not_used(samples):
 @pytest.mark.parametrize(
     ("change", "kind", "reason"),
     [
-        (lambda s: s[: 720 * 3], KIND, "3.0 h of samples: at least 6 h are needed"),
-        (lambda s: s[:0], KIND, "0.0 h of samples"),
-        (lambda s: s[::20], KIND, "0.00 capacities were charged"),
+        (lambda s: s[: 720 * 3], PACK_SPEC, "3.0 h of samples: at least 6 h are needed"),
+        (lambda s: s[:0], PACK_SPEC, "0.0 h of samples"),
+        (lambda s: s[::20], PACK_SPEC, "0.00 capacities were charged"),
         (lambda s: s[:60], PackSpec(cell="pem_30w"), "pem_30w is a fuel cell"),
-        (lambda s: s, KIND.model_copy(update={"series": 7}), "no sample is plausible for this cell"),
+        (lambda s: s, PACK_SPEC.model_copy(update={"series": 7}), "no sample is plausible for this cell"),
         (lambda s: s, PackSpec(cell="nowhere"), "nowhere: no cell file of this name was loaded"),
     ],
 )
 def test_reason_without_a_new_cell(samples, change, kind, reason):
-    text = WRONG if kind.cell == "own" else None
+    text = WRONG_CELL_TOML if kind.cell == "own" else None
     result = reidentify("house", change(samples), kind, text)
     assert (result.cell_file, result.reason[: len(reason)]) == ("", reason)
 
@@ -92,9 +93,9 @@ def test_reason_without_a_new_cell(samples, change, kind, reason):
 def test_rest_is_not_enough(samples):
     resting = samples.copy()
     resting["current_a"] = 0.0
-    assert "capacities were charged" in reidentify("house", resting, KIND, WRONG).reason
+    assert "capacities were charged" in reidentify("house", resting, PACK_SPEC, WRONG_CELL_TOML).reason
 
 
 def test_gaps_and_time_steps_back(samples):
     holes = np.concatenate([samples[:1800], samples[1860:3000], samples[2900:4000], samples[4200:]])
-    assert reidentify("house", holes, KIND, WRONG).cell_file
+    assert reidentify("house", holes, PACK_SPEC, WRONG_CELL_TOML).cell_file

@@ -14,15 +14,20 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.pack import PackSettings
 from tests.estimator.simulated_cell import pulses
 
-STORE = 500_000 * 3600 * 10**9
+STORE_HOUR = 500_000
+"""Hour in which the edge's block store was created [hours since 1970]."""
+STORE_ID_NS = STORE_HOUR * 3600 * 10**9
+"""Creation time of the block store, which identifies it and is the origin of its time stamps [ns since 1970]."""
 PACK = PackSettings(name="p1", cell="ncr18650", series=1, parallel=2)
 
 
-def block(samples, number=1, store=STORE):
-    return Block(store, number, 1, store / 1e9 + float(samples["time_s"][-1]), samples)
+def block(samples, number=1, store=STORE_ID_NS):
+    last_s = float(samples["time_s"][-1])
+    return Block(store=store, number=number, oldest=1, arrival_s=store / 1e9 + last_s, samples=samples)
 
 
-def work(sums, estimator, samples, store=STORE):
+def add_blocks(sums, estimator, samples, store=STORE_ID_NS):
+    """Run the estimator over ``samples`` in blocks of 60, and add the results to ``sums``."""
     for first in range(0, samples.size, 60):
         part = block(samples[first : first + 60], first // 60 + 1, store)
         add(sums, estimator.run(part.samples), part, estimator)
@@ -30,21 +35,21 @@ def work(sums, estimator, samples, store=STORE):
 
 @pytest.fixture(scope="module")
 def hour():
-    """Sums, estimator and samples of an hour at 1 Hz."""
+    """Return sums, estimator and samples of an hour at 1 Hz."""
     samples, _ = pulses(soc=0.8, hours=1.0)
     sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    work(sums, estimator, samples)
+    add_blocks(sums, estimator, samples)
     return sums, estimator, samples
 
 
 def test_row_has_the_measured_values(hour):
     sums, estimator, samples = hour
-    summary = row(PACK, 500_000, sums, estimator)
+    summary = row(PACK, STORE_HOUR, sums, estimator)
     current, voltage = samples["current_a"], samples["voltage_v"]
     steps = 0.5 * (current[1:] + current[:-1]) / 3600
     assert (summary.pack, summary.hour, summary.cell, summary.series, summary.parallel) == (
         "p1",
-        500_000,
+        STORE_HOUR,
         "ncr18650",
         1,
         2,
@@ -63,7 +68,7 @@ def test_row_has_the_measured_values(hour):
 
 def test_row_has_the_estimates_at_the_end_of_the_hour(hour):
     sums, estimator, samples = hour
-    summary, trace = row(PACK, 500_000, sums, estimator), Estimator(load_cell("ncr18650")).run(samples)
+    summary, trace = row(PACK, STORE_HOUR, sums, estimator), Estimator(load_cell("ncr18650")).run(samples)
     assert (summary.soc, summary.soc_std) == (trace["soc"][-1], trace["soc_std"][-1])
     assert (summary.r_s_ohm, summary.tau_tl_std_s) == (trace["r_s_ohm"][-1], trace["tau_tl_std_s"][-1])
     assert summary.stability_margin_min == trace["stability_margin"].min()
@@ -73,29 +78,29 @@ def test_row_has_the_estimates_at_the_end_of_the_hour(hour):
 
 
 def test_json_round_trip(hour):
-    text = row(PACK, 500_000, hour[0], hour[1]).model_dump_json()
+    text = row(PACK, STORE_HOUR, hour[0], hour[1]).model_dump_json()
     assert Hour.model_validate_json(text).model_dump_json() == text
     assert "NaN" not in text
 
 
 def test_row_does_not_depend_on_block_size(hour):
     sums, estimator, samples = hour
-    whole, other = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    add(whole, other.run(samples), block(samples), other)
-    assert row(PACK, 1, whole, other) == row(PACK, 1, sums, estimator)
+    one_block, other = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
+    add(one_block, other.run(samples), block(samples), other)
+    assert row(PACK, 1, one_block, other) == row(PACK, 1, sums, estimator)
 
 
 def test_next_hour_starts_at_zero_and_includes_the_step_from_the_last_sample():
     samples, _ = pulses(soc=0.8, hours=0.1)
     sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    work(sums, estimator, samples[:180])
+    add_blocks(sums, estimator, samples[:180])
     first = row(PACK, 1, sums, estimator)
     begin(sums, estimator.record[0])
-    work(sums, estimator, samples[180:])
+    add_blocks(sums, estimator, samples[180:])
     second = row(PACK, 2, sums, estimator)
     assert (first.samples, second.samples, first.seen_s, second.seen_s) == (180, 180, 179.0, 180.0)
     whole, other = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    work(whole, other, samples)
+    add_blocks(whole, other, samples)
     assert first.charge_out_ah + second.charge_out_ah == pytest.approx(row(PACK, 1, whole, other).charge_out_ah)
 
 
@@ -103,10 +108,12 @@ def test_nothing_is_counted_across_gaps_and_clock_changes():
     samples, _ = pulses(soc=0.8, hours=0.1)
     samples["current_a"] = 1.0
     sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    work(sums, estimator, samples[:60])
-    work(sums, estimator, samples[120:180])  # a gap of 61 s
-    estimator.resume(100.0)
-    work(sums, estimator, samples[180:240], STORE + 1)  # another store: its timestamps only seem to continue
+    add_blocks(sums, estimator, samples[:60])
+    add_blocks(sums, estimator, samples[120:180])  # a gap of 61 s
+    estimator.resume(unseen_s=100.0)
+    add_blocks(
+        sums, estimator, samples[180:240], STORE_ID_NS + 1
+    )  # the time stamps of another store have another origin
     summary = row(PACK, 1, sums, estimator)
     assert (summary.gaps, summary.seen_s) == (2, 3 * 59.0)
     assert summary.charge_out_ah == pytest.approx(3 * 59.0 / 3600)
@@ -141,7 +148,12 @@ def test_fuel_cell_has_no_soc():
 def test_block_belongs_to_the_hour_of_its_last_sample():
     samples = np.zeros(60, SAMPLE)
     samples["time_s"] = 3600.0 - 30.0 + np.arange(60)
-    assert hour_of(block(samples)) == 500_001
-    assert hour_of(block(samples[:30])) == 500_000
+    assert hour_of(block(samples)) == STORE_HOUR + 1
+    assert hour_of(block(samples[:30])) == STORE_HOUR
+
+
+def test_block_with_an_infinite_last_time_belongs_to_the_hour_of_its_store():
+    samples = np.zeros(60, SAMPLE)
+    samples["time_s"] = 3600.0 + np.arange(60)
     samples["time_s"][-1] = math.inf
-    assert hour_of(Block(STORE, 1, 1, 0.0, samples)) == 500_000
+    assert hour_of(Block(store=STORE_ID_NS, number=1, oldest=1, arrival_s=0.0, samples=samples)) == STORE_HOUR
