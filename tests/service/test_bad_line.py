@@ -1,4 +1,4 @@
-"""What the line may do to a running service: bytes on a PTY -> decoder -> estimator -> published values."""
+"""Running service with faults on its serial line: bytes on a PTY, decoder, estimator, published values."""
 
 import asyncio
 import itertools
@@ -35,7 +35,7 @@ HELLO = Hello(
 
 
 def sample(sequence: int, *, board_us: int | None = None, voltage_sum: int = 15_565, status: int = 0) -> SampleMessage:
-    """3.8 V, 0 A."""
+    """Return a sample of 3.8 V and 0 A, unless its sums are changed."""
     at_us = (sequence + 1) * PERIOD_US if board_us is None else board_us
     return SampleMessage(sequence % MODULUS, at_us % MODULUS, voltage_sum, 51_200, 100, 0, 0, status)
 
@@ -45,7 +45,7 @@ def frames(first: int, count: int, **options: Any) -> bytes:
 
 
 class SkippingClock:
-    """The host's, which a test lets go on by ``skipped_s``."""
+    """Monotonic clock of the host that a test advances by ``skipped_s``."""
 
     def __init__(self) -> None:
         self.skipped_s = 0.0
@@ -74,7 +74,7 @@ class Service:
 
 @asynccontextmanager
 async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -> AsyncIterator[Service]:
-    """A running service with a board that has sent its hello message."""
+    """Run a service with a board that has sent its hello message."""
     line.plug()
     settings = Settings(
         pack=PackSettings(initial_soc=0.5),
@@ -250,8 +250,8 @@ async def test_the_state_names_the_lowest_and_highest_cell(line: Line) -> None:
     assert (snapshot.estimate.cell_lowest_v, snapshot.estimate.cell_highest_v) == (3.79, 3.81)
 
 
-async def test_a_former_reason_is_no_longer_reported(line: Line) -> None:
-    """A board whose hello scales by zero has no numbers; before, its voltage was out of range."""
+async def test_new_reason_replaces_an_earlier_one(line: Line) -> None:
+    """The voltage is out of range at first. Then a hello with a slope of zero makes the current NaN."""
     async with service(line) as live:
         live.line.write(frames(0, 5, voltage_sum=16_000_000))
         await live.until(lambda s: "where 1.5..4.5 V" in (s.health.sensor_message or ""))

@@ -1,4 +1,4 @@
-"""What a pack's runs leave to the next: counters, crashes, unseen time, files of all formats, an SOC that a rest corrects."""
+"""Successive runs of a pack: counters, crashes, gaps, checkpoints of all formats, and the SOC after a long gap."""
 
 import asyncio
 import dataclasses
@@ -41,7 +41,7 @@ def at(hours: float) -> BootTimestamp:
 
 
 async def run_at(hours: float, folder: Path, *rows: tuple[float, float, float], settings: Settings = SETTINGS) -> Any:
-    """A run over ``rows`` that begins so late. Returns its estimator and its last snapshot."""
+    """Run a service over ``rows``, starting at this time [h]. Return its estimator and its last snapshot."""
     source, sink = ScriptedSource(), Collector()
     source.give(*rows)
     source.finish()
@@ -112,8 +112,8 @@ async def test_a_run_without_samples_changes_neither_counters_nor_the_age_of_the
     assert found.counters.total.samples["dropped_range"] == 1
 
 
-async def killed(folder: Path, *, with_a_sample: bool) -> None:
-    """A run that leaves no word: its last save is not made."""
+async def run_and_kill(folder: Path, *, with_a_sample: bool) -> None:
+    """Run a service that ends without its final save."""
 
     class Killed(CheckpointFile):
         def _write(self, content: dict[str, Any], ledger: RunCounters) -> None:
@@ -133,7 +133,7 @@ async def test_a_start_after_an_unclean_end_counts_as_a_crash(tmp_path: Path) ->
     await run_samples(tmp_path, samples=1)
     for with_a_sample in (True, False):
         counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
-        await killed(tmp_path, with_a_sample=with_a_sample)
+        await run_and_kill(tmp_path, with_a_sample=with_a_sample)
     counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
     counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
     assert counted == [0, 1, 2, 2]
@@ -164,7 +164,7 @@ async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Pat
 async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_continue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A later version is tried and left more often than files are preserved; the first files have learned most."""
+    """The later version runs once more than there are preserved files. The oldest files remain, and the last is replaced."""
     file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     for attempt in range(MAX_LATER_FILES + 1):
@@ -249,13 +249,13 @@ async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
             release.wait()
 
     with capture_logs() as lines:
-        await stopped_by_nothing(Hung(tmp_path, SETTINGS, CELL))
+        await run_with_hanging_disk(Hung(tmp_path, SETTINGS, CELL))
     assert "the disk hangs: the last checkpoint is not written" in {line["event"] for line in lines}
     release.set()
 
 
-async def stopped_by_nothing(hung: CheckpointFile) -> None:
-    """A run on a disk that hangs."""
+async def run_with_hanging_disk(hung: CheckpointFile) -> None:
+    """Run a service on a disk that hangs until its source ends."""
     async with run_with_frequent_saves(hung) as (source, sink, task):
         source.give((0.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs")
@@ -284,13 +284,13 @@ def test_gap_lengths_agree_with_the_kernel() -> None:
     gap_s = float(estimator.settings["gap_s"][0])
     steps = rng.choice([0.1, 1.0, 2.0 * gap_s, 100.0, -50.0], 400)
     times = np.cumsum(steps)
-    found = []
+    lengths = []
     for time_s in times:
         gaps, before_s, step_s = (float(estimator.state[n][0]) for n in ("gaps", "time_s", "step_s"))
         started = estimator.state["started"][0]
         estimator.step(float(time_s), 0.0, 3.8)
         if started:
-            one = gap_lengths(np.array([time_s]), before_s, step_s, gap_s, np.inf)
-            assert len(one) == estimator.state["gaps"][0] - gaps
-            found += one
-    assert gap_lengths(times[1:], float(times[0]), 0.0, gap_s, np.inf) == pytest.approx(found)
+            new_lengths = gap_lengths(np.array([time_s]), before_s, step_s, gap_s, np.inf)
+            assert len(new_lengths) == estimator.state["gaps"][0] - gaps
+            lengths += new_lengths
+    assert gap_lengths(times[1:], float(times[0]), 0.0, gap_s, np.inf) == pytest.approx(lengths)

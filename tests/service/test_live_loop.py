@@ -44,7 +44,7 @@ class Run:
     delivery: DeliveryStats
 
     async def ask(self, name: str, **arguments: Any) -> Any:
-        """The data of the response; UserError where there is an error."""
+        """Send a request. Return the data of the response, or raise its error as a UserError."""
         response = await self.requests.handle(name, json.dumps(arguments).encode())
         assert response
         answer = json.loads(response)
@@ -254,18 +254,18 @@ async def test_the_properties_of_a_silent_board_stay_published(again: dict[str, 
     assert boards[-1] == (again or {"serial": "A1", "firmware": "1.0"})
 
 
-class Zeroed:
-    """What has the board take the present current as zero, and a clock that the test sets."""
+class ZeroRecorder:
+    """Counter of the commands that set the board's current zero, with a clock that the test sets."""
 
     def __init__(self) -> None:
-        self.times, self.now_s = 0, 0.0
+        self.calls, self.now_s = 0, 0.0
         self.clock = Clock(monotonic=lambda: self.now_s)
 
     async def __call__(self) -> None:
-        self.times += 1
+        self.calls += 1
 
-    async def watch(self, run: Run, rows: list[tuple[float, float]]) -> None:
-        """A second for each (current, voltage), from the first publication on."""
+    async def feed(self, run: Run, rows: list[tuple[float, float]]) -> None:
+        """Feed one sample a second with these currents and voltages, after the first publication."""
         while not run.sink.snapshots:
             self.now_s += 0.1
             await asyncio.sleep(0.01)
@@ -280,11 +280,11 @@ AT_REST = [(0.03, 3.8)] * (round(REST_S) + 2)
 
 
 async def test_current_zero_is_accepted_at_rest() -> None:
-    zero = Zeroed()
+    zero = ZeroRecorder()
     async with running(current_zero=zero, clock=zero.clock) as run:
-        await zero.watch(run, AT_REST)
+        await zero.feed(run, AT_REST)
         assert await run.ask("current_zero") == {}
-    assert zero.times == 1
+    assert zero.calls == 1
 
 
 @pytest.mark.parametrize(
@@ -298,24 +298,24 @@ async def test_current_zero_is_accepted_at_rest() -> None:
     ],
 )
 async def test_current_zero_is_rejected_while_current_flows(rows: list[tuple[float, float]], why: str) -> None:
-    zero = Zeroed()
+    zero = ZeroRecorder()
     async with running(current_zero=zero, clock=zero.clock) as run:
-        await zero.watch(run, rows)
+        await zero.feed(run, rows)
         with pytest.raises(UserError, match=why):
             await run.ask("current_zero")
-    assert zero.times == 0
+    assert zero.calls == 0
 
 
 async def test_rest_before_a_silence_does_not_count() -> None:
-    zero = Zeroed()
+    zero = ZeroRecorder()
     async with running(current_zero=zero, clock=zero.clock) as run:
-        await zero.watch(run, AT_REST)
+        await zero.feed(run, AT_REST)
         zero.now_s += REST_S
         await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
-        await zero.watch(run, AT_REST[:2])
+        await zero.feed(run, AT_REST[:2])
         with pytest.raises(UserError, match="watched for"):
             await run.ask("current_zero")
-    assert zero.times == 0
+    assert zero.calls == 0
 
 
 async def test_current_zero_is_rejected_by_a_source_without_it() -> None:

@@ -1,4 +1,4 @@
-"""What systemd and health wait_for of a loop that turns, of a source that hangs, and of what waits."""
+"""Watchdog and status messages to systemd, and latency, idle time and waiting reads in health."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ from tests.scripted_source import ScriptedSource
 
 
 class Systemd:
-    """Hears one pack."""
+    """Receiver of the notifications of one pack's service."""
 
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -33,16 +33,16 @@ class Systemd:
         self._socket.setblocking(False)
         self.notifier = SystemdNotifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "30000"})
 
-    async def wait_for(self, wanted: str) -> str:
-        """Wait for a state that begins so."""
+    async def wait_for(self, prefix: str) -> str:
+        """Wait for a notification that begins with ``prefix``."""
         async with asyncio.timeout(LONG_S):
             while True:
                 state = (await asyncio.get_running_loop().sock_recv(self._socket, 4096)).decode()
-                if state.startswith(wanted):
+                if state.startswith(prefix):
                     return state
 
     def received(self) -> list[str]:
-        """What has come since."""
+        """Return the notifications that have arrived since the last call."""
         states = []
         with contextlib.suppress(BlockingIOError):
             while True:
