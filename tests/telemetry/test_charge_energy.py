@@ -18,7 +18,7 @@ def make_trace(time_s: np.ndarray, current_a: float | np.ndarray, voltage_v: flo
 
 
 def meter_blocks(*blocks: np.ndarray) -> ChargeEnergy:
-    """Return the totals of a new meter meter_blocks these blocks."""
+    """Return the totals of a new meter after these blocks."""
     meter = ChargeEnergyMeter(ChargeEnergy(), GAP_S)
     for block in blocks:
         meter.add(block)

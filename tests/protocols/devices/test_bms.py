@@ -99,7 +99,7 @@ def test_no_bytes_raise_and_chunk_boundaries_do_not_change_the_values(
 @pytest.mark.parametrize("name", POLL_CYCLES)
 def test_response_with_one_changed_byte_is_rejected_and_the_next_one_decoded(name: str) -> None:
     valid = POLL_CYCLES[name]
-    # Only bytes of the last response are changed, because it completes the sample. On the newer_jk_response JK a record follows it.
+    # Only bytes of the last response are changed, because it completes the sample. On the newer JK a record follows it.
     is_newer_jk = name == "jk_newer"
     response_bytes = len(frames.JK_NEWER_FRAME) if is_newer_jk else 12
     response_end = len(valid) - (len(frames.JK_RECORD_OF_PACK_2) if is_newer_jk else 0)
@@ -236,7 +236,7 @@ def test_older_jk_encodes_negative_temperatures_above_100() -> None:
 
 
 def newer_jk_response(address: int, **values: int) -> bytes:
-    """Return the newer_jk_response response of the pack with this address. ``values`` are its ``millivolts`` or ``milliamperes``."""
+    """Return the newer response of the pack with this address. ``values`` are its ``millivolts`` or ``milliamperes``."""
     frame = bytearray(frames.JK_NEWER_FRAME)
     for name, at in (("millivolts", 150), ("milliamperes", 158)):
         if name in values:

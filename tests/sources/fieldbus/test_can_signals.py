@@ -7,7 +7,7 @@ from pathlib import Path
 import cantools
 import pytest
 from cantools.database.can import Database
-from hypothesis import source_settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -69,9 +69,7 @@ def source(**options: object) -> CanSource:
     return CanSource.model_validate({"kind": "can"} | options)
 
 
-@source_settings(
-    st.lists(st.tuples(st.sampled_from([0x355, 0x356, 0x357]), st.booleans(), st.binary(max_size=64)), max_size=20)
-)
+@given(st.lists(st.tuples(st.sampled_from([0x355, 0x356, 0x357]), st.booleans(), st.binary(max_size=64)), max_size=20))
 def test_no_frames_raise_with_a_profile(frames: list[tuple[int, bool, bytes]]) -> None:
     map_ = CanMap(source(profile="pylontech-can"))
     for identifier, extended, data in frames:
@@ -79,7 +77,7 @@ def test_no_frames_raise_with_a_profile(frames: list[tuple[int, bool, bytes]]) -
         assert (reading is not None) == ((identifier, extended) == (0x356, False) and len(data) >= 4)
 
 
-@source_settings(st.lists(st.tuples(st.sampled_from([0x500, 0x501]), st.binary(max_size=64)), max_size=20))
+@given(st.lists(st.tuples(st.sampled_from([0x500, 0x501]), st.binary(max_size=64)), max_size=20))
 def test_no_frames_raise_with_a_dbc_file(dbc_source: CanSource, frames: list[tuple[int, bytes]]) -> None:
     map_ = CanMap(dbc_source)
     for identifier, data in frames:

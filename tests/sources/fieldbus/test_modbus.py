@@ -34,7 +34,7 @@ def victron() -> Registers:
 
 
 async def read_lines(producer: ModbusProducer, count: int) -> list[dict[str, object]]:
-    """Return the first ``count`` read_lines of samples after the line ``CONNECTED``."""
+    """Return the first ``count`` lines of samples after the line ``CONNECTED``."""
     async with asyncio.timeout(LONG_S), aclosing(producer.iter_lines()) as lines:
         assert await anext(lines) == CONNECTED
         return [json.loads(await anext(lines)) for _ in range(count)]
@@ -43,7 +43,7 @@ async def read_lines(producer: ModbusProducer, count: int) -> list[dict[str, obj
 async def failure_reason(producer: ModbusProducer) -> str:
     """Return the reason for which the source is unavailable."""
     with pytest.raises(SourceUnavailableError) as raised:
-        await read_lines(producer, 1_000_000)  # more read_lines than arrive before the failure_reason
+        await read_lines(producer, 1_000_000)  # more lines than arrive before the failure
     return str(raised.value)
 
 

@@ -5,7 +5,7 @@ import math
 import struct
 
 import pytest
-from hypothesis import source_settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -32,14 +32,14 @@ def words(raw: float, kind: str, *, low_word_first: bool = False, address: int =
     return {("holding", address + i): word for i, word in enumerate(values[::-1] if low_word_first else values)}
 
 
-@source_settings(st.data(), st.sampled_from(list(FORMATS)), st.booleans())
+@given(st.data(), st.sampled_from(list(FORMATS)), st.booleans())
 def test_packed_values_are_decoded(data: st.DataObject, kind: str, low_word_first: bool) -> None:
     raw = data.draw(RANGES[kind])
     register = Register(address=7, type=kind, low_word_first=low_word_first, scale=0.01, offset=-2.0)
     assert decode(register, words(raw, kind, low_word_first=low_word_first, address=7)) == round(raw * 0.01 - 2.0, 5)
 
 
-@source_settings(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(FORMATS)), st.booleans()), max_size=60))
+@given(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(FORMATS)), st.booleans()), max_size=60))
 def test_requests_cover_every_register_once_within_the_maximum_length(wanted: list[tuple[int, str, bool]]) -> None:
     values = [
         Value("cells", Register(address=address, type=kind, table="input" if is_input else "holding"))
