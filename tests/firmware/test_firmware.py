@@ -240,16 +240,16 @@ def test_restart_is_a_watchdog_reset_and_settings_in_the_eeprom_survive_it(start
     assert sample.status >> 4 == ResetCause.WATCHDOG
 
 
-def test_the_decoder_goes_on_across_a_restart(start: Start) -> None:
+def test_sample_times_increase_across_a_restart(start: Start) -> None:
     host = start()
     host.take(100)
     host.ask(command(MessageType.COMMAND_RESTART))
     host.until(lambda: len(host.hellos) == 2)
     host.take(100)
-    decoder, (cut, hello) = FrameDecoder(), host.hellos[-1]
+    decoder, (samples_before_restart, hello) = FrameDecoder(), host.hellos[-1]
     decoder.feed(0.0, host.hellos[0][1].encode())
-    before = decoder.feed(1.0, b"".join(s.encode() for s in host.samples[:cut]))
-    after = decoder.feed(1.5, hello.encode() + b"".join(s.encode() for s in host.samples[cut:]))
+    before = decoder.feed(1.0, b"".join(s.encode() for s in host.samples[:samples_before_restart]))
+    after = decoder.feed(1.5, hello.encode() + b"".join(s.encode() for s in host.samples[samples_before_restart:]))
     assert decoder.counters.resets == 1
     assert decoder.counters.frames_lost == 0
     assert after["status"][0] & SampleStatus.RESET
@@ -302,7 +302,7 @@ def test_restart_does_not_depend_on_the_boot_loader(start: Start) -> None:
         host.take(30)
         host.ask(set_rate_command(1000))
         host.ask(command(MessageType.COMMAND_RESTART))
-        host.until(lambda wanted=restarts: len(host.hellos) > wanted)
+        host.until(lambda count=restarts: len(host.hellos) > count)
         assert host.hellos[-1][1].reset_cause == ResetCause.WATCHDOG
         samples = host.take(20)
         assert [s.sequence for s in samples[-10:]] == list(range(samples[-10].sequence, samples[-10].sequence + 10))

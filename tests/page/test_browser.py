@@ -275,10 +275,10 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
     )
     async with dashboard_of(browser, house, "cellar") as opened:
         await publish(house.live, "alarm/cell_under_voltage", alarm.model_dump_json())
-        shown = opened.page.get_by_role("alert").locator(".alarm")
-        await shown.wait_for()
-        text = await shown.inner_text()
-        for said in (
+        element = opened.page.get_by_role("alert").locator(".alarm")
+        await element.wait_for()
+        text = await element.inner_text()
+        for part in (
             "under voltage",
             "cell 3 has 2.412 V: stop discharging",
             "2.412 V",
@@ -286,14 +286,14 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
             "critical",
             "latched",
         ):
-            assert said in text
+            assert part in text
         quiet = alarm.model_copy(update={"active": False, "latched": False, "since": None, "value": None, "text": ""})
         await publish(house.live, "alarm/cell_under_voltage", quiet.model_dump_json())
-        await shown.wait_for(state="detached")
+        await element.wait_for(state="detached")
         unwatched = quiet.model_copy(update={"watched": False, "unwatched_reason": "cell voltages are missing"})
         await publish(house.live, "alarm/cell_under_voltage", unwatched.model_dump_json())
-        await shown.wait_for()
-        text = await shown.inner_text()
+        await element.wait_for()
+        text = await element.inner_text()
         assert "cell voltages are missing" in text
         assert "cannot be watched" in text
         await publish(house.live, "alarm/cell_under_voltage", b"")

@@ -12,7 +12,7 @@ import pytest
 from yarl import URL
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.page import web_server as of_server
+from bms_estimator.page import web_server
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import FILES, STATIC, PageServer
@@ -93,14 +93,14 @@ async def test_reader_gets_stored_and_then_new_values(hub, past):
 
 
 async def test_keep_alive_events_reveal_a_lost_connection(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "PING_S", 0.05)
+    monkeypatch.setattr(web_server, "PING_S", 0.05)
     async with browsing(hub, past) as session, session.get("/events") as response:
         stream = messages(response)
         assert [await anext(stream) for _ in range(3)] == [{}, {}, {}]
 
 
 async def test_client_that_reads_nothing_is_disconnected(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "WRITE_S", 0.2)
+    monkeypatch.setattr(web_server, "WRITE_S", 0.2)
     async with browsing(hub, past) as session:
         reader, writer = await asyncio.open_connection(session._base_url.host, session._base_url.port, limit=1024)
         writer.write(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -117,7 +117,7 @@ async def test_client_that_reads_nothing_is_disconnected(hub, past, monkeypatch)
 async def test_excess_stream_replaces_the_oldest_of_the_busiest_address(
     hub: PackTopics, past: HistoryQuery, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(of_server, "MAX_STREAMS", 3)
+    monkeypatch.setattr(web_server, "MAX_STREAMS", 3)
     hub.set_link_state(None)
     async with browsing(hub, past) as session, contextlib.AsyncExitStack() as streams:
         url = session._base_url.join(URL("/events"))
@@ -148,7 +148,7 @@ async def test_stalled_readers_share_their_texts(hub: PackTopics, past: HistoryQ
     async with browsing(hub, past) as session:
         before = process.memory_info().rss
         address = session._base_url.host, session._base_url.port
-        clients = [await asyncio.open_connection(*address, limit=1024) for _ in range(of_server.MAX_STREAMS)]
+        clients = [await asyncio.open_connection(*address, limit=1024) for _ in range(web_server.MAX_STREAMS)]
         async with asyncio.timeout(LONG_S):
             for reader, writer in clients:
                 writer.write(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -228,7 +228,7 @@ async def test_a_pack_without_a_database_has_no_history(tmp_path, hub, past):
 
 
 async def test_address_in_use_is_reported_and_retried(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "RETRY_S", 0.05)
+    monkeypatch.setattr(web_server, "RETRY_S", 0.05)
     opened = asyncio.Queue[str]()
     with socket.create_server(("127.0.0.1", 0)) as other:
         settings = PageSettings(listen=f"127.0.0.1:{other.getsockname()[1]}")

@@ -106,10 +106,10 @@ async def test_charge_and_energy_are_published_once_saved_so_that_a_kill_does_no
 async def test_a_run_without_samples_changes_neither_counters_nor_the_age_of_the_state(tmp_path: Path) -> None:
     await run_at(0.0, tmp_path, (0.0, 0.1, 3.8))
     await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))
-    found = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(2.0)).load()
-    assert found.unseen_s == pytest.approx(7200.0)
-    assert found.counters.restarts == 2
-    assert found.counters.total.samples["dropped_range"] == 1
+    loaded = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(2.0)).load()
+    assert loaded.unseen_s == pytest.approx(7200.0)
+    assert loaded.counters.restarts == 2
+    assert loaded.counters.total.samples["dropped_range"] == 1
 
 
 async def run_and_kill(folder: Path, *, with_a_sample: bool) -> None:
@@ -129,14 +129,14 @@ async def run_and_kill(folder: Path, *, with_a_sample: bool) -> None:
 
 
 async def test_a_start_after_an_unclean_end_counts_as_a_crash(tmp_path: Path) -> None:
-    counted = []
+    crashes = []
     await run_samples(tmp_path, samples=1)
     for with_a_sample in (True, False):
-        counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
+        crashes.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
         await run_and_kill(tmp_path, with_a_sample=with_a_sample)
-    counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
-    counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
-    assert counted == [0, 1, 2, 2]
+    crashes.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
+    crashes.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
+    assert crashes == [0, 1, 2, 2]
 
 
 async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: Path) -> None:
@@ -149,14 +149,14 @@ async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: 
         assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: at(hours)).load().reason == reason
 
 
-COUNTED = RunCounters(
+COUNTERS = RunCounters(
     6, Totals(since="2023-11-14T22:13:20Z", crashes=2, samples={"samples": 70}, unseen_s=30.0), clean=True
 )
 
 
 async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0))
-    file.save(learned_estimator().record, COUNTED)
+    file.save(learned_estimator().record, COUNTERS)
     _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edit("state", longest_days=2.0))
     assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
 
@@ -168,15 +168,15 @@ async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_co
     file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     for attempt in range(MAX_LATER_FILES + 1):
-        counted = dataclasses.replace(COUNTED, restarts=6 + attempt)
-        save_as(FORMAT + 1, file, learned_estimator(), monkeypatch, counted)
+        counters = dataclasses.replace(COUNTERS, restarts=6 + attempt)
+        save_as(FORMAT + 1, file, learned_estimator(), monkeypatch, counters)
         inodes.append(file.path.stat().st_ino)
         health = (await run_samples(tmp_path, samples=1)).health
         files = min(attempt + 1, MAX_LATER_FILES)
         assert f"reads {FORMAT}; set aside as pack.later-{files}.npz; once the version" in health.checkpoint
         assert (health.restarts, health.total.crashes, health.total.unseen_s) == (7 + attempt, 2, 30.0)
-    kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, MAX_LATER_FILES + 1)]
-    assert kept_inodes == [*inodes[: MAX_LATER_FILES - 1], inodes[MAX_LATER_FILES]]
+    preserved_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, MAX_LATER_FILES + 1)]
+    assert preserved_inodes == [*inodes[: MAX_LATER_FILES - 1], inodes[MAX_LATER_FILES]]
     assert (tmp_path / "pack.refused.npz").read_bytes() == b"an older one"
 
 
@@ -210,8 +210,8 @@ async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after
 )
 async def test_implausible_counters_are_reset_and_the_state_is_restored(tmp_path: Path, wrong: dict[str, Any]) -> None:
     learned = learned_estimator()
-    total = COUNTED.total.model_copy(update=wrong)
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTED, total=total))
+    total = COUNTERS.total.model_copy(update=wrong)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTERS, total=total))
     with capture_logs() as lines:
         health = (await run_samples(tmp_path, samples=1)).health
     assert "restart from zero" in lines[0]["event"]
@@ -225,10 +225,11 @@ async def test_a_deleted_state_folder_is_recreated_with_access_for_the_owner_onl
     folder = tmp_path / "state"
     async with run_with_frequent_saves(CheckpointFile(folder, SETTINGS, CELL)) as (source, sink, _):
         for second in range(3):
-            seen = len(sink.snapshots)
+            snapshots_before = len(sink.snapshots)
             source.give((float(second), 0.1, 3.8))
             await sink.until(
-                lambda s, n=second + 1: s.health.samples["samples"] == n and s.health.checkpoint == "saved", skip=seen
+                lambda s, n=second + 1: s.health.samples["samples"] == n and s.health.checkpoint == "saved",
+                skip=snapshots_before,
             )
             while not folder.exists():  # noqa: ASYNC110 - a file has no event
                 await asyncio.sleep(0.01)

@@ -138,12 +138,12 @@ async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> Non
         silent = await run.sink.until(lambda s: s.health.samples["samples"] == 1 and not s.health.sensor_online)
         assert silent.estimate is None
         assert "no usable sample" in (silent.health.sensor_message or "")
-        seen = len(run.sink.snapshots)
+        snapshots_before = len(run.sink.snapshots)
         run.source.give((1.0, 0.1, 380.0))
-        snapshot = await run.sink.until(lambda s: "dropped" in (s.health.sensor_message or ""), skip=seen)
+        snapshot = await run.sink.until(lambda s: "dropped" in (s.health.sensor_message or ""), skip=snapshots_before)
         assert "dropped since: 1 outside the cell's range" in (snapshot.health.sensor_message or "")
         run.source.give((2.0, 0.1, 3.8))
-        await run.sink.until(lambda s: s.health.sensor_online, skip=seen)
+        await run.sink.until(lambda s: s.health.sensor_online, skip=snapshots_before)
         later = await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
         assert "dropped" not in (later.health.sensor_message or "")
 
@@ -199,9 +199,9 @@ async def test_a_step_of_the_wall_clock_changes_time_stamps_only() -> None:
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.estimate is not None)
         offset = -7200.0
-        seen = len(run.sink.snapshots)
+        snapshots_before = len(run.sink.snapshots)
         run.source.give((0.1, 0.1, 3.8))
-        after = await run.sink.until(lambda s: s.estimate is not None, skip=seen)
+        after = await run.sink.until(lambda s: s.estimate is not None, skip=snapshots_before)
         state = await run.end()
     assert after.estimate
     assert after.estimate.publish_time.startswith("2023-11-14T20:13:20")
@@ -244,12 +244,12 @@ async def test_the_properties_of_a_silent_board_stay_published(again: dict[str, 
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: bool(s.info.board))
         run.source.board = {}
-        seen = len(run.sink.snapshots)
+        snapshots_before = len(run.sink.snapshots)
         at_s = run.sink.snapshots[-1].health.uptime_s
-        await run.sink.until(lambda s: s.health.uptime_s > at_s + 1.0, skip=seen)
+        await run.sink.until(lambda s: s.health.uptime_s > at_s + 1.0, skip=snapshots_before)
         run.source.board = again
         await run.end()
-    boards = [s.info.board for s in run.sink.snapshots[seen:]]
+    boards = [s.info.board for s in run.sink.snapshots[snapshots_before:]]
     assert {} not in boards
     assert boards[-1] == (again or {"serial": "A1", "firmware": "1.0"})
 
@@ -271,9 +271,9 @@ class ZeroRecorder:
             await asyncio.sleep(0.01)
         for current_a, voltage_v in rows:
             self.now_s += 1.0
-            seen = len(run.sink.snapshots)
+            snapshots_before = len(run.sink.snapshots)
             run.source.give((self.now_s, current_a, voltage_v))
-            await run.sink.until(lambda s: s.estimate is not None, skip=seen)
+            await run.sink.until(lambda s: s.estimate is not None, skip=snapshots_before)
 
 
 AT_REST = [(0.03, 3.8)] * (round(REST_S) + 2)
@@ -326,8 +326,8 @@ async def test_current_zero_is_rejected_by_a_source_without_it() -> None:
 
 
 async def test_a_parameter_has_its_source_and_a_missing_capacitance_its_reason() -> None:
-    known = {"pack": PackSettings(initial_soc=0.001), "identifier": IdentifierSettings(soc_std=0.005)}
-    nearly_empty = SETTINGS.model_copy(update=known)
+    changes = {"pack": PackSettings(initial_soc=0.001), "identifier": IdentifierSettings(soc_std=0.005)}
+    nearly_empty = SETTINGS.model_copy(update=changes)
     async with running(nearly_empty) as run:
         run.source.give((0.0, 0.0, 2.5))
         run.source.finish()

@@ -190,9 +190,9 @@ async def test_a_stopping_service_saves_first_although_its_broker_hangs(
         state = await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 50)
         broker.freeze()
         await stop_service(process)
-        seen = len(live.messages)
+        messages_before = len(live.messages)
         broker.thaw()
-        await live.wait("bms/pack/availability", lambda payload: payload == b"offline", skip=seen)
+        await live.wait("bms/pack/availability", lambda payload: payload == b"offline", skip=messages_before)
     board.cancel()
     (checkpoint,) = checkpoints(state_home)
     with np.load(checkpoint) as saved:

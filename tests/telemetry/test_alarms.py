@@ -99,7 +99,7 @@ async def test_each_alarm_is_raised_and_ends_on_a_capture(name: str, tmp_path: P
     assert (last.active, last.latched, bool(last.text)) == (latched, latched, latched)
 
 
-async def test_a_healthy_pack_raises_no_alarm_and_unmeasured_quantities_show_none(
+async def test_healthy_pack_raises_no_alarm_and_alarms_of_unmeasured_quantities_are_not_reported(
     tmp_path: Path,
 ) -> None:
     lines = [Line(60, current_a=5.0, temperature_c=None), Line(60, current_a=-5.0, temperature_c=None)]
@@ -382,8 +382,8 @@ def test_alarms_are_unwatched_during_silence() -> None:
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
     alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
-    seen = [(9.9, True, None), (10.0, False, "no cable"), (0.1, True, None)]
-    for silent_s, is_watched, reason in seen:
+    silences = [(9.9, True, None), (10.0, False, "no cable"), (0.1, True, None)]
+    for silent_s, is_watched, reason in silences:
         alarms.on_silence(silent_s, WALL_S, "no cable")
         shown = {alarm.name: alarm for alarm in alarms.report()}
         assert (shown["pack_over_voltage"].watched, shown["pack_over_voltage"].unwatched_reason) == (is_watched, reason)

@@ -23,7 +23,8 @@ Q_AH = CELL.cell.capacity_ah
 NOW_S = 1.7e9
 
 
-def at(soc: float) -> Estimator:
+def estimator_at(soc: float) -> Estimator:
+    """Return an estimator after one sample at rest at this SOC."""
     estimator = Estimator(CELL, initial_soc=soc, identifier=None)
     estimator.step(0.0, 0.0, chen_mora.emf(soc, CELL.a))
     return estimator
@@ -42,36 +43,39 @@ def pulses(current_a: float, hours: float) -> np.ndarray:
 
 
 def test_charge_energy_and_time_at_a_load() -> None:
-    left = remaining_charge(at(0.5), 0.055)
+    left = remaining_charge(estimator_at(0.5), 0.055)
     assert left.capacity_ah == pytest.approx(0.5 * Q_AH)
     assert left.time_to_empty_s == pytest.approx(0.5 * Q_AH / 0.055 * 3600.0)
     energy_wh = Q_AH * quad(chen_mora.emf, 0.0, 0.5, args=(CELL.a,))[0]
-    assert remaining_charge(at(0.5), 0.0).energy_wh == pytest.approx(energy_wh, rel=1e-4)
-    assert remaining_charge(at(0.5), 0.0).energy_wh - left.energy_wh == pytest.approx(
-        0.055 * 0.5 * Q_AH * sum(f(0.5, at(0.5).state[0]["a"]) for f in (chen_mora.r_s, chen_mora.r_ts, chen_mora.r_tl))
+    assert remaining_charge(estimator_at(0.5), 0.0).energy_wh == pytest.approx(energy_wh, rel=1e-4)
+    assert remaining_charge(estimator_at(0.5), 0.0).energy_wh - left.energy_wh == pytest.approx(
+        0.055
+        * 0.5
+        * Q_AH
+        * sum(f(0.5, estimator_at(0.5).state[0]["a"]) for f in (chen_mora.r_s, chen_mora.r_ts, chen_mora.r_tl))
     )
 
 
 def test_usable_charge_ends_at_the_margins() -> None:
-    estimator = at(0.5)
+    estimator = estimator_at(0.5)
     state = estimator.state[0]
     usable_ah = remaining_charge(estimator, 0.0).usable_ah
     assert usable_ah == pytest.approx((0.5 - max(state["delta_1"], state["delta_2"])) * Q_AH)
-    assert remaining_charge(at(0.001), 0.0).usable_ah == 0.0
+    assert remaining_charge(estimator_at(0.001), 0.0).usable_ah == 0.0
 
 
 @pytest.mark.parametrize("current_a", [0.0, -1.0, 1e-5])
-def test_a_pack_that_does_not_discharge_has_no_time_to_empty(current_a: float) -> None:
-    assert math.isnan(remaining_charge(at(0.5), current_a).time_to_empty_s)
+def test_time_to_empty_is_none_unless_the_pack_is_discharged(current_a: float) -> None:
+    assert math.isnan(remaining_charge(estimator_at(0.5), current_a).time_to_empty_s)
 
 
-def test_a_pack_that_charges_has_a_time_to_full_and_no_other_has() -> None:
-    assert remaining_charge(at(0.4), -0.055).time_to_full_s == pytest.approx(0.6 * Q_AH / 0.055 * 3600.0)
-    assert remaining_charge(at(1.0), -0.055).time_to_full_s == 0.0
-    assert all(math.isnan(remaining_charge(at(0.5), a).time_to_full_s) for a in (0.0, 1.0, -1e-5))
+def test_time_to_full_is_none_unless_the_pack_is_charged() -> None:
+    assert remaining_charge(estimator_at(0.4), -0.055).time_to_full_s == pytest.approx(0.6 * Q_AH / 0.055 * 3600.0)
+    assert remaining_charge(estimator_at(1.0), -0.055).time_to_full_s == 0.0
+    assert all(math.isnan(remaining_charge(estimator_at(0.5), a).time_to_full_s) for a in (0.0, 1.0, -1e-5))
 
 
-def test_nothing_is_known_before_the_first_sample() -> None:
+def test_values_are_none_before_the_first_sample() -> None:
     estimator = Estimator(CELL, initial_soc=0.5, identifier=None)
     assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)
     assert make_parameters_payload(estimator, NOW_S).elements == {}
@@ -206,9 +210,9 @@ def test_current_of_the_wrong_sign_is_suspected() -> None:
 def test_series_resistance_is_compared_with_that_of_the_cell_file_at_the_same_temperature() -> None:
     ratios = []
     for temperature_c in (25.0, 0.0):
-        seen = capture(Case("R_s", temperature_c=temperature_c, hours=0.5))
-        estimator = Estimator(seen.cell, initial_soc=float(seen.soc[0]))
-        estimator.run(seen.samples)
+        recording = capture(Case("R_s", temperature_c=temperature_c, hours=0.5))
+        estimator = Estimator(recording.cell, initial_soc=float(recording.soc[0]))
+        estimator.run(recording.samples)
         r_s = make_parameters_payload(estimator, NOW_S).state_of_health["r_s"]
         assert r_s.source == "identified"
         ratios.append(r_s.value)

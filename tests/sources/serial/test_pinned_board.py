@@ -189,21 +189,21 @@ async def test_board_is_found_on_another_port(folder: Path, memory: KnownBoardFi
 
 
 async def test_swapped_boards_are_found_by_their_packs(folder: Path, tmp_path: Path) -> None:
-    one, two = folder / "ttyUSB0", folder / "ttyUSB1"
+    first_port, second_port = folder / "ttyUSB0", folder / "ttyUSB1"
     memories = [KnownBoardFile(tmp_path, name) for name in ("house", "shed")]
     async with (
-        source(one, memories[0]),
-        source(two, memories[1]),
-        board(one, serial=1),
-        board(two, serial=2, voltage_v=OTHERS_V),
+        source(first_port, memories[0]),
+        source(second_port, memories[1]),
+        board(first_port, serial=1),
+        board(second_port, serial=2, voltage_v=OTHERS_V),
     ):
         await wait_until_stored(memories[0], "00000001")
         await wait_until_stored(memories[1], "00000002")
     async with (
-        source(one, memories[0]) as house,
-        source(two, memories[1]) as shed,
-        board(two, serial=1),
-        board(one, serial=2, voltage_v=OTHERS_V),
+        source(first_port, memories[0]) as house,
+        source(second_port, memories[1]) as shed,
+        board(second_port, serial=1),
+        board(first_port, serial=2, voltage_v=OTHERS_V),
     ):
         await until(lambda: house.blocks and shed.blocks)
     assert np.concatenate(house.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
@@ -430,5 +430,5 @@ def test_file_written_by_root_belongs_to_the_owner_of_the_folder(tmp_path: Path)
     os.chown(theirs, 65534, 65533)
     memory = KnownBoardFile(theirs, "house")
     memory.save(NO_BOARD)
-    found = memory.path.stat()
-    assert (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == (65534, 65533, 0o600)
+    file_status = memory.path.stat()
+    assert (file_status.st_uid, file_status.st_gid, stat.S_IMODE(file_status.st_mode)) == (65534, 65533, 0o600)
