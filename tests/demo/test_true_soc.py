@@ -17,7 +17,9 @@ FALL_PER_S = 1.0 / 3600.0
 def frame(at_s: float) -> bytes:
     """Return a sample with this time stamp."""
     board_us = round(at_s * 1e6) % MODULUS
-    return SampleMessage(0, board_us, 1, 1, 1, 0, 0, 0).encode()
+    return SampleMessage(
+        sequence=0, board_us=board_us, voltage_sum=1, current_sum=1, count=1, aux_sum=0, aux_count=0, status=0
+    ).encode()
 
 
 @pytest.fixture

@@ -36,6 +36,8 @@ SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), publish=PublishSettings(
 
 @dataclass
 class Run:
+    """Running estimation loop with its inputs and outputs."""
+
     source: ScriptedSource
     sink: Collector
     requests: RequestDispatcher
@@ -61,9 +63,9 @@ class Run:
 async def running(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
     source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), DeliveryStats()
     requests = RequestDispatcher(delivery, ("set_soc", "current_zero", "publish_rate"))
-    edges = {"requests": requests, "delivery": delivery}
+    arguments = {"requests": requests, "delivery": delivery}
     task = asyncio.create_task(
-        run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, **edges, **options)
+        run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, **arguments, **options)
     )
     try:
         yield Run(source, sink, requests, task, stop, delivery)
@@ -83,7 +85,7 @@ async def test_voltage_current_and_power_are_means_of_the_publish_window() -> No
     (window,) = estimates(run.sink)
     assert window.voltage_v == pytest.approx(3.85)
     assert window.current_a == pytest.approx(0.5)
-    assert window.power_w == pytest.approx(3.9 / 2)  # the mean of products, not the product of means
+    assert window.power_w == pytest.approx(3.9 / 2)  # the mean of the products of current and voltage
     assert window.sample_rate_hz == pytest.approx(100.0)
     assert window.frames_received == 100
 
@@ -95,10 +97,10 @@ async def test_blocks_and_single_steps_give_equal_states() -> None:
         for i in range(0, 500, 7):
             run.source.give(*rows[i : i + 7])
         live = await run.end()
-    alone = new_estimator(SETTINGS, CELL)
+    single_steps = new_estimator(SETTINGS, CELL)
     for row in rows:
-        alone.step(*row)
-    assert live.record.tobytes() == alone.record.tobytes()
+        single_steps.step(*row)
+    assert live.record.tobytes() == single_steps.record.tobytes()
 
 
 async def test_unusable_samples_are_dropped_and_counted() -> None:
@@ -116,8 +118,8 @@ async def test_unusable_samples_are_dropped_and_counted() -> None:
         )
         await run.sink.until(lambda s: s.health.samples["gaps"] == 1)
         await run.end()
-    counted = run.sink.snapshots[-1].health.samples
-    assert counted == {
+    counters = run.sink.snapshots[-1].health.samples
+    assert counters == {
         "samples": 3,
         "dropped_not_finite": 2,
         "dropped_range": 2,

@@ -242,14 +242,15 @@ async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_pat
     assert json.loads(after.saved_state).keys() & {"pack_under_voltage"} == set()
 
 
-async def test_a_saturated_current_exceeds_any_limit() -> None:
-    alarms = AlarmEvaluator(
-        watched(settings({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}}), PACK),
-        0.2,
-        5.0,
-        Inputs(10.0, 2),
-        10.0,
+def make_evaluator(alarms: dict[str, Any] | None = None) -> AlarmEvaluator:
+    """Return an evaluator for ``PACK`` with these settings of the alarms."""
+    return AlarmEvaluator(
+        watched(settings(alarms), PACK), charging_a=0.2, gap_s=5.0, inputs=Inputs(lost_s=10.0, series=2), silent_s=10.0
     )
+
+
+async def test_a_saturated_current_exceeds_any_limit() -> None:
+    alarms = make_evaluator({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}})
     block = np.zeros(2, dtype=SAMPLE)
     block["time_s"], block["current_a"], block["voltage_v"] = [0.0, 0.1], 25.0, 7.4
     block["status"] = [0, int(SampleStatus.CURRENT_SATURATED)]
@@ -261,7 +262,7 @@ async def test_a_saturated_current_exceeds_any_limit() -> None:
 
 
 def test_a_second_silence_renews_the_cause_of_a_latched_link_lost() -> None:
-    alarms = AlarmEvaluator(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = make_evaluator({"link_lost": {"latch": True}})
     saved = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
     alarms.restore(json.dumps({"link_lost": saved}))
     alarms.on_silence(1.0, WALL_S, "")
@@ -273,7 +274,7 @@ def test_a_second_silence_renews_the_cause_of_a_latched_link_lost() -> None:
 
 
 def test_a_saved_alarm_with_an_invalid_value_is_rejected() -> None:
-    alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = make_evaluator()
     saved = {"since_s": WALL_S, "value": math.inf, "gone": False, "acknowledged": False}
     with pytest.raises(ValueError, match="pack_over_voltage: value = inf"):
         alarms.restore(json.dumps({"pack_over_voltage": saved}))
@@ -377,7 +378,7 @@ async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None
 
 
 def test_alarms_are_unwatched_during_silence() -> None:
-    alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = make_evaluator()
     block = np.zeros(1, dtype=SAMPLE)
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
@@ -392,7 +393,7 @@ def test_alarms_are_unwatched_during_silence() -> None:
 
 
 def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_a_sample_arrives() -> None:
-    before, after = (AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0) for _ in range(2))
+    before, after = (make_evaluator() for _ in range(2))
     block = np.zeros(1, dtype=SAMPLE)
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     before.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
@@ -411,7 +412,7 @@ def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_a_sample_ar
 
 
 def test_damaged_saved_quantities_are_rejected() -> None:
-    alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = make_evaluator()
     with pytest.raises(ValueError, match="temperature: measured = 77"):
         alarms.restore(json.dumps({"inputs": {"temperature": [77, True]}}))
 
@@ -420,7 +421,7 @@ def test_damaged_saved_quantities_are_rejected() -> None:
 def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: float) -> None:
     """Two samples arrive together, twice a minute. The voltage is above the limit from the fifth burst on."""
     rule = {"pack_over_voltage": {"delay_s": 10.0}}
-    alarms = AlarmEvaluator(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = make_evaluator(rule)
     for burst in range(12):
         block = np.zeros(2, dtype=SAMPLE)
         block["time_s"], block["voltage_v"] = 30.0 * burst + np.array([0.0, spacing_s]), 8.6 if burst >= 4 else 7.4
@@ -432,7 +433,7 @@ def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: flo
 
 def test_a_single_gap_does_not_count_toward_a_delay() -> None:
     rule = {"pack_over_voltage": {"delay_s": 25.0}}
-    alarms = AlarmEvaluator(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = make_evaluator(rule)
     times_s = [*range(5), *range(25, 200), *range(220, 300)]
     block = np.zeros(len(times_s), dtype=SAMPLE)
     block["time_s"] = times_s
