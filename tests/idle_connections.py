@@ -15,7 +15,7 @@ import aiohttp
 from tests.fleet.nats_cluster import NatsCluster
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
-from tests.page.house import Service, starting
+from tests.page.house import Service, start_program
 from tests.patience import LONG_S
 
 DESCRIPTORS = 1024
@@ -114,7 +114,7 @@ async def attack_fleet_page(folder: Path, engine: NatsCluster) -> Outcome:
 async def _attack_page(
     folder: Path, port: int, program: tuple[object, ...], stop: Callable[[], object], start: Callable[[], object]
 ) -> Outcome:
-    process = await starting(folder, *program, port=port)
+    process = await start_program(folder, *program, port=port)
     url = f"http://127.0.0.1:{port}/"
     try:
         await _link_is(url, up=True)

@@ -21,7 +21,7 @@ from bms_estimator.fleet.nats.streams import make_streams
 from tests.fleet.nats_cluster import running
 from tests.fleet.published_states import load, make_packs, publish, publish_heartbeat
 from tests.free_port import free_port
-from tests.page.house import starting
+from tests.page.house import start_program
 
 MINUTE_S = 60.0
 TICK_S = 0.05
@@ -73,7 +73,7 @@ async def measure(packs: int, minutes: float) -> None:
         await load(nc, make_packs(packs))
         port = free_port()
         arguments = ("--server", cluster.url, "--listen", f"127.0.0.1:{port}", "--no-browser")
-        page = await starting(Path(temporary), "fleet", "page", *arguments, port=port)
+        page = await start_program(Path(temporary), "fleet", "page", *arguments, port=port)
         process, got = psutil.Process(page.pid), dict[str, float]()
         tasks = [asyncio.create_task(send(nc, packs)), asyncio.create_task(read(f"http://127.0.0.1:{port}", got))]
         await asyncio.sleep(1.5 * MINUTE_S)

@@ -1,4 +1,4 @@
-"""The demo's broker is right in what our topics need: retained messages and last wills."""
+"""Broker of the demo: retained messages and last wills."""
 
 import asyncio
 import contextlib
@@ -16,8 +16,8 @@ from tests.patience import LONG_S
 
 RETAINED = ["bms/p/availability", "bms/p/sensor/availability", "bms/p/info", "homeassistant/device/p/config"]
 
-# A client with a last will that ends without a word once it is connected
-DIES = """
+# Program of a client with a last will that ends without a DISCONNECT when its input is closed
+CRASHING_CLIENT = """
 import asyncio, os, sys, aiomqtt
 async def main():
     will = aiomqtt.Will("bms/p/availability", b"offline", qos=1, retain=True)
@@ -42,9 +42,9 @@ async def next_message(client: aiomqtt.Client) -> tuple[str, bytes, bool]:
     return message.topic.value, message.payload, message.retain
 
 
-async def all_retained(port: int, subscription: str) -> list[str]:
-    """Return the retained topics of a new client, until one that it publishes itself."""
-    seen = []
+async def receive_retained(port: int, subscription: str) -> list[str]:
+    """Return the topics of the retained messages that a new client receives. The client's own message ends the list."""
+    topics = []
     last = subscription.replace("#", "last").replace("+", "last")
     async with aiomqtt.Client("127.0.0.1", port) as client:
         await client.subscribe(subscription, qos=1)
@@ -52,8 +52,8 @@ async def all_retained(port: int, subscription: str) -> list[str]:
         while True:
             topic, payload, retain = await next_message(client)
             if not retain and payload == b'"x"':
-                return sorted(seen)
-            seen.append(topic)
+                return sorted(topics)
+            topics.append(topic)
 
 
 async def publish_all(client: aiomqtt.Client) -> None:
@@ -71,26 +71,26 @@ async def publish_all(client: aiomqtt.Client) -> None:
         ("homeassistant/status", []),
     ],
 )
-async def test_a_subscription_gets_the_retained_messages_it_matches_once(free_port, subscription, expected):
+async def test_subscriber_receives_each_matching_retained_message_once(free_port, subscription, expected):
     async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
         await publish_all(service)
-        for other in ("bms/#", "homeassistant/#", "#"):  # others listen too
+        for other in ("bms/#", "homeassistant/#", "#"):  # overlapping subscriptions of another client
             await service.subscribe(other)
-        assert await all_retained(free_port, subscription) == sorted(expected)
+        assert await receive_retained(free_port, subscription) == sorted(expected)
 
 
 async def test_an_empty_message_removes_a_retained_one(free_port):
     async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
         await publish_all(service)
         await service.publish("bms/p/info", b"", qos=1, retain=True)
-        assert "bms/p/info" not in await all_retained(free_port, "bms/#")
+        assert "bms/p/info" not in await receive_retained(free_port, "bms/#")
 
 
-async def test_the_will_of_a_client_that_dies_comes_and_is_retained(free_port):
+async def test_will_of_a_crashed_client_is_published_and_retained(free_port):
     async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as watcher:
         await watcher.subscribe("bms/p/availability", qos=1)
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", DIES, str(free_port), stdin=asyncio.subprocess.PIPE
+            sys.executable, "-c", CRASHING_CLIENT, str(free_port), stdin=asyncio.subprocess.PIPE
         )
         assert await next_message(watcher) == ("bms/p/availability", b"online", False)
         assert process.stdin
@@ -102,7 +102,7 @@ async def test_the_will_of_a_client_that_dies_comes_and_is_retained(free_port):
             assert await next_message(late) == ("bms/p/availability", b"offline", True)
 
 
-async def test_the_will_of_a_client_that_says_goodbye_does_not_come(free_port):
+async def test_will_of_a_client_that_disconnects_is_not_published(free_port):
     async with DemoBroker(free_port):
         will = aiomqtt.Will("bms/p/availability", b"offline", qos=1, retain=True)
         async with aiomqtt.Client("127.0.0.1", free_port, will=will) as service:
@@ -112,7 +112,7 @@ async def test_the_will_of_a_client_that_says_goodbye_does_not_come(free_port):
             assert await next_message(late) == ("bms/p/availability", b"online", True)
 
 
-async def test_a_port_that_is_taken_is_said(free_port):
+async def test_port_in_use_is_reported(free_port):
     async with DemoBroker(free_port):
         with pytest.raises(UserError, match=f"port {free_port}: taken"):
             DemoBroker(free_port)
@@ -130,7 +130,7 @@ async def test_the_printed_command_shows_the_topics(free_port):
         assert sorted(shown.decode().split()[::2]) == sorted(RETAINED[:3])
 
 
-async def test_what_came_before_its_end_is_handed_on(free_port):
+async def test_messages_received_before_the_shutdown_are_delivered(free_port):
     async with DemoBroker(free_port):
         listener = aiomqtt.Client("127.0.0.1", free_port)
         await listener.__aenter__()
@@ -138,11 +138,11 @@ async def test_what_came_before_its_end_is_handed_on(free_port):
         async with aiomqtt.Client("127.0.0.1", free_port) as client:
             for number in range(2000):
                 await client.publish("bms/p/state", str(number))
-    seen = list[bytes]()
+    payloads = list[bytes]()
     with contextlib.suppress(aiomqtt.MqttError):  # the broker has gone
         async with asyncio.timeout(LONG_S):
             async for message in listener.messages:
-                seen.append(message.payload)
+                payloads.append(message.payload)
     with contextlib.suppress(aiomqtt.MqttError):
         await listener.__aexit__(None, None, None)
-    assert [int(payload) for payload in seen] == list(range(2000))
+    assert [int(payload) for payload in payloads] == list(range(2000))

@@ -1,4 +1,4 @@
-"""The truth that the demo shows belongs to the very sample that the estimate is of."""
+"""True SOC that the demo shows: it belongs to the sample of the shown estimate."""
 
 import math
 
@@ -11,17 +11,20 @@ from bms_estimator.simulation.simulated_pack import SimulatedPack, constant
 
 LOAD_A, START_SOC, STEP_S = 0.275, 0.9, 0.02
 FALL_PER_S = 1.0 / 3600.0
-"""At 1C."""
+"""Decrease of the SOC by ``LOAD_A``, the 1C current [1/s]."""
 
 
 def frame(at_s: float) -> bytes:
+    """Return a sample with this time stamp."""
     board_us = round(at_s * 1e6) % MODULUS
-    return SampleMessage(0, board_us, 1, 1, 1, 0, 0, 0).encode()
+    return SampleMessage(
+        sequence=0, board_us=board_us, voltage_sum=1, current_sum=1, count=1, aux_sum=0, aux_count=0, status=0
+    ).encode()
 
 
 @pytest.fixture
 def truth() -> TrueSoc:
-    """True SOC of a pack that a simulator has read five minutes ahead."""
+    """Return the true SOC of a pack whose simulator is five minutes ahead of the received samples."""
     truth = TrueSoc(SimulatedPack(load_cell("chen_mora"), constant(LOAD_A), soc=START_SOC))
     for step in range(1, round(300.0 / STEP_S)):
         truth(step * STEP_S)
@@ -32,7 +35,7 @@ def soc_at(at_s: float) -> float:
     return START_SOC - FALL_PER_S * at_s
 
 
-def test_the_truth_is_of_the_last_whole_sample_that_came_though_the_pack_has_run_ahead(truth: TrueSoc) -> None:
+def test_true_soc_is_that_of_the_last_complete_sample_although_the_simulation_is_ahead(truth: TrueSoc) -> None:
     assert truth.soc() == START_SOC
     truth.write(0.0, frame(10.0) + frame(60.0))
     assert truth.soc() == pytest.approx(soc_at(60.0), abs=FALL_PER_S * STEP_S)
@@ -43,17 +46,17 @@ def test_the_truth_is_of_the_last_whole_sample_that_came_though_the_pack_has_run
     assert truth.soc() == pytest.approx(soc_at(90.0), abs=FALL_PER_S * STEP_S)
 
 
-def test_bytes_that_are_no_sample_do_not_move_the_truth(truth: TrueSoc) -> None:
+def test_noise_does_not_change_the_true_soc(truth: TrueSoc) -> None:
     truth.write(0.0, frame(30.0))
     truth.write(0.0, b"\x05noise\0\0\xff" * 9)
     assert truth.soc() == pytest.approx(soc_at(30.0), abs=FALL_PER_S * STEP_S)
 
 
-def test_the_truth_goes_on_when_the_board_s_clock_has_turned_over(truth: TrueSoc) -> None:
-    turn_s = MODULUS * 1e-6
+def test_true_soc_continues_after_a_wrap_of_the_board_clock() -> None:
+    wrap_s = MODULUS * 1e-6
     pack = SimulatedPack(load_cell("chen_mora"), constant(0.01), soc=START_SOC)
-    slow = TrueSoc(pack)
-    for minute in range(1, math.ceil(turn_s / 60.0) + 20):
-        slow(60.0 * minute)
-        slow.write(0.0, frame(60.0 * minute))
-        assert slow.soc() == pack.soc
+    truth = TrueSoc(pack)
+    for minute in range(1, math.ceil(wrap_s / 60.0) + 20):
+        truth(60.0 * minute)
+        truth.write(0.0, frame(60.0 * minute))
+        assert truth.soc() == pack.soc

@@ -1,4 +1,4 @@
-"""The host's end of the board's line, one message at a time."""
+"""Host at the serial line of a board, which reads and sends single messages."""
 
 import os
 import select
@@ -11,11 +11,13 @@ from tests.patience import LONG_S
 
 
 class Host:
-    """Reads and remembers all that the board sends.
+    """Host that stores all messages of the board.
 
     Attributes:
-        hellos: With the number of samples before each.
-        bad: Frames that were none.
+        samples: Received samples.
+        hellos: Received hellos, each with the number of samples before it.
+        acks: Received acknowledgments.
+        bad: Invalid frames.
     """
 
     def __init__(self, path: str) -> None:
@@ -27,8 +29,8 @@ class Host:
         self.bad: list[bytes] = []
 
     def __enter__(self) -> Self:
-        self._fd = os.open(self._path, os.O_RDWR | os.O_NOCTTY)  # no flush as pyserial's: nothing may be missed
-        self.until(lambda: bool(self.hellos))  # before that the board does not listen
+        self._fd = os.open(self._path, os.O_RDWR | os.O_NOCTTY)  # pyserial would flush the first bytes
+        self.until(lambda: bool(self.hellos))  # before its hello the board ignores commands
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -38,7 +40,7 @@ class Host:
         os.write(self._fd, data)
 
     def read(self) -> None:
-        """Take what has come, or wait a little for it."""
+        """Store the messages that have arrived. Wait up to 0.1 s for bytes."""
         if not select.select([self._fd], [], [], 0.1)[0]:
             return
         *frames, self._rest = (self._rest + os.read(self._fd, 1 << 16)).split(b"\0")
@@ -58,25 +60,26 @@ class Host:
                 self.acks.append(Ack.decode(packet))
 
     def until(self, condition: Callable[[], bool]) -> None:
+        """Read until the condition is true."""
         deadline = time.monotonic() + LONG_S
         while not condition():
             assert time.monotonic() < deadline, "the board did not bring what was wanted"
             self.read()
 
     def take(self, samples: int) -> list[SampleMessage]:
-        """The next ``samples`` samples."""
+        """Wait for the next ``samples`` samples. Return them."""
         begin = len(self.samples)
         self.until(lambda: len(self.samples) >= begin + samples)
         return self.samples[begin : begin + samples]
 
     def hello(self) -> Hello:
-        """The next hello."""
+        """Wait for the next hello. Return it."""
         begin = len(self.hellos)
         self.until(lambda: len(self.hellos) > begin)
         return self.hellos[begin][1]
 
     def ask(self, command: bytes) -> Ack:
-        """The answer to a command."""
+        """Send a command. Return its acknowledgment."""
         begin = len(self.acks)
         self.send(command)
         self.until(lambda: len(self.acks) > begin)

@@ -1,7 +1,7 @@
-// The board's own headers on the host. A line in, a line out:
-//   sample|hello|ack NUMBER...   encodes the message, gives packet and frame in hexadecimal
-//   unframe HEX                  gives the packet without CRC of a frame without delimiter, "bad" when it is none
-//   timing RATE                  gives pairs of conversions in a window, its length in ns, aux readings in one
+// Headers of the firmware on the host. The program answers each input line with one output line:
+//   sample|hello|ack NUMBER...   packet and frame of the message in hexadecimal
+//   unframe HEX                  packet without CRC of a frame without delimiter; "bad" for an invalid frame
+//   timing RATE                  pairs of conversions in a window, length of the window in ns, auxiliary readings in it
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

@@ -1,4 +1,4 @@
-"""``bms-estimator board`` and the firmware."""
+"""Command ``bms-estimator board`` with the firmware in simavr: calibration, gains and serial number."""
 
 from pathlib import Path
 
@@ -15,16 +15,16 @@ from tests.simavr_board import SimavrBoard, write_readings
 pytestmark = pytest.mark.usefixtures("firmware")
 
 
-def measured(host: Host) -> tuple[float, float]:
-    """Mean voltage and current of the next fifty samples [V], [A]."""
-    host.take(1)  # at a frame's end: another reader may have taken a part of one
+def mean_values(host: Host) -> tuple[float, float]:
+    """Return the mean voltage [V] and current [A] of the next fifty samples."""
+    host.take(1)  # another reader may have taken the beginning of this frame
     host.send(hello_command())
     hello = host.hello()
     block = FrameDecoder().feed(0.0, b"".join([hello.encode(), *(s.encode() for s in host.take(50))]))
     return block["voltage_v"].mean(), block["current_a"].mean()
 
 
-def test_a_board_whose_bandgap_was_wrong_measures_right_once_its_aref_was_told(
+def test_board_with_a_wrong_bandgap_is_calibrated_by_the_voltage_at_aref(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
@@ -32,31 +32,31 @@ def test_a_board_whose_bandgap_was_wrong_measures_right_once_its_aref_was_told(
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 22.2, 25.0)])
     with SimavrBoard(readings, avcc_mv=4750) as board, Host(board.path) as host:
         assert host.ask(set_bandgap_command(1.02)).value == 1_020_000
-        assert measured(host) == pytest.approx(
+        assert mean_values(host) == pytest.approx(
             (22.2 * 1.02 / 1.1, 2.5), rel=5e-3
         )  # a ratiometric sensor needs no bandgap
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as exit_info:
             main(["board", board.path, "--aref-v", "4.75", "--serial", "77"])
         out, err = capsys.readouterr()
-        assert (ended.value.code or 0, err) == (0, "")
+        assert (exit_info.value.code or 0, err) == (0, "")
         assert "bandgap: was 1.0200 V, now 1." in out
         assert "serial: was 00000000, now 0000004d" in out
-        assert measured(host) == pytest.approx((22.2, 2.5), rel=5e-3)
+        assert mean_values(host) == pytest.approx((22.2, 2.5), rel=5e-3)
         hello = host.hellos[-1][1]
     assert hello.bandgap_uv == pytest.approx(1_100_000, rel=1e-3)
     assert hello.serial == 77
 
 
-def test_gains_that_differ_from_the_drawings_are_set_once_and_used_from_then_on(
+def test_configured_divider_and_slope_are_stored_and_used(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 20.0, 25.0)])
     with SimavrBoard(readings) as board, Host(board.path) as host:
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as exit_info:
             main(["board", board.path, "--divider", "5", "--volts-per-ampere", "0.05", "--absolute"])
         out, err = capsys.readouterr()
-        assert (ended.value.code or 0, err) == (0, "")
+        assert (exit_info.value.code or 0, err) == (0, "")
         assert "divider: was 6.1, now 5\n" in out
         assert "current: was 0.1 V/A at 5 V, ratiometric, now 0.05 V/A\n" in out
-        assert measured(host) == pytest.approx((20.0 * 5.0 / 6.1, 5.0), rel=5e-3)
+        assert mean_values(host) == pytest.approx((20.0 * 5.0 / 6.1, 5.0), rel=5e-3)

@@ -40,20 +40,23 @@ from tests.simavr_board import FIRMWARE, SimavrBoard, write_readings
 
 pytestmark = pytest.mark.usefixtures("firmware")
 
-FLAT_OUT = math.inf
+MAX_SPEED = math.inf
+"""Simulation as fast as the computer allows."""
 STEADY = [(0.0, 2.5, 22.2, 25.0)]
+"""Constant readings: time [s], current [A], voltage [V], temperature [C]."""
+DIVIDER = 6.1
 AUX_SETTLING = 3
-"""Conversions of an aux input before those that count."""
+"""Number of conversions of an auxiliary input that are discarded before those that count."""
 
 Start = Callable[..., Host]
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Start a board with readings and options; gives its host."""
+    """Return a function that starts a board with readings and options, and returns its host."""
     with ExitStack() as stack:
 
-        def begin(readings: Sequence[tuple[float, ...]] = STEADY, speed: float = FLAT_OUT, **options: Any) -> Host:
+        def begin(readings: Sequence[tuple[float, ...]] = STEADY, speed: float = MAX_SPEED, **options: Any) -> Host:
             file = write_readings(tmp_path / "readings.csv", readings)
             board = stack.enter_context(SimavrBoard(file, speed=speed, **options))
             return stack.enter_context(Host(board.path))
@@ -62,12 +65,12 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def means(samples: list[SampleMessage]) -> tuple[float, float]:
-    """Mean conversion of voltage and of current."""
+    """Return the mean conversions of voltage and current."""
     pairs = sum(s.count for s in samples)
     return sum(s.voltage_sum for s in samples) / pairs, sum(s.current_sum for s in samples) / pairs
 
 
-def test_the_hello_comes_before_the_first_sample_and_tells_how_the_board_is_built(start: Start) -> None:
+def test_hello_precedes_the_first_sample_and_describes_the_board(start: Start) -> None:
     host = start()
     host.take(1)
     before, hello = host.hellos[0]
@@ -83,15 +86,15 @@ def test_the_hello_comes_before_the_first_sample_and_tells_how_the_board_is_buil
 
 
 @pytest.mark.parametrize("mcu", ["atmega2560", "atmega32u4", "atmega328"])
-def test_it_does_not_compile_for_another_chip_and_says_why(tmp_path: Path, mcu: str) -> None:
+def test_compilation_for_another_chip_fails_with_a_reason(tmp_path: Path, mcu: str) -> None:
     target = tmp_path / "bms_board.ino.o"
     command = ["make", "--silent", "-C", FIRMWARE, f"MCU={mcu}", f"BUILD={tmp_path}", target]
-    made = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert made.returncode != 0
-    assert "This firmware is for an ATmega328P at 16 MHz" in made.stderr
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert process.returncode != 0
+    assert "This firmware is for an ATmega328P at 16 MHz" in process.stderr
 
 
-def test_a_hello_on_request_tells_where_the_board_is(start: Start) -> None:
+def test_requested_hello_has_the_next_sequence_number(start: Start) -> None:
     host = start()
     host.take(50)
     host.send(hello_command())
@@ -101,7 +104,7 @@ def test_a_hello_on_request_tells_where_the_board_is(start: Start) -> None:
     assert hello.board_us == host.samples[at - 1].board_us
 
 
-def test_samples_are_ten_milliseconds_apart_to_the_microsecond(start: Start) -> None:
+def test_sample_period_is_exactly_10_ms(start: Start) -> None:
     host = start()
     host.take(1000)
     samples = host.samples[:1000]
@@ -110,8 +113,8 @@ def test_samples_are_ten_milliseconds_apart_to_the_microsecond(start: Start) -> 
 
 
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 20), (1000, 6)])
-def test_the_boards_clock_is_the_clock_that_triggers_the_converter(start: Start, rate_hz: int, seconds: int) -> None:
-    """A signal with a period of a second changes in the same conversion of the same window each time: no slot is lost."""
+def test_board_clock_and_adc_trigger_do_not_drift_apart(start: Start, rate_hz: int, seconds: int) -> None:
+    """A signal with a period of one second changes at the same conversion of each second, so that no conversion is lost."""
     changes = [(0.5 * i + 0.0004, 0.0, 12.0 if i % 2 else 16.0, 25.0) for i in range(2 * seconds)]
     host = start([(0.0, 0.0, 12.0, 25.0), *changes], noise_lsb=0.0)
     host.ask(set_rate_command(rate_hz))
@@ -123,12 +126,12 @@ def test_the_boards_clock_is_the_clock_that_triggers_the_converter(start: Start,
 
 
 @pytest.mark.parametrize("rate_hz", [1, 7, 10, 300, 999, 1000])
-def test_every_rate_has_its_exact_period_from_the_next_sample_on(start: Start, rate_hz: int) -> None:
+def test_each_rate_has_its_exact_period_after_the_next_samples(start: Start, rate_hz: int) -> None:
     host = start()
     pairs, period_ns = compute_window(rate_hz)
     ack = host.ask(set_rate_command(rate_hz))
     assert (ack.command, ack.result, ack.value) == (MessageType.COMMAND_SET_RATE, AckResult.OK, period_ns)
-    host.take(2)  # the window that had begun, and one that may have ended before the command
+    host.take(2)  # the current window, and one that may have ended before the command
     samples = host.take(min(2 * rate_hz, 1500) + 1)
     assert [s.sequence for s in samples] == list(range(samples[0].sequence, samples[0].sequence + len(samples)))
     assert all(2 * s.count + bool(s.aux_count) * (AUX_SETTLING + s.aux_count) == 2 * pairs for s in samples)
@@ -142,8 +145,8 @@ def test_every_rate_has_its_exact_period_from_the_next_sample_on(start: Start, r
 
 
 @pytest.mark.parametrize("rate_hz", [1, 10])
-def test_at_low_rates_the_reference_is_as_steady_as_at_high_ones(start: Start, rate_hz: int) -> None:
-    """A time constant of seconds leaves few samples to average: each holds many readings of the bandgap."""
+def test_reference_has_low_noise_at_low_rates(start: Start, rate_hz: int) -> None:
+    """Few samples fall into the time constant of seconds. Therefore each contains many readings of the bandgap."""
     host, decoder = start(), FrameDecoder()
     host.ask(set_rate_command(rate_hz))
     decoder.feed(0.0, host.hellos[0][1].encode())
@@ -155,26 +158,26 @@ def test_at_low_rates_the_reference_is_as_steady_as_at_high_ones(start: Start, r
 
 
 @pytest.mark.parametrize("rate_hz", [0, 1001, 65535])
-def test_a_rate_out_of_range_changes_nothing(start: Start, rate_hz: int) -> None:
+def test_rate_out_of_range_is_rejected(start: Start, rate_hz: int) -> None:
     host = start()
     ack = host.ask(command(MessageType.COMMAND_SET_RATE, rate_hz.to_bytes(2, "little")))
     assert (ack.result, ack.value) == (AckResult.BAD_VALUE, 10_000_000)
 
 
 @pytest.mark.parametrize("avcc_mv", [5000, 4750])
-def test_what_is_fed_is_measured_within_the_converters_resolution_at_any_supply(start: Start, avcc_mv: int) -> None:
-    fed = [(0.0, 0.0), (-20.0, 3.0), (20.0, 23.0), (1.234, 22.2), (0.01, 12.345)]
-    host = start([(0.5 * i, *reading, 25.0) for i, reading in enumerate(fed)], avcc_mv=avcc_mv)
-    host.take(len(fed) * 50)
+def test_readings_are_measured_within_the_resolution_of_the_adc_at_any_supply(start: Start, avcc_mv: int) -> None:
+    readings = [(0.0, 0.0), (-20.0, 3.0), (20.0, 23.0), (1.234, 22.2), (0.01, 12.345)]
+    host = start([(0.5 * i, *reading, 25.0) for i, reading in enumerate(readings)], avcc_mv=avcc_mv)
+    host.take(len(readings) * 50)
     decoder = FrameDecoder()
     block = decoder.feed(0.0, b"".join([host.hellos[0][1].encode(), *(s.encode() for s in host.samples)]))
     assert decoder.reference_v == pytest.approx(avcc_mv * 1e-3, rel=3e-4)
     volt_step = decoder.reference_v / 1024
-    for i, (current_a, voltage_v) in enumerate(fed):
-        part = block[50 * i + 10 : 50 * i + 40]
-        for name, truth, step in (("voltage_v", voltage_v, 6.1 * volt_step), ("current_a", current_a, 50.0 / 1024)):
+    for i, (current_a, voltage_v) in enumerate(readings):
+        part = block[50 * i + 10 : 50 * i + 40]  # the samples at the changes of the readings are not compared
+        for name, truth, step in (("voltage_v", voltage_v, DIVIDER * volt_step), ("current_a", current_a, 50.0 / 1024)):
             if name == "voltage_v" and truth == 0.0:
-                continue  # noise below zero is cut off by the converter
+                continue  # the ADC clips noise below zero, so that the mean is too high
             assert np.abs(part[name] - truth).max() < 1.0 * step
             assert abs(part[name].mean() - truth) < 0.2 * step + 3e-4 * abs(truth)
 
@@ -188,23 +191,23 @@ def test_what_is_fed_is_measured_within_the_converters_resolution_at_any_supply(
         (24.0, 30.0, 0),
     ],
 )
-def test_readings_beyond_the_converters_range_are_marked(
+def test_readings_outside_the_range_of_the_adc_are_marked_as_saturated(
     start: Start, current_a: float, voltage_v: float, bits: int
 ) -> None:
     marks = BoardStatus.VOLTAGE_SATURATED | BoardStatus.CURRENT_SATURATED
     assert {s.status & marks for s in start([(0.0, current_a, voltage_v, 25.0)]).take(20)} == {bits}
 
 
-def test_the_ntc_is_read_by_turns_with_the_bandgap(start: Start) -> None:
+def test_temperature_of_the_ntc_is_measured(start: Start) -> None:
     decoder = FrameDecoder()
-    fed = [-20.0, 25.0, 60.0]
-    host = start([(4.0 * i, 0.0, 22.2, celsius) for i, celsius in enumerate(fed)])
+    temperatures_c = [-20.0, 25.0, 60.0]
+    host = start([(4.0 * i, 0.0, 22.2, celsius) for i, celsius in enumerate(temperatures_c)])
     host.take(1200)
     block = decoder.feed(0.0, b"".join([host.hellos[0][1].encode(), *(s.encode() for s in host.samples)]))
-    assert block["temperature_c"][[380, 780, 1180]] == pytest.approx(fed, abs=0.3)
+    assert block["temperature_c"][[380, 780, 1180]] == pytest.approx(temperatures_c, abs=0.3)
 
 
-def test_without_an_ntc_only_the_bandgap_is_read(start: Start) -> None:
+def test_board_without_an_ntc_reads_only_the_bandgap(start: Start) -> None:
     host = start([(0.0, 0.0, 22.2)])
     samples = host.take(20)
     assert not host.hellos[0][1].channels & Channels.NTC
@@ -212,7 +215,7 @@ def test_without_an_ntc_only_the_bandgap_is_read(start: Start) -> None:
     assert np.mean([s.aux_sum for s in samples]) == pytest.approx(1.1 / 5.0 * 1024, abs=1.0)
 
 
-def test_a_restart_is_a_watchdog_reset_and_what_is_kept_in_eeprom_survives_it(start: Start) -> None:
+def test_restart_is_a_watchdog_reset_and_settings_in_the_eeprom_survive_it(start: Start) -> None:
     host = start([(0.0, 0.8, 22.2, 25.0)])
     first = host.hellos[0][1]
     zero = host.ask(zero_current_command())
@@ -223,7 +226,7 @@ def test_a_restart_is_a_watchdog_reset_and_what_is_kept_in_eeprom_survives_it(st
     assert host.ask(set_divider_command(5.0123)).value == 5_012_300
     assert host.ask(set_current_slope_command(0.025)).value == 25_000
     assert host.ask(set_ratiometric_command(0)).value == 0
-    host.take(20)  # an EEPROM takes 3.4 ms for a byte
+    host.take(20)  # 200 ms, because writing a byte of the EEPROM takes 3.4 ms
     assert host.ask(command(MessageType.COMMAND_RESTART)).result == AckResult.OK
     host.until(lambda: len(host.hellos) == 2)
     hello = host.hellos[1][1]
@@ -237,29 +240,29 @@ def test_a_restart_is_a_watchdog_reset_and_what_is_kept_in_eeprom_survives_it(st
     assert sample.status >> 4 == ResetCause.WATCHDOG
 
 
-def test_the_decoder_goes_on_across_a_restart(start: Start) -> None:
+def test_sample_times_increase_across_a_restart(start: Start) -> None:
     host = start()
     host.take(100)
     host.ask(command(MessageType.COMMAND_RESTART))
     host.until(lambda: len(host.hellos) == 2)
     host.take(100)
-    decoder, (cut, hello) = FrameDecoder(), host.hellos[-1]
+    decoder, (samples_before_restart, hello) = FrameDecoder(), host.hellos[-1]
     decoder.feed(0.0, host.hellos[0][1].encode())
-    before = decoder.feed(1.0, b"".join(s.encode() for s in host.samples[:cut]))
-    after = decoder.feed(1.5, hello.encode() + b"".join(s.encode() for s in host.samples[cut:]))
+    before = decoder.feed(1.0, b"".join(s.encode() for s in host.samples[:samples_before_restart]))
+    after = decoder.feed(1.5, hello.encode() + b"".join(s.encode() for s in host.samples[samples_before_restart:]))
     assert decoder.counters.resets == 1
     assert decoder.counters.frames_lost == 0
     assert after["status"][0] & SampleStatus.RESET
     assert after["time_s"][0] > before["time_s"][-1]
 
 
-def test_a_sensor_far_from_its_middle_is_no_zero(start: Start) -> None:
+def test_current_zero_far_from_mid_scale_is_rejected(start: Start) -> None:
     host = start([(0.0, 8.0, 22.2, 25.0)])
     ack = host.ask(zero_current_command())
     assert (ack.result, ack.value) == (AckResult.BAD_VALUE, 500_000)
 
 
-def test_a_second_zero_is_refused_while_the_first_is_measured(start: Start) -> None:
+def test_second_zero_command_is_rejected_while_the_first_is_in_progress(start: Start) -> None:
     host = start()
     assert host.ask(zero_current_command() * 2).result == AckResult.BUSY
     host.until(lambda: len(host.acks) == 2)
@@ -267,7 +270,7 @@ def test_a_second_zero_is_refused_while_the_first_is_measured(start: Start) -> N
 
 
 @pytest.mark.parametrize(
-    ("wanted", "kept"),
+    ("set_command", "old_value"),
     [
         (set_bandgap_command(1.3), 1_100_000),
         (set_divider_command(0.99), 6_100_000),
@@ -277,14 +280,14 @@ def test_a_second_zero_is_refused_while_the_first_is_measured(start: Start) -> N
         (set_ratiometric_command(2), 1),
     ],
 )
-def test_a_value_that_no_board_has_is_refused(start: Start, wanted: bytes, kept: int) -> None:
-    ack = start().ask(wanted)
-    assert (ack.result, ack.value) == (AckResult.BAD_VALUE, kept)
+def test_implausible_value_is_rejected(start: Start, set_command: bytes, old_value: int) -> None:
+    ack = start().ask(set_command)
+    assert (ack.result, ack.value) == (AckResult.BAD_VALUE, old_value)
 
 
 @pytest.mark.parametrize("rates_hz", [(801, 1000), (667, 999), (1, 900)])
-def test_slots_get_shorter_wherever_the_counter_stands(start: Start, rates_hz: tuple[int, int]) -> None:
-    """The simulator ends where the chip would miss the compare, and with it 4 ms that the board's clock does not see."""
+def test_increase_of_the_rate_misses_no_timer_compare(start: Start, rates_hz: tuple[int, int]) -> None:
+    """The simulator aborts at a missed compare, which would cost the chip 4 ms that its clock does not count."""
     host = start()
     for i in range(10):
         for rate_hz in rates_hz:
@@ -292,21 +295,21 @@ def test_slots_get_shorter_wherever_the_counter_stands(start: Start, rates_hz: t
             host.take(2 + i % 3)
 
 
-def test_a_restart_asks_nothing_of_the_boot_loader(start: Start) -> None:
-    """The simulator ends at a reset by the watchdog, in which a Nano's old boot loader hangs."""
+def test_restart_does_not_depend_on_the_boot_loader(start: Start) -> None:
+    """The simulator aborts at a real watchdog reset, because the old boot loader of a Nano would hang in it."""
     host = start()
     for restarts in range(1, 4):
         host.take(30)
         host.ask(set_rate_command(1000))
         host.ask(command(MessageType.COMMAND_RESTART))
-        host.until(lambda wanted=restarts: len(host.hellos) > wanted)
+        host.until(lambda count=restarts: len(host.hellos) > count)
         assert host.hellos[-1][1].reset_cause == ResetCause.WATCHDOG
         samples = host.take(20)
         assert [s.sequence for s in samples[-10:]] == list(range(samples[-10].sequence, samples[-10].sequence + 10))
     assert len({hello.boot_id for _, hello in host.hellos}) == 4
 
 
-def test_garbage_is_ignored_and_the_next_command_is_heard(start: Start) -> None:
+def test_garbage_is_ignored_and_the_next_command_is_executed(start: Start) -> None:
     host = start()
     good = set_serial_command(7)
     wrong_crc = seal(b"\x01\x14\x09\0\0\0")[:-2] + b"\x01\0"
@@ -319,7 +322,7 @@ def test_garbage_is_ignored_and_the_next_command_is_heard(start: Start) -> None:
     assert host.bad == []
 
 
-def test_commands_of_other_versions_and_unknown_ones_are_answered_as_such(start: Start) -> None:
+def test_commands_of_other_versions_and_unknown_commands_are_rejected_with_the_reason(start: Start) -> None:
     host = start()
     other = host.ask(seal(bytes((PROTOCOL_VERSION + 1, MessageType.COMMAND_SET_RATE, 1, 0))))
     assert (other.result, other.value) == (AckResult.OTHER_VERSION, PROTOCOL_VERSION)
@@ -328,7 +331,7 @@ def test_commands_of_other_versions_and_unknown_ones_are_answered_as_such(start:
     assert host.ask(short).result == AckResult.UNKNOWN_COMMAND
 
 
-def test_a_line_without_room_loses_samples_but_never_their_time(start: Start) -> None:
+def test_overrun_of_the_line_loses_samples_but_their_times_remain_correct(start: Start) -> None:
     host = start(speed=1.0)
     host.ask(set_rate_command(1000))
     host.send(hello_command() * 400)
@@ -340,13 +343,13 @@ def test_a_line_without_room_loses_samples_but_never_their_time(start: Start) ->
     assert all((step > 1) == bool(b.status & BoardStatus.OVERRUN) for step, b in steps)
     inner = [(at, hello.sequence) for at, hello in host.hellos if 0 < at < len(host.samples)]
     assert len(inner) > 10
-    assert all(host.samples[at - 1].sequence < told <= host.samples[at].sequence for at, told in inner)
+    assert all(host.samples[at - 1].sequence < sequence <= host.samples[at].sequence for at, sequence in inner)
     last, first = host.samples[-1], host.samples[-400]
     assert last.board_us - first.board_us == 1000 * (last.sequence - first.sequence)
     assert host.bad == []
 
 
-async def test_the_services_own_source_sets_the_rate_and_reads(tmp_path: Path) -> None:
+async def test_serial_source_sets_the_rate_and_reads_the_samples(tmp_path: Path) -> None:
     readings = write_readings(tmp_path / "readings.csv", STEADY)
     with SimavrBoard(readings) as simulated:
         settings = SensorSettings(port=simulated.path, sample_rate_hz=250)

@@ -1,4 +1,4 @@
-"""A simulated board does not outlive the program that started it, however that ends."""
+"""End of a simulated board when the program that started it is killed."""
 
 import os
 import subprocess
@@ -9,8 +9,8 @@ from pathlib import Path
 from tests.patience import LONG_S
 from tests.simavr_board import ELF, SIMULATOR, write_readings
 
-# Pid and terminal go to two pipes: on one, either line may come first.
-START = """
+# The PID and the path of the terminal are written to two pipes, because on one pipe their order would be random.
+PARENT_SCRIPT = """
 import subprocess, sys
 board = subprocess.Popen(sys.argv[1:], stdout=sys.stderr)
 print(board.pid, flush=True)
@@ -20,7 +20,7 @@ board.wait()
 
 def test_simulator_ends_when_its_parent_is_killed(firmware: None, tmp_path: Path) -> None:
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 0.1, 3.8)])
-    command = [sys.executable, "-c", START, SIMULATOR, ELF, "--readings", readings]
+    command = [sys.executable, "-c", PARENT_SCRIPT, SIMULATOR, ELF, "--readings", readings]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, **pipes) as parent:
         assert parent.stdout
@@ -31,12 +31,13 @@ def test_simulator_ends_when_its_parent_is_killed(firmware: None, tmp_path: Path
         finally:
             parent.kill()
     deadline = time.monotonic() + LONG_S
-    while alive(board):
+    while is_alive(board):
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
-def alive(pid: int) -> bool:
+def is_alive(pid: int) -> bool:
+    """Return True if the process exists and is no zombie."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

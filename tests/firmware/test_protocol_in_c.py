@@ -1,4 +1,4 @@
-"""The board's own headers, compiled on the host, against the shared vectors and the host's arithmetic."""
+"""Headers of the firmware, compiled for the host and compared with the shared test vectors and the Python code."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ InC = Callable[[Sequence[str]], list[str]]
 
 @pytest.fixture(scope="session")
 def in_c(tmp_path_factory: pytest.TempPathFactory) -> InC:
-    """Answers lines as protocol_on_host.c says."""
+    """Return a function that sends lines to protocol_on_host.c and returns its output lines."""
     compiler = shutil.which("gcc")
     if compiler is None:
         pytest.skip("no gcc here: make apt")
@@ -28,33 +28,33 @@ def in_c(tmp_path_factory: pytest.TempPathFactory) -> InC:
     strict = ("-std=c11", "-Wall", "-Wextra", "-Werror", "-fsanitize=undefined", "-fno-sanitize-recover=all")
     subprocess.run([compiler, *strict, "-I", FIRMWARE / "bms_board", source, "-o", program], check=True)
 
-    def answer(questions: Sequence[str]) -> list[str]:
-        ran = subprocess.run([program], input="\n".join(questions), capture_output=True, text=True, check=True)
-        return ran.stdout.splitlines()
+    def run_lines(lines: Sequence[str]) -> list[str]:
+        process = subprocess.run([program], input="\n".join(lines), capture_output=True, text=True, check=True)
+        return process.stdout.splitlines()
 
-    return answer
+    return run_lines
 
 
 def test_messages_are_encoded_byte_for_byte(in_c: InC) -> None:
-    def question(vector: dict[str, Any]) -> str:
+    def input_line(vector: dict[str, Any]) -> str:
         return " ".join([vector["message"], *map(str, vector["fields"].values())])
 
     vectors = VECTORS["messages"]
-    assert in_c([question(v) for v in vectors]) == [f"{v['packet']} {v['frame']}" for v in vectors]
+    assert in_c([input_line(v) for v in vectors]) == [f"{v['packet']} {v['frame']}" for v in vectors]
 
 
 @pytest.mark.parametrize("kind", ["messages", "commands"])
-def test_good_frames_are_unpacked(in_c: InC, kind: str) -> None:
+def test_valid_frames_are_decoded(in_c: InC, kind: str) -> None:
     vectors = VECTORS[kind]
     assert in_c([f"unframe {v['frame'][:-2]}" for v in vectors]) == [v["packet"][:-4] for v in vectors]
 
 
-def test_bad_frames_are_refused(in_c: InC) -> None:
+def test_invalid_frames_are_rejected(in_c: InC) -> None:
     vectors = VECTORS["bad_frames"]
     assert in_c([f"unframe {v['frame'][:-2]}" for v in vectors]) == ["bad"] * len(vectors)
 
 
-def test_every_rate_divides_the_clock_as_the_virtual_board_does(in_c: InC) -> None:
+def test_timing_of_each_rate_equals_that_of_the_virtual_board(in_c: InC) -> None:
     rates = range(1, 1001)
     divided = ["{} {} {}".format(*compute_window(rate), compute_aux_count(rate)) for rate in rates]
     assert in_c([f"timing {rate}" for rate in rates]) == divided

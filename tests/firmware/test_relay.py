@@ -1,4 +1,4 @@
-"""The relay pin of the firmware: in simavr it cuts the load that the board measures."""
+"""Relay pin of the firmware in simavr, where it disconnects the load that the board measures."""
 
 import math
 import struct
@@ -14,7 +14,11 @@ from tests.simavr_board import SimavrBoard, write_readings
 
 pytestmark = pytest.mark.usefixtures("firmware")
 
-LOAD_A, STEPS_PER_A = 5.0, 1024 * 0.1 / 5.0
+LOAD_A = 5.0
+LSB_PER_A = 1024 * 0.1 / 5.0
+"""Conversion per current [LSB/A]: 10 bits, a slope of 0.1 V/A and a reference of 5 V."""
+ZERO_LSB = 512.0
+"""Conversion at zero current."""
 
 
 @pytest.fixture
@@ -25,10 +29,10 @@ def host(tmp_path: Path) -> Iterator[Host]:
 
 
 def current_a(host: Host) -> float:
-    """Once the window in which the pin may have moved is over."""
+    """Return the current after the window in which the pin may have changed [A]."""
     host.take(2)
     sample = host.take(1)[0]
-    return (sample.current_sum / sample.count - 512.0) / STEPS_PER_A
+    return (sample.current_sum / sample.count - ZERO_LSB) / LSB_PER_A
 
 
 def test_relay_pin_is_low_after_reset_and_follows_commands(host: Host) -> None:
@@ -53,16 +57,17 @@ def test_invalid_relay_word_changes_nothing(host: Host) -> None:
 
 
 @pytest.mark.parametrize("high", [True, False])
-def test_silent_host_sets_the_fallback_level(host: Host, high: bool) -> None:
+def test_silence_of_the_host_sets_the_fallback_level(host: Host, high: bool) -> None:
     host.ask(set_relay_command(Relay(high=high, high_when_silent=None, silent_s=2)))
     host.take(400)
     assert current_a(host) == pytest.approx(0.0 if high else LOAD_A, abs=0.1)
-    sent = len(host.samples)
+    samples_before_command = len(host.samples)
     host.ask(set_relay_command(Relay(high=high, high_when_silent=not high, silent_s=3)))
-    heard = len(host.samples)
-    samples = (*host.samples[sent:], *host.take(450))
-    cut = [abs(s.current_sum / s.count - 512.0) < 0.5 * LOAD_A * STEPS_PER_A for s in samples]
-    assert set(cut[2:290]) == {high}
-    assert set(cut[-100:]) == {not high}
-    turned = sent + cut.index(not high, 2)
-    assert sent + 300 <= turned <= heard + 310  # the board has heard it between the two
+    samples_before_ack = len(host.samples)
+    samples = (*host.samples[samples_before_command:], *host.take(450))
+    disconnected = [abs(s.current_sum / s.count - ZERO_LSB) < 0.5 * LOAD_A * LSB_PER_A for s in samples]
+    assert set(disconnected[2:290]) == {high}
+    assert set(disconnected[-100:]) == {not high}
+    samples_before_change = samples_before_command + disconnected.index(not high, 2)
+    # The board received the command between its sending and its acknowledgment. 3 s are 300 samples.
+    assert samples_before_command + 300 <= samples_before_change <= samples_before_ack + 310

@@ -1,4 +1,4 @@
-"""A real Chromium without a screen, for all tests of a module."""
+"""Headless Chromium, which all tests of a module share, and tabs with their console errors and requests."""
 
 import contextlib
 import shutil
@@ -46,8 +46,8 @@ class Tab:
 
     async def text(self, quantity: str) -> str:
         """Return the shown text of a quantity; empty if it is hidden."""
-        shown = self.page.locator(f'[data-q="{quantity}"]')
-        return await shown.inner_text() if await shown.is_visible() else ""
+        element = self.page.locator(f'[data-q="{quantity}"]')
+        return await element.inner_text() if await element.is_visible() else ""
 
     async def until(self, condition: str, argument: Any = None) -> None:
         """Wait until a JavaScript expression is true."""
@@ -57,11 +57,11 @@ class Tab:
         await self.until("text => document.getElementById('status').innerText.includes(text)", text)
 
     async def until_text(self, quantity: str, text: str) -> None:
-        """Wait until ``text`` returns this."""
+        """Wait until a quantity is shown with this text; empty: until the quantity is hidden."""
         await self.until(
             """([name, text]) => {
-                const shown = document.querySelector(`[data-q="${name}"]`);
-                return (shown.checkVisibility() ? shown.innerText : "") === text;
+                const element = document.querySelector(`[data-q="${name}"]`);
+                return (element.checkVisibility() ? element.innerText : "") === text;
             }""",
             [quantity, text],
         )

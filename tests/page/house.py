@@ -1,4 +1,4 @@
-"""The pack of the page's tests: the real service with a board that prints its cells, and programs that serve pages."""
+"""Service of a simulated pack whose board prints lines with cell voltages, and start of programs that serve pages."""
 
 import asyncio
 import contextlib
@@ -15,22 +15,22 @@ from tests.patience import LONG_S
 from tests.serial_line import Line
 
 Values = dict[str, Any]
-"""Lines of a board."""
+"""Values of a line of the board."""
 CELL, SERIES, PARALLEL = "ncr18650", 14, 10
 PACK = f'cell = "{CELL}"\nseries = {SERIES}\nparallel = {PARALLEL}\ninitial_soc = 0.6'
-"""Capacity of the simulated pack, as in its file."""
-UNEVEN_V = [1e-3 * d for d in (2, -1, 3, 0, -4, 1, 5, -2, 1, 2, -17, 1, 4, 5)]
-"""Deviations of the cells of a simulated pack from their mean [V]."""
+"""Section ``[pack]`` of the simulated pack."""
+CELL_DEVIATIONS_V = [1e-3 * d for d in (2, -1, 3, 0, -4, 1, 5, -2, 1, 2, -17, 1, 4, 5)]
+"""Deviations of the simulated cells from their mean [V]."""
 
 
 def simulated(load_a: float = 24.0, soc: float = 0.66) -> Callable[[float], Values]:
-    """A pack of a bicycle's size under changing loads; the eleventh cell is weak."""
+    """Return the values of an e-bike pack under changing loads, by time [s]. The eleventh cell has a low voltage."""
     pack = SimulatedPack(load_cell(CELL).pack(SERIES, PARALLEL), random_steps(load_a, 4), soc=soc)
 
-    def at(time_s: float) -> Values:
+    def values_at(time_s: float) -> Values:
         reading = pack(time_s)
         mean_v = reading.voltage_v / SERIES
-        cells = [round(mean_v + apart_v, 4) for apart_v in UNEVEN_V]
+        cells = [round(mean_v + deviation_v, 4) for deviation_v in CELL_DEVIATIONS_V]
         return {
             "voltage": round(sum(cells), 4),
             "current": round(reading.current_a, 3),
@@ -38,11 +38,11 @@ def simulated(load_a: float = 24.0, soc: float = 0.66) -> Callable[[float], Valu
             "cells": cells,
         }
 
-    return at
+    return values_at
 
 
-async def starting(folder: Path, *arguments: object, port: int) -> asyncio.subprocess.Process:
-    """Start a program that serves a page, and wait for it."""
+async def start_program(folder: Path, *arguments: object, port: int) -> asyncio.subprocess.Process:
+    """Start a program that serves a page, and wait until its port is open."""
     log = folder / f"{port}.log"
     with log.open("ab") as file:
         process = await asyncio.create_subprocess_exec(
@@ -63,17 +63,17 @@ async def starting(folder: Path, *arguments: object, port: int) -> asyncio.subpr
 
 
 class Service:
-    """The real service of one pack, whose board prints text.
+    """Service of one pack, whose board prints text.
 
     Args:
-        folder: For its files; its state is kept there, too.
-        broker: Where it publishes.
-        port: Of its page.
-        board: What the board prints, by the time since it began [s].
-        pack: What it is, as its file has it.
-        name: Of the pack.
+        folder: Folder of its files and its state.
+        broker: Broker to which the service publishes.
+        port: Port of its page.
+        board: Function of the time since its start [s] that returns the values of the board's line.
+        pack: Section ``[pack]`` without the name, TOML.
+        name: Name of the pack.
         more: Further settings, TOML; the first ones belong to ``[state]``.
-        rate_hz: How often the board prints and the service publishes.
+        rate_hz: Rate of the board's lines and of the publications [Hz].
     """
 
     def __init__(
@@ -123,9 +123,9 @@ folder = "{folder}"
         self._line.unplug()
 
     async def start(self, settings: str = "") -> None:
-        """Start the service, with more of a pack file if need be, TOML; until its page is served."""
+        """Start the service with further settings (TOML), and wait until its page is served."""
         self._pack.write_text(self._settings + settings)
-        self.process = await starting(self._folder, "run", "--no-view", self._pack, port=self._port)
+        self.process = await start_program(self._folder, "run", "--no-view", self._pack, port=self._port)
 
     async def kill(self) -> None:
         self.process.kill()

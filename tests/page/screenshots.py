@@ -1,6 +1,6 @@
-"""The pictures of the page for README: the real service of a simulated pack in a real Chromium; ``make screenshots``.
+"""Screenshots of the page for the documentation: service of a simulated pack in Chromium (``make screenshots``).
 
-A minute: long enough for the estimator to have learned something. The history of a day before is simulated, too.
+The history of the day before is simulated, too.
 """
 
 import asyncio
@@ -27,10 +27,12 @@ from tests.store.test_history import record
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
 LEARN_S = 60.0
-TOP = 500
-"""Height of the page that shows an alarm or stale values [px]."""
-SOC, CAPACITY_AH = 0.66, 30.0
-"""SOC of the pack at the end of its day, approximately."""
+"""Time before the first screenshot in which the estimator identifies the pack [s]."""
+TOP_PX = 500
+"""Height of the part of the page with alarms or stale values [px]."""
+SOC = 0.66
+"""Approximate SOC at the end of the simulated day."""
+CAPACITY_AH = 30.0
 ALARMS = """
 [alarms]
 cell_imbalance = {limit_v = 0.02, delay_s = 1, severity = "critical"}
@@ -38,17 +40,17 @@ soc_low = {limit = 0.9, delay_s = 1}
 """
 
 
-def yesterday() -> list[Snapshot]:
-    """A pack's day, minute by minute: the sun charges it, the evening uses it."""
+def make_day_before() -> list[Snapshot]:
+    """Return the snapshots of the last 24 hours, one per minute. The pack is charged by day and discharged at night."""
     assert ONE.estimate
     times = [time.time() - 60.0 * minute for minute in range(24 * 60, 0, -1)]
-    currents = [_current_a(each) for each in times]
-    socs = [-charge_a_min / 60.0 / CAPACITY_AH for charge_a_min in itertools.accumulate(currents)]
+    currents = [_current_a(time_s) for time_s in times]
+    soc_changes = [-charge_a_min / 60.0 / CAPACITY_AH for charge_a_min in itertools.accumulate(currents)]
     snapshots = []
-    for time_s, current_a, moved in zip(times, currents, socs, strict=True):
-        soc = SOC + moved - socs[-1]
+    for time_s, current_a, soc_change in zip(times, currents, soc_changes, strict=True):
+        soc = SOC + soc_change - soc_changes[-1]
         voltage_v = SERIES * (3.35 + 0.75 * soc - 5e-3 * current_a)
-        told = {
+        values = {
             "time": iso_utc(time_s),
             "board_time_s": time_s,
             "voltage_v": voltage_v,
@@ -58,12 +60,12 @@ def yesterday() -> list[Snapshot]:
             "soc_std": 0.012,
             "temperature_c": 24.0 - 0.5 * current_a,
         }
-        snapshots.append(ONE._replace(estimate=ONE.estimate.model_copy(update=told)))
+        snapshots.append(ONE._replace(estimate=ONE.estimate.model_copy(update=values)))
     return snapshots
 
 
 def _current_a(time_s: float) -> float:
-    """Current of a house: 8 h of sun."""
+    """Return the current of a house with a solar generator, which charges for 8 h a day."""
     hour = time_s % 86_400 / 3600.0
     return 0.9 + 0.3 * math.sin(time_s / 700.0) - 4.0 * max(0.0, 1.0 - ((hour - 12.5) / 4.0) ** 2)
 
@@ -73,13 +75,13 @@ async def shoot(opened: Tab, name: str, part: str = "", *, top: bool = False) ->
     if part:
         await opened.page.locator(part).screenshot(path=path)
     else:
-        await opened.page.screenshot(path=path, clip={"x": 0, "y": 0, "width": 1280, "height": TOP} if top else None)
+        await opened.page.screenshot(path=path, clip={"x": 0, "y": 0, "width": 1280, "height": TOP_PX} if top else None)
     sys.stdout.write(f"{path.relative_to(DOCS.parents[1])}: {path.stat().st_size / 1e3:.0f} kB\n")
 
 
 @contextlib.asynccontextmanager
-async def shown(browser: Browser, service: Service, **options: Any) -> AsyncIterator[Tab]:
-    """The page once its curves are drawn."""
+async def open_page(browser: Browser, service: Service, **options: Any) -> AsyncIterator[Tab]:
+    """Open the page and wait until its curves are drawn."""
     async with tab(browser, service.url, **options) as opened:
         await opened.until_status("live")
         await opened.until("() => document.querySelectorAll('.curve [aria-label]').length >= 4")
@@ -87,22 +89,22 @@ async def shown(browser: Browser, service: Service, **options: Any) -> AsyncIter
 
 
 async def shoot_all(service: Service, browser: Browser) -> None:
-    async with shown(browser, service) as opened:
+    async with open_page(browser, service) as opened:
         await asyncio.sleep(LEARN_S)
         await shoot(opened, "desktop")
         await shoot(opened, "cells", ".cells")
         await opened.page.get_by_text("Day", exact=True).click()
         await opened.page.get_by_role("img", name="Voltage, last day: from").wait_for()
         await shoot(opened, "day", ".curves")
-    async with shown(browser, service, size=PHONE, device_scale_factor=1.5) as opened:
+    async with open_page(browser, service, size=PHONE, device_scale_factor=1.5) as opened:
         await shoot(opened, "phone")
-    async with shown(browser, service, color_scheme="dark") as opened:
+    async with open_page(browser, service, color_scheme="dark") as opened:
         await shoot(opened, "dark")
         await service.kill()
         await opened.until_status("stale since")
         await shoot(opened, "stale", top=True)
     await service.start(ALARMS)
-    async with shown(browser, service) as opened:
+    async with open_page(browser, service) as opened:
         await opened.page.locator(".alarm").nth(1).wait_for()
         await asyncio.sleep(LEARN_S / 2)
         await shoot(opened, "alarm", top=True)
@@ -111,7 +113,7 @@ async def shoot_all(service: Service, browser: Browser) -> None:
 async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        await record(folder / "attic.sqlite", yesterday())
+        await record(folder / "attic.sqlite", make_day_before())
         broker = Broker(folder).start()
         try:
             async with Service(folder, broker, free_port(), simulated(soc=SOC)) as service, chromium() as browser:

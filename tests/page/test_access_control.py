@@ -19,7 +19,7 @@ TOKEN = "0123456789abcdef"
         ("pi.local:8765", "pi.local", 8765, False),
     ],
 )
-def test_an_address_is_read(text, host, port, loopback):
+def test_listen_address_is_parsed(text, host, port, loopback):
     listen = parse_listen(text)
     assert (listen.host, listen.port, listen.loopback) == (host, port, loopback)
 
@@ -38,14 +38,14 @@ def test_token_is_required_beyond_this_machine():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [(None, "cannot be read: No such file"), (b"short\n", "has 5 letters, must have 16"), (b"\xff" * 20, "not UTF-8")],
 )
-def test_invalid_token_is_reported(tmp_path, text, said):
+def test_invalid_token_is_reported(tmp_path, text, message):
     file = tmp_path / "token"
     if text is not None:
         file.write_bytes(text)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         make_access_control(PageSettings(listen="0.0.0.0:8765", token_file=file))
 
 
@@ -54,7 +54,7 @@ def test_newline_after_the_token_is_ignored(tmp_path):
     guard = make_access_control(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
     assert guard.is_valid_token(TOKEN)
     assert not any(guard.is_valid_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
-    assert not guard.is_valid_token("\udcff" * 16)  # as aiohttp has a header that is no UTF-8
+    assert not guard.is_valid_token("\udcff" * 16)  # aiohttp decodes a header that is not UTF-8 like this
     assert not guard.is_valid_cookie("\udcff" * 64)
     assert guard.is_valid_cookie(guard.cookie)
     assert not guard.is_valid_cookie(TOKEN)

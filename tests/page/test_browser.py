@@ -1,7 +1,7 @@
 """The page in a real Chromium: it shows the publications, and reports when they are not current.
 
-A real Mosquitto; the real service of a pack with four cells, whose page is one; the real ``dashboard`` of the broker, whose
-page is the other. A second pack on that broker is this test's own, so that it may publish anything.
+The tests use Mosquitto, the service of the pack ``attic`` with its own page, and the ``dashboard`` of the broker, which is
+the second page. The pack ``cellar`` is published by the tests themselves, so that they can publish any value.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from bms_estimator.settings.page import PageSettings
 from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
-from tests.page.house import Service, starting
+from tests.page.house import Service, start_program
 from tests.sinks.snapshots import ONE, STACK
 from tests.store.test_history import at, record
 
@@ -36,7 +36,7 @@ MINUS = "\N{MINUS SIGN}"
 PACK = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
 CELLS = (3.311, 3.325, 3.318, 3.322)
 CELLAR = "bms/cellar"
-ODD = {
+STATE_VALUES = {
     "soc": 0.4321,
     "soc_percent": 43.21,
     "soc_std": 0.0123,
@@ -57,7 +57,7 @@ ODD = {
     "stability_margin": 0.3532,
     "cells_v": [3.271, 3.2755, None, 3.2688],
 }
-SHOWN = {
+SHOWN_TEXTS = {
     "soc": "43.2",
     "soc_std": "2.5",
     "voltage_v": "52.35 V",
@@ -85,12 +85,18 @@ SHOWN = {
 
 
 class House(NamedTuple):
-    """All that runs."""
+    """Running programs, and a client of the broker.
+
+    Attributes:
+        broker: The broker.
+        service: Service of the pack ``attic``.
+        dashboard: URL of the dashboard.
+        live: Client that publishes the topics of the pack ``cellar``.
+    """
 
     broker: Broker
     service: Service
     dashboard: str
-    """User of the broker."""
     live: Listener
 
 
@@ -115,7 +121,7 @@ async def browser() -> AsyncIterator[Browser]:
 
 
 def board(_time_s: float) -> dict[str, Any]:
-    """It prints the same again and again."""
+    """Return the constant values that the board prints."""
     return {"voltage": sum(CELLS), "current": 2.5, "temperature": 21.5, "cells": CELLS}
 
 
@@ -125,7 +131,7 @@ async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
     port = free_port()
     async with Service(folder, broker, free_port(), board, pack=PACK) as service, Listener(broker) as live:
         arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
-        process = await starting(folder, "dashboard", *arguments, port=port)
+        process = await start_program(folder, "dashboard", *arguments, port=port)
         await publish(live, "availability", b"online")
         await publish(live, "sensor/availability", b"online")
         await publish(live, "info", ONE.info.model_copy(update={"device": "cellar"}).model_dump_json())
@@ -153,16 +159,16 @@ async def dashboard_of(browser: Browser, house: House, pack: str, **options: Any
         yield opened
 
 
-def of_clock(time: str) -> str:
+def format_time(time: str) -> str:
     """Format a time as a browser on this machine does."""
     return datetime.fromisoformat(time).astimezone().strftime("%H:%M:%S")
 
 
-async def test_what_is_on_the_page_is_what_was_published_with_its_units(browser: Browser, house: House) -> None:
+async def test_page_shows_the_published_values_with_units(browser: Browser, house: House) -> None:
     async with dashboard_of(browser, house, "cellar") as opened:
-        await publish_state(house.live, **ODD)
-        await opened.until_text("soc", SHOWN["soc"])
-        assert {name: await opened.text(name) for name in SHOWN} == SHOWN
+        await publish_state(house.live, **STATE_VALUES)
+        await opened.until_text("soc", SHOWN_TEXTS["soc"])
+        assert {name: await opened.text(name) for name in SHOWN_TEXTS} == SHOWN_TEXTS
         meter = opened.page.get_by_role("meter", name="State of charge")
         assert await meter.get_attribute("aria-valuenow") == "43"
         cell = opened.page.get_by_role("img", name="cell 4: 3.269 V, lowest")
@@ -173,7 +179,7 @@ async def test_what_is_on_the_page_is_what_was_published_with_its_units(browser:
         assert opened.errors == []
 
 
-async def test_what_is_not_known_is_not_shown(browser: Browser, house: House) -> None:
+async def test_unknown_values_are_hidden(browser: Browser, house: House) -> None:
     async with dashboard_of(browser, house, "cellar") as opened:
         state = await publish_state(house.live, soc_std=None, temperature_c=None, innovation_v=None, voltage_v=3.21)
         await opened.until_text("voltage_v", "3.210 V")
@@ -185,14 +191,16 @@ async def test_what_is_not_known_is_not_shown(browser: Browser, house: House) ->
         assert not await opened.page.locator(".hero").is_visible()  # a fuel cell has no state of charge
         for key in set(state) - {"time", "voltage_v"}:
             state.pop(key)
-        await publish_state(house.live, **dict.fromkeys(ODD))
+        await publish_state(house.live, **dict.fromkeys(STATE_VALUES))
         await opened.until_text("voltage_v", "")
         body = await opened.page.inner_text("body")
         assert not re.search("NaN|undefined|null|Infinity", body)
         assert opened.errors == []
 
 
-async def test_the_pack_of_a_service_is_shown_by_both_alike_and_by_nobody_else(browser: Browser, house: House) -> None:
+async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_nothing_from_elsewhere(
+    browser: Browser, house: House
+) -> None:
     parameters = await house.live.wait_json("bms/attic/parameters")
     async with tab(browser, house.service.url) as own, dashboard_of(browser, house, "attic") as other:
         for opened in (own, other):
@@ -207,10 +215,12 @@ async def test_the_pack_of_a_service_is_shown_by_both_alike_and_by_nobody_else(b
             assert re.fullmatch(r"\d+ h \d\d min", await opened.text("time_left"))
             assert await opened.text("celllow") == "3.311 V · cell 1"
             assert "in series" in await opened.page.inner_text("#what")
-            await opened.until("count => document.querySelectorAll('#params tr').length === count", len_of(parameters))
+            await opened.until(
+                "count => document.querySelectorAll('#params tr').length === count", count_parameters(parameters)
+            )
             row = opened.page.locator('[data-p="a a1"]')
             text = (await row.locator("td").nth(0).inner_text()).replace(MINUS, "-")
-            await house.live.wait_json("bms/attic/parameters", lambda p: as_shown(p["a"]["a1"]) == text)  # noqa: B023
+            await house.live.wait_json("bms/attic/parameters", lambda p: format_parameter(p["a"]["a1"]) == text)  # noqa: B023
             await opened.until_status("live")
             assert opened.errors == []
             origin = "/".join(opened.page.url.split("/")[:3])
@@ -219,7 +229,7 @@ async def test_the_pack_of_a_service_is_shown_by_both_alike_and_by_nobody_else(b
         assert await other.page.get_by_role("tab").count() == 2
 
 
-def as_shown(parameter: dict[str, Any]) -> str:
+def format_parameter(parameter: dict[str, Any]) -> str:
     """Format a value to the two digits of its standard deviation, or to four without one."""
     if parameter["std"] is None:
         return f"{parameter['value']:.4g}"
@@ -227,11 +237,11 @@ def as_shown(parameter: dict[str, Any]) -> str:
     return f"{parameter['value']:.{decimals}f}"
 
 
-def len_of(parameters: dict[str, Any]) -> int:
+def count_parameters(parameters: dict[str, Any]) -> int:
     return sum(len(parameters[group]) for group in ("a", "elements", "state_of_health"))
 
 
-async def test_two_packs_are_changed_between_by_the_keyboard_alone(browser: Browser, house: House) -> None:
+async def test_pack_is_selected_by_keyboard(browser: Browser, house: House) -> None:
     async with dashboard_of(browser, house, "attic") as opened:
         page = opened.page
         await page.keyboard.press("Tab")
@@ -265,10 +275,10 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
     )
     async with dashboard_of(browser, house, "cellar") as opened:
         await publish(house.live, "alarm/cell_under_voltage", alarm.model_dump_json())
-        shown = opened.page.get_by_role("alert").locator(".alarm")
-        await shown.wait_for()
-        text = await shown.inner_text()
-        for said in (
+        element = opened.page.get_by_role("alert").locator(".alarm")
+        await element.wait_for()
+        text = await element.inner_text()
+        for part in (
             "under voltage",
             "cell 3 has 2.412 V: stop discharging",
             "2.412 V",
@@ -276,14 +286,14 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
             "critical",
             "latched",
         ):
-            assert said in text
+            assert part in text
         quiet = alarm.model_copy(update={"active": False, "latched": False, "since": None, "value": None, "text": ""})
         await publish(house.live, "alarm/cell_under_voltage", quiet.model_dump_json())
-        await shown.wait_for(state="detached")
+        await element.wait_for(state="detached")
         unwatched = quiet.model_copy(update={"watched": False, "unwatched_reason": "cell voltages are missing"})
         await publish(house.live, "alarm/cell_under_voltage", unwatched.model_dump_json())
-        await shown.wait_for()
-        text = await shown.inner_text()
+        await element.wait_for()
+        text = await element.inner_text()
         assert "cell voltages are missing" in text
         assert "cannot be watched" in text
         await publish(house.live, "alarm/cell_under_voltage", b"")
@@ -317,10 +327,10 @@ async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(bro
         assert opened.errors == []
 
 
-async def test_a_pack_with_an_alarm_appears_among_foreign_names_and_stands_first(
+async def test_pack_with_an_alarm_is_listed_first_among_too_many_packs(
     browser: Browser, broker: Broker, folder: Path
 ) -> None:
-    """On a dashboard of its own, as foreign names would stay on the other one."""
+    """The test has a dashboard of its own, because the many packs would remain on the other one."""
     settings = MqttSettings(url=broker.url, base_topic="crowd")
     alarm = Alarm(
         name="over_temperature",
@@ -367,21 +377,21 @@ async def test_history_is_drawn_for_each_span(browser: Browser, house: House, fo
         assert opened.errors == []
 
 
-async def test_where_no_history_is_kept_it_says_so(browser: Browser, house: House) -> None:
+async def test_missing_history_is_reported(browser: Browser, house: House) -> None:
     await house.live.publish("bms/guest/availability", b"online", qos=1)
     async with dashboard_of(browser, house, "guest") as opened:
         await opened.page.get_by_text("Day", exact=True).click()
         await opened.page.get_by_text("No history is kept here").wait_for()
 
 
-async def test_it_is_stale_while_the_sensor_or_the_service_is_offline(browser: Browser, house: House) -> None:
+async def test_page_is_stale_while_the_sensor_or_the_service_is_offline(browser: Browser, house: House) -> None:
     async with dashboard_of(browser, house, "cellar") as opened:
         state = await publish_state(house.live)
         await opened.until_status("live")
         offline = ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "the board is silent"})
         await publish(house.live, "health", offline.model_dump_json())
         await publish(house.live, "sensor/availability", b"offline")
-        await opened.until_status(f"stale since {of_clock(state['time'])}")
+        await opened.until_status(f"stale since {format_time(state['time'])}")
         assert "the board is silent" in await opened.page.inner_text("#why")
         await publish(house.live, "sensor/availability", b"online")
         await publish(house.live, "health", ONE.health.model_dump_json())
@@ -393,7 +403,9 @@ async def test_it_is_stale_while_the_sensor_or_the_service_is_offline(browser: B
         await opened.until_status("live")
 
 
-async def test_it_is_stale_when_the_service_is_killed_and_live_when_it_is_back(browser: Browser, house: House) -> None:
+async def test_page_is_stale_after_a_kill_of_the_service_and_live_after_its_restart(
+    browser: Browser, house: House
+) -> None:
     async with (
         tab(browser, house.service.url) as own,
         dashboard_of(browser, house, "attic") as other,
@@ -410,7 +422,9 @@ async def test_it_is_stale_when_the_service_is_killed_and_live_when_it_is_back(b
         await other.until_status("live")
 
 
-async def test_it_is_stale_while_the_broker_is_away_until_new_values_come(browser: Browser, house: House) -> None:
+async def test_page_is_stale_from_the_loss_of_the_broker_until_new_values_arrive(
+    browser: Browser, house: House
+) -> None:
     async with dashboard_of(browser, house, "attic") as opened:
         await opened.until_status("live")
         house.broker.stop()
@@ -420,7 +434,7 @@ async def test_it_is_stale_while_the_broker_is_away_until_new_values_come(browse
         await opened.until_status("live")
 
 
-async def test_beyond_this_machine_it_asks_for_the_token(browser: Browser, folder: Path, broker: Broker) -> None:
+async def test_page_for_other_machines_requires_the_token(browser: Browser, folder: Path, broker: Broker) -> None:
     token = folder / "token"
     token.write_text("0123456789abcdef")
     settings = PageSettings(listen=f"0.0.0.0:{free_port()}", token_file=token)
@@ -435,7 +449,7 @@ async def test_beyond_this_machine_it_asks_for_the_token(browser: Browser, folde
 
 
 @pytest.mark.parametrize("size", [PHONE, {"width": 320, "height": 600}, {"width": 1920, "height": 1080}], ids=str)
-async def test_nothing_is_wider_than_the_screen(browser: Browser, house: House, size: dict[str, int]) -> None:
+async def test_no_element_is_wider_than_the_screen(browser: Browser, house: House, size: dict[str, int]) -> None:
     async with dashboard_of(browser, house, "attic", size=size) as opened:
         await opened.until_text("celllow", "3.311 V · cell 1")
         wider = """width => [...document.querySelectorAll("body, header *, #pack, .card, .card :not(.scroll *)")]

@@ -1,4 +1,4 @@
-"""A thousand idle connections to each program with HTTP, while its broker or server is restarted."""
+"""A thousand idle connections to each program with an HTTP page, while its broker or NATS server is restarted."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,21 +24,22 @@ def engine(tmp_path: Path) -> Iterator[NatsCluster]:
         yield started
 
 
-def assert_unimpressed(outcome: Outcome) -> None:
+def assert_undisturbed(outcome: Outcome) -> None:
+    """Assert that all requests were answered without errors in the log."""
     assert set(outcome.answers) == {200}
     assert outcome.tracebacks == 0
     assert outcome.log_lines < MAX_LOG_LINES
 
 
-async def test_the_service_saves_checkpoints_and_finds_its_broker_again(tmp_path: Path, broker: Broker) -> None:
-    assert_unimpressed(await attack_service(tmp_path, broker))
+async def test_service_saves_checkpoints_and_reconnects_to_its_broker(tmp_path: Path, broker: Broker) -> None:
+    assert_undisturbed(await attack_service(tmp_path, broker))
 
 
 @pytest.mark.thorough
-async def test_the_dashboard_finds_its_broker_again(tmp_path: Path, broker: Broker) -> None:
-    assert_unimpressed(await attack_dashboard(tmp_path, broker))
+async def test_dashboard_reconnects_to_its_broker(tmp_path: Path, broker: Broker) -> None:
+    assert_undisturbed(await attack_dashboard(tmp_path, broker))
 
 
 @pytest.mark.thorough
-async def test_the_page_of_a_fleet_finds_its_server_again(tmp_path: Path, engine: NatsCluster) -> None:
-    assert_unimpressed(await attack_fleet_page(tmp_path, engine))
+async def test_fleet_page_reconnects_to_its_server(tmp_path: Path, engine: NatsCluster) -> None:
+    assert_undisturbed(await attack_fleet_page(tmp_path, engine))

@@ -27,11 +27,11 @@ async def test_new_reader_gets_the_last_values_of_all_packs():
     hub.put("attic", "state", state(1.0))
     hub.put("cellar", "availability", "online")
     with hub.reading() as reader:
-        found = await read(reader)
+        messages = await read(reader)
     assert hub.packs == ["attic", "cellar"]
-    assert found["attic/state"] == state(1.0)
-    assert found["cellar/availability"] == "online"
-    assert found["attic/recent"]["voltage_v"] == [13.0, 14.0]
+    assert messages["attic/state"] == state(1.0)
+    assert messages["cellar/availability"] == "online"
+    assert messages["attic/recent"]["voltage_v"] == [13.0, 14.0]
 
 
 async def test_slow_reader_gets_only_the_newest_values():
@@ -61,16 +61,16 @@ async def test_pack_with_cleared_topics_is_removed():
     assert hub.packs == []
     hub.put("attic", "availability", "online")
     with hub.reading() as reader:
-        found = await read(reader)
-    assert found["attic/recent"]["time_s"] == []
-    assert found["attic/elements"] == {}
+        messages = await read(reader)
+    assert messages["attic/recent"]["time_s"] == []
+    assert messages["attic/elements"] == {}
 
 
 def test_payload_nested_too_deeply_is_ignored():
-    hub, deep = PackTopics(), 0
+    hub, nested = PackTopics(), []
     for _ in range(sys.getrecursionlimit() + 1):
-        deep = [deep]
-    hub.put("attic", "state", deep)
+        nested = [nested]
+    hub.put("attic", "state", nested)
     assert hub.packs == []
 
 
@@ -152,14 +152,14 @@ async def test_message_size_is_limited_and_the_rest_follows() -> None:
     hub = PackTopics()
     for number in range(100):
         hub.put("attic", f"alarm/{number}", "x" * 10_000)
-    found, sizes = dict[str, object](), list[int]()
+    messages, sizes = dict[str, object](), list[int]()
     with hub.reading() as reader:
         while text := await reader.next(0.0):
             sizes.append(len(text))
-            found |= json.loads(text)
+            messages |= json.loads(text)
     assert max(sizes) < 1.1 * MAX_MESSAGE_BYTES
     assert len(sizes) > 1
-    assert sum(key.startswith("attic/alarm/") for key in found) == 100
+    assert sum(key.startswith("attic/alarm/") for key in messages) == 100
 
 
 async def test_dropped_pack_is_removed_from_the_list() -> None:

@@ -12,7 +12,7 @@ import pytest
 from yarl import URL
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.page import web_server as of_server
+from bms_estimator.page import web_server
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import FILES, STATIC, PageServer
@@ -24,7 +24,7 @@ from tests.sinks.snapshots import ONE
 from tests.store.test_history import at, record
 
 MAX_BYTES = 100_000
-"""Total content for a browser."""
+"""Maximum total size of the static files [bytes]."""
 TOKEN = "0123456789abcdef"
 
 
@@ -42,8 +42,8 @@ def past() -> HistoryQuery:
 async def browsing(
     hub: PackTopics, past: HistoryQuery, settings: PageSettings | None = None
 ) -> AsyncIterator[aiohttp.ClientSession]:
-    """Return a client with cookies at a server's address."""
-    jar = aiohttp.CookieJar(unsafe=True)  # of an address, too
+    """Start a server. Yield a client with cookies for its address."""
+    jar = aiohttp.CookieJar(unsafe=True)  # accepts cookies of an IP address
     async with (
         PageServer(settings or PageSettings(listen="127.0.0.1:0"), hub, past, patient=False) as server,
         aiohttp.ClientSession(server.url, cookie_jar=jar) as session,
@@ -58,10 +58,10 @@ async def messages(response: aiohttp.ClientResponse) -> AsyncIterator[dict[str, 
 
 
 def test_static_files_are_small_and_local():
-    given = [file.path for file in FILES.values()]
-    assert sorted(given) == sorted(STATIC.iterdir())
-    assert sum(path.stat().st_size for path in given) <= MAX_BYTES
-    own = [path.read_text() for path in given if path.name != "uplot.js"]
+    paths = [file.path for file in FILES.values()]
+    assert sorted(paths) == sorted(STATIC.iterdir())
+    assert sum(path.stat().st_size for path in paths) <= MAX_BYTES
+    own = [path.read_text() for path in paths if path.name != "uplot.js"]
     assert not any("http://" in text.replace("http://www.w3.org/2000/svg", "") or "https://" in text for text in own)
 
 
@@ -93,21 +93,21 @@ async def test_reader_gets_stored_and_then_new_values(hub, past):
 
 
 async def test_keep_alive_events_reveal_a_lost_connection(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "PING_S", 0.05)
+    monkeypatch.setattr(web_server, "PING_S", 0.05)
     async with browsing(hub, past) as session, session.get("/events") as response:
         stream = messages(response)
         assert [await anext(stream) for _ in range(3)] == [{}, {}, {}]
 
 
 async def test_client_that_reads_nothing_is_disconnected(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "WRITE_S", 0.2)
+    monkeypatch.setattr(web_server, "WRITE_S", 0.2)
     async with browsing(hub, past) as session:
         reader, writer = await asyncio.open_connection(session._base_url.host, session._base_url.port, limit=1024)
         writer.write(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
         async with asyncio.timeout(LONG_S):
             await reader.readuntil(b"retry")
             payload = {"text": "x" * 60_000}
-            while hub.readers:  # the sockets' buffers take some
+            while hub.readers:  # the first messages fill the buffers of the sockets
                 hub.put("attic", "health", payload)
                 assert all(len(waiting._waiting) <= 4 for waiting in hub._readers)
                 await asyncio.sleep(0)
@@ -117,7 +117,7 @@ async def test_client_that_reads_nothing_is_disconnected(hub, past, monkeypatch)
 async def test_excess_stream_replaces_the_oldest_of_the_busiest_address(
     hub: PackTopics, past: HistoryQuery, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(of_server, "MAX_STREAMS", 3)
+    monkeypatch.setattr(web_server, "MAX_STREAMS", 3)
     hub.set_link_state(None)
     async with browsing(hub, past) as session, contextlib.AsyncExitStack() as streams:
         url = session._base_url.join(URL("/events"))
@@ -148,12 +148,12 @@ async def test_stalled_readers_share_their_texts(hub: PackTopics, past: HistoryQ
     async with browsing(hub, past) as session:
         before = process.memory_info().rss
         address = session._base_url.host, session._base_url.port
-        clients = [await asyncio.open_connection(*address, limit=1024) for _ in range(of_server.MAX_STREAMS)]
+        clients = [await asyncio.open_connection(*address, limit=1024) for _ in range(web_server.MAX_STREAMS)]
         async with asyncio.timeout(LONG_S):
             for reader, writer in clients:
                 writer.write(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
                 await reader.readuntil(b"data: ")
-            for number in range(256):  # other texts, which readers must not store either
+            for number in range(256):  # new texts replace the first ones, which no reader may store
                 hub.put("attic", f"alarm/{number}", f"{number}".zfill(65_001))
                 await asyncio.sleep(0)
         grown = process.memory_info().rss - before
@@ -206,12 +206,12 @@ async def test_history_has_a_limited_number_of_points(tmp_path, hub):
         for span in ("hour", "day", "month"):
             async with session.get("/history", params={"pack": "attic", "span": span}) as response:
                 assert response.status == 200
-                found = await response.json()
-            lengths[span] = len(found["time_s"])
-            assert {len(column) for name, column in found.items() if name not in ("step_s", "events")} == {
+                content = await response.json()
+            lengths[span] = len(content["time_s"])
+            assert {len(column) for name, column in content.items() if name not in ("step_s", "events")} == {
                 lengths[span]
             }
-            assert found["voltage_v"][-1] == pytest.approx(at(0.0).estimate.voltage_v)
+            assert content["voltage_v"][-1] == pytest.approx(at(0.0).estimate.voltage_v)
         assert 60 <= lengths["hour"] <= 61
         assert 288 <= lengths["day"] <= 289
         assert 17 <= lengths["month"] <= 18
@@ -228,7 +228,7 @@ async def test_a_pack_without_a_database_has_no_history(tmp_path, hub, past):
 
 
 async def test_address_in_use_is_reported_and_retried(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "RETRY_S", 0.05)
+    monkeypatch.setattr(web_server, "RETRY_S", 0.05)
     opened = asyncio.Queue[str]()
     with socket.create_server(("127.0.0.1", 0)) as other:
         settings = PageSettings(listen=f"127.0.0.1:{other.getsockname()[1]}")
@@ -254,11 +254,11 @@ async def test_packs_that_share_an_address_share_a_page_until_the_last_one_ends(
                 sink.publish(ONE)
             async with aiohttp.ClientSession(url) as session, session.get("/events") as response:
                 stream = messages(response)
-                found = await anext(stream)
+                content = await anext(stream)
                 for pack in ("attic", "cellar"):
-                    assert found[f"{pack}/state"] == json.loads(ONE.estimate.model_dump_json())
-                    assert found[f"{pack}/health"] == json.loads(ONE.health.model_dump_json())
-                    assert found[f"{pack}/availability"] == "online"
+                    assert content[f"{pack}/state"] == json.loads(ONE.estimate.model_dump_json())
+                    assert content[f"{pack}/health"] == json.loads(ONE.health.model_dump_json())
+                    assert content[f"{pack}/availability"] == "online"
                 await cellar.__aexit__(None, None, None)
                 assert (await anext(stream))["cellar/availability"] == "offline"
                 await cellar.__aenter__()

@@ -1,4 +1,4 @@
-"""One service for each pack, for any state of its folder and any other users."""
+"""Instance lock: one service for each pack, whatever happens to its folder and whichever users there are."""
 
 import os
 import shutil
@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.instance_lock import _name, instance_lock
 
 NOBODY = 65534
-SQUAT = """
+HOLD_NAME_SCRIPT = """
 import os, socket, sys
 os.setuid(int(sys.argv[2]))
 held = socket.socket(socket.AF_UNIX)
@@ -24,7 +24,7 @@ held.listen(1)
 print(flush=True)
 sys.stdin.read()
 """
-"""Holds the name of its first argument as the user of its second until its input ends."""
+"""Program that binds the socket name of its first argument, as the user of its second, until its input ends."""
 
 
 def test_second_service_of_a_pack_is_rejected(tmp_path: Path) -> None:
@@ -33,7 +33,7 @@ def test_second_service_of_a_pack_is_rejected(tmp_path: Path) -> None:
         with instance_lock(tmp_path, "pack"):
             with pytest.raises(UserError, match=f"{served}process {os.getpid()}$"), instance_lock(tmp_path, "pack"):
                 pass
-            for _ in range(5):  # the system tells the first ones only whose the name is
+            for _ in range(5):  # the system reports the owner of the name only to the first connections
                 with pytest.raises(UserError, match=served), instance_lock(tmp_path, "pack"):
                     pass
     with (
@@ -44,7 +44,7 @@ def test_second_service_of_a_pack_is_rejected(tmp_path: Path) -> None:
         pass
 
 
-def test_a_service_that_does_not_listen_yet_counts_and_one_that_has_just_ended_does_not(
+def test_starting_service_holds_the_lock_and_an_ended_one_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with socket.socket(socket.AF_UNIX) as starting:
@@ -81,9 +81,9 @@ def test_symlink_in_place_of_a_lock_file_is_ignored(tmp_path: Path) -> None:
     assert victim.read_text() == "precious"
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a process of another user")
 def test_lock_held_by_another_user_is_ignored(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", SQUAT, _name(tmp_path, "pack")[1:], str(NOBODY)]
+    command = [sys.executable, "-c", HOLD_NAME_SCRIPT, _name(tmp_path, "pack")[1:], str(NOBODY)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe) as stranger:
         assert stranger.stdout
@@ -91,10 +91,10 @@ def test_lock_held_by_another_user_is_ignored(tmp_path: Path) -> None:
         with capture_logs() as lines, instance_lock(tmp_path, "pack"):
             pass
         assert [line["user"] for line in lines] == [NOBODY]
-        os.chown(tmp_path, NOBODY, NOBODY)  # one who may write the folder is a service
+        os.chown(tmp_path, NOBODY, NOBODY)  # a process of the folder's owner counts as a service
         with pytest.raises(UserError, match=f"by process {stranger.pid}"), instance_lock(tmp_path, "pack"):
             pass
         with pytest.raises(UserError, match="served already"), instance_lock(tmp_path, "pack"):
-            pass  # whose it is is told to nobody any more: rather no service than two
+            pass  # the owner is no longer reported, and the lock then prefers no service to two services
         assert stranger.stdin
         stranger.stdin.close()

@@ -1,4 +1,4 @@
-"""The listener under attack: idle connections without a token, while checkpoints are saved and clients are answered."""
+"""HTTP listener under attack: idle connections exhaust neither descriptors nor the service of authorized clients."""
 
 import asyncio
 import contextlib
@@ -14,7 +14,7 @@ import structlog
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer
-from bms_estimator.process import listener as of_listener
+from bms_estimator.process import listener as listener_module
 from bms_estimator.process.listener import CONNECTIONS, Connections, Listener
 from bms_estimator.settings.page import PageSettings
 from tests.idle_connections import DESCRIPTORS, attacked, few_descriptors
@@ -35,16 +35,16 @@ async def test_a_thousand_idle_connections_leave_descriptors_and_an_authorized_c
 async def _answered_under_attack(server: PageServer, tmp_path: Path) -> None:
     async with attacked(int(server.url.rsplit(":", 1)[1].strip("/"))):
         assert len(CONNECTIONS) <= CONNECTIONS.limit
-        with contextlib.ExitStack() as files:  # as many as the cap reserves for all else
+        with contextlib.ExitStack() as files:  # the limit reserves half of the descriptors for other purposes
             for number in range(DESCRIPTORS // 2):
                 files.enter_context((tmp_path / f"{number}").open("w"))
-        given = {"Authorization": "Bearer 0123456789abcdef"}
-        async with aiohttp.ClientSession(server.url, headers=given) as session, session.get("/") as response:
+        headers = {"Authorization": "Bearer 0123456789abcdef"}
+        async with aiohttp.ClientSession(server.url, headers=headers) as session, session.get("/") as response:
             assert response.status == 200
 
 
 async def test_a_client_without_a_complete_header_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(of_listener, "HEADER_S", 0.05)
+    monkeypatch.setattr(listener_module, "HEADER_S", 0.05)
     async with PageServer(PageSettings(listen="127.0.0.1:0"), PackTopics(), HistoryQuery(), patient=False) as server:
         port = int(server.url.rsplit(":", 1)[1].strip("/"))
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
@@ -80,15 +80,15 @@ async def test_a_slow_client_gets_its_response_and_one_that_does_not_read_is_dis
     with connections.serving(transport):
         pass
     transport.write(bytes(8 << 20))
-    (held,) = connections._open.values()
-    connections._expire(held)
+    (open_connection,) = connections._open.values()
+    connections._expire(open_connection)
     unsent = transport.get_write_buffer_size()
     async with asyncio.timeout(LONG_S):
         while transport.get_write_buffer_size() == unsent:
             await asyncio.get_running_loop().run_in_executor(None, peer.recv, 1 << 16)
-    connections._expire(held)
+    connections._expire(open_connection)
     assert not transport.is_closing()
-    connections._expire(held)
+    connections._expire(open_connection)
     assert transport.is_closing()
     peer.close()
 
@@ -106,8 +106,8 @@ async def connection() -> AsyncIterator[tuple[socket.socket, asyncio.Transport]]
 
 
 async def test_failed_accepts_are_logged_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Descriptors are exhausted, as they are where other parts of the process leak them."""
-    monkeypatch.setattr(of_listener, "RETRY_S", 0.01)
+    """The limit of descriptors is lowered, as if another part of the process leaked descriptors."""
+    monkeypatch.setattr(listener_module, "RETRY_S", 0.01)
     attempts, paused = 0, Listener._pause
 
     def pause(listener: Listener, listening: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""The log: the requested lines, without waiting for a reader."""
+"""Log: lines of the configured levels, written without waiting for the reader of stderr."""
 
 import threading
 from collections.abc import Iterator
@@ -44,16 +44,16 @@ def test_unread_lines_are_counted_and_queued_ones_keep_their_order(
     def write(_: int, data: bytes) -> int:
         assert release.wait(LONG_S)
         written.append(data[:3])
-        return min(len(data), 3)  # as pipes do
+        return min(len(data), 3)  # like a pipe, this accepts a part of the data
 
     monkeypatch.setattr(stderr_writer, "os", SimpleNamespace(write=write))
     monkeypatch.setattr(stderr_writer, "MAX_QUEUED_LINES", 4)
     out = Stderr()
     for i in range(20):
         out.take(f"line {i}")
-    out.drain()  # gives up
+    out.drain()  # returns after its timeout
     lost = out.lost
-    assert 15 <= lost <= 16  # one may be on its way
+    assert 15 <= lost <= 16  # the writer may already have removed one line from the queue of four
     release.set()
     while out._lines.unfinished_tasks:
         out.drain()

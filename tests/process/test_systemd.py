@@ -18,7 +18,8 @@ def systemd(tmp_path: Path) -> Iterator[socket.socket]:
         yield systemd
 
 
-def heard(systemd: socket.socket) -> list[str]:
+def receive_states(systemd: socket.socket) -> list[str]:
+    """Return the notifications that have arrived."""
     states = []
     while True:
         try:
@@ -27,23 +28,23 @@ def heard(systemd: socket.socket) -> list[str]:
             return states
 
 
-def test_several_packs_are_ready_with_the_last_and_alive_only_while_each_is(
+def test_process_is_ready_with_its_last_pack_and_alive_while_all_packs_are(
     tmp_path: Path, systemd: socket.socket
 ) -> None:
     notifier = SystemdNotifier(["a", "b"], {"NOTIFY_SOCKET": str(tmp_path / "notify")})
     notifier.ready("a")
-    assert heard(systemd) == []
+    assert receive_states(systemd) == []
     notifier.ready("b")
-    assert heard(systemd) == ["READY=1\nSTATUS=estimating a, b"]
+    assert receive_states(systemd) == ["READY=1\nSTATUS=estimating a, b"]
     for pack in "aaab":
         notifier.alive(pack)
     notifier.alive("b")
-    assert heard(systemd) == ["WATCHDOG=1"]
+    assert receive_states(systemd) == ["WATCHDOG=1"]
     notifier.alive("a")
-    assert heard(systemd) == ["WATCHDOG=1"]
+    assert receive_states(systemd) == ["WATCHDOG=1"]
 
 
-def test_a_watchdog_that_waits_for_another_process_is_not_ours() -> None:
-    ours = {"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())}
-    assert SystemdNotifier(["a"], ours).watchdog_s == 3.0
-    assert SystemdNotifier(["a"], ours | {"WATCHDOG_PID": "1"}).watchdog_s == 0.0
+def test_watchdog_of_another_process_is_ignored() -> None:
+    environment = {"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())}
+    assert SystemdNotifier(["a"], environment).watchdog_s == 3.0
+    assert SystemdNotifier(["a"], environment | {"WATCHDOG_PID": "1"}).watchdog_s == 0.0

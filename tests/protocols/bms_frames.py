@@ -1,10 +1,10 @@
-"""Frames of real BMS, as published by others, with the values by the same source."""
+"""Frames of real BMS from public repositories, with the values that their authors decoded."""
 
 from typing import NamedTuple
 
 
 class Published(NamedTuple):
-    """A response, or those of one poll cycle, and their values. Current positive on discharge here."""
+    """Responses of one poll cycle, and their values. The current is positive on discharge."""
 
     protocol: str
     frames: bytes
@@ -12,7 +12,7 @@ class Published(NamedTuple):
     current_a: float
     temperature_c: float
     cells_v: list[float]
-    described: str
+    description: str
 
 
 JBD_NAME = bytes.fromhex("dd050019 4a42442d53503034533033342d4c34532d323030412d422d55 fa0877")
@@ -29,10 +29,10 @@ JBD_DISCHARGING = Published(
     + bytes.fromhex("dd03001d 0618fee101f201f4002a2c7c00000000000080640304030b8b0b8a0b84 f88477"),
     15.6, 2.87, 22.133, [3.43, 3.425, 3.432, 3.417], "JBD BMS, 4 cells",
 )  # fmt: skip
-"""patman15/aiobmsble, tests/bms/test_jbd_bms.py: current -2.87 A, not charging."""
+"""patman15/aiobmsble, tests/bms/test_jbd_bms.py: the BMS reports -2.87 A and is not charging."""
 
-JBD_UNWIRED = bytes.fromhex("dd030017 000000000000271000002c5000000000000020000110 00ff0577")
-"""syssi/esphome-jbd-bms, docs/pdus/JBD-SP25S003-L16S-100A-100A-B.txt: no probe at all."""
+JBD_WITHOUT_PROBES = bytes.fromhex("dd030017 000000000000271000002c5000000000000020000110 00ff0577")
+"""syssi/esphome-jbd-bms, docs/pdus/JBD-SP25S003-L16S-100A-100A-B.txt: a BMS without temperature probes."""
 
 DALY_STATUS = bytes.fromhex("a5019408 1001000002000b9b fb")
 DALY_CELLS = bytes.fromhex(
@@ -75,9 +75,12 @@ JK_NEWER_FRAME = bytes.fromhex(
     "0000000000000000000000000000ff0001000000e20400000100f6c74040000000003014fe010001010100060000600c0000"
     "00000000ad00b300b4009003da269d07180600008051010000000000000000000000000000feff7fdd2f0101b00700000016"
 )
-"""syssi/esphome-jk-bms, tests/components/jk_bms_ble/frames_jk02_32s_v11.h, of a JK_PB2A16S15P; the same frame as on RS485."""
+"""syssi/esphome-jk-bms, tests/components/jk_bms_ble/frames_jk02_32s_v11.h: a JK_PB2A16S15P.
+
+The frames on Bluetooth and on RS485 are equal.
+"""
 JK_RECORD_OF_PACK_2 = bytes.fromhex("0210162000010478")
-"""The frame after it: eggcho/jk-bms-passive-bridge, README."""
+"""Record that follows the newer frame on RS485: eggcho/jk-bms-passive-bridge, README."""
 
 JK_NEWER = Published(
     "jk", JK_NEWER_FRAME + JK_RECORD_OF_PACK_2, 51.689, 0.0, 17.7,

@@ -20,7 +20,7 @@ DEVICE = Device(
     "shunt", lambda sign, _: TextProtocol(current_sign=sign), Resolution(2400, "charge_positive", 5.0, 0.05, 0.02, 0.3)
 )
 """
-USE_IT = """
+SCRIPT = """
 import sys
 from bms_estimator.protocols import devices
 devices.__path__.append(sys.argv[1])
@@ -34,12 +34,12 @@ print(sensor.baud, sensor.period_s, sensor.current_dead_band_a, samples["current
 """
 
 
-def test_file_in_the_folder_of_devices_is_a_protocol(tmp_path: Path) -> None:
+def test_new_file_in_the_folder_of_devices_registers_a_protocol(tmp_path: Path) -> None:
     (tmp_path / "shunt.py").write_text(NEW_DEVICE)
-    done = subprocess.run(
-        [sys.executable, "-c", USE_IT, tmp_path], capture_output=True, text=True, timeout=LONG_S, check=False
+    process = subprocess.run(
+        [sys.executable, "-c", SCRIPT, tmp_path], capture_output=True, text=True, timeout=LONG_S, check=False
     )
-    assert done.stdout == "9600 5.0 0.3 [-0.2] shunt\n", done.stderr
+    assert process.stdout == "9600 5.0 0.3 [-0.2] shunt\n", process.stderr
 
 
 def test_settings_list_all_protocols() -> None:
@@ -48,6 +48,6 @@ def test_settings_list_all_protocols() -> None:
     assert set(PROTOCOLS) == {BOARD, "daly", "jbd", "jk", "junctek", "pylontech", "text", "vedirect"}
 
 
-def test_unknown_protocol_is_refused_with_the_list() -> None:
+def test_unknown_protocol_is_rejected_with_the_list_of_protocols() -> None:
     with pytest.raises(ValidationError, match="must be one of binary, junctek, pylontech, text, "):
         SensorSettings.model_validate({"protocol": "x"})

@@ -147,28 +147,28 @@ ESCAPES = (
     "(setsid {daemon} &)",
     "env -i {daemon} &",
 )
-"""Ways in which a program starts another one that is found also after its own end."""
+"""Commands that start a daemon which is found also after the end of its parent."""
 CHILD = "env -i setsid {daemon} &"
-"""A way that is found while the program runs."""
+"""Command that starts a daemon which is found only while its parent runs."""
 
 
 @pytest.mark.parametrize(
-    ("ways", "then"), [pytest.param(ESCAPES, "exit", marks=pytest.mark.thorough), ((*ESCAPES, CHILD), "sleep 1000")]
+    ("starts", "then"), [pytest.param(ESCAPES, "exit", marks=pytest.mark.thorough), ((*ESCAPES, CHILD), "sleep 1000")]
 )
 async def test_all_descendants_of_a_program_are_killed_after_the_time_limit(
-    tmp_path: Path, ways: tuple[str, ...], then: str
+    tmp_path: Path, starts: tuple[str, ...], then: str
 ) -> None:
     started = tmp_path / "started"
     started.touch()
     daemon = program(tmp_path / "daemon", f"echo $$ >> {started}; exec /bin/sleep 1000")
-    lines = [way.format(daemon=daemon) for way in ways]
-    lines += [f"until [ $(wc -l < {started}) = {len(ways)} ]; do :; done", then]
+    lines = [start.format(daemon=daemon) for start in starts]
+    lines += [f"until [ $(wc -l < {started}) = {len(starts)} ]; do :; done", then]
     script = program(tmp_path / "script", "\n".join(lines))
     async with hooks({"run": [script], "timeout_s": 10.0}) as running:
         running.on_alarm_change(Change(0.0, RAISED))
         failed = await until_health(running, lambda health: health.failures == 1)
     assert failed.failing == [f"run {script}: took longer than 10 s"]
-    assert [_runs(int(line)) for line in _lines(started)] == [False] * len(ways)
+    assert [_runs(int(line)) for line in _lines(started)] == [False] * len(starts)
 
 
 async def test_a_child_that_outlives_its_program_runs_until_the_time_limit(tmp_path: Path) -> None:
@@ -295,19 +295,19 @@ async def test_a_program_inherits_only_listed_and_configured_variables(
 
 
 async def test_a_critical_alarm_that_cannot_be_watched_counts_as_raised() -> None:
-    """It is tables once, though it is raised meanwhile, and ends only when it can be watched and its cause is gone."""
+    """The hook runs once although the alarm is raised meanwhile. It runs again when the alarm is watched and cleared."""
     hot = RAISED.model_copy(update={"name": "over_temperature", "severity": "critical", "text": "hot"})
-    blind = {"watched": False, "unwatched_reason": "no temperature"}
+    unwatched = {"watched": False, "unwatched_reason": "no temperature"}
     cold = hot.model_copy(update={"active": False, "since": None, "text": ""})
     output: list[bytes] = []
     tables = {"topic": "load/set", "payload": "$name $state $text"}
     async with hooks(tables, publish=lambda _, payload: output.append(payload)) as running:
         for alarm in (
-            cold.model_copy(update=blind),
-            hot.model_copy(update=blind),
-            cold.model_copy(update=blind),
+            cold.model_copy(update=unwatched),
+            hot.model_copy(update=unwatched),
+            cold.model_copy(update=unwatched),
             cold,
-            cold.model_copy(update=blind | {"severity": "warning"}),
+            cold.model_copy(update=unwatched | {"severity": "warning"}),
             cold.model_copy(update={"severity": "warning"}),
         ):
             running.on_alarm_change(Change(0.0, alarm))
@@ -405,7 +405,7 @@ def test_a_hook_without_its_broker_or_relay_is_rejected_at_the_start(tables: dic
 
 
 async def test_an_over_current_switches_the_relay_is_published_and_acknowledged(broker: Broker, tmp_path: Path) -> None:
-    """A virtual board whose relay takes the load off, over its line; the alarm latches, over a restart, too."""
+    """The relay of a virtual board disconnects the load. The latched alarm survives a restart."""
     load_a = 8.0
     board = VirtualBoard(lambda _: Reading(0.0 if board.relay_high else load_a, 22.0, 25.0))
     tables: dict[str, Any] = {
@@ -464,7 +464,7 @@ async def test_an_over_current_switches_the_relay_is_published_and_acknowledged(
 async def test_a_lost_temperature_sensor_switches_the_relay_and_a_hook_that_cannot_start_raises_an_alarm(
     broker: Broker, tmp_path: Path
 ) -> None:
-    """A virtual board whose NTC breaks while the pack is charged, over its line."""
+    """The NTC of a virtual board breaks while the pack is charged."""
     temperature_c, out, missing = 25.0, tmp_path / "out", tmp_path / "later"
     board = VirtualBoard(lambda _: Reading(-8.0, 22.0, temperature_c))
     hot = {"alarms": ["over_temperature"]}

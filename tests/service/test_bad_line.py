@@ -1,4 +1,4 @@
-"""What the line may do to a running service: bytes on a PTY -> decoder -> estimator -> published values."""
+"""Running service with faults on its serial line: bytes on a PTY, decoder, estimator, published values."""
 
 import asyncio
 import itertools
@@ -35,17 +35,27 @@ HELLO = Hello(
 
 
 def sample(sequence: int, *, board_us: int | None = None, voltage_sum: int = 15_565, status: int = 0) -> SampleMessage:
-    """3.8 V, 0 A."""
+    """Return a sample of 3.8 V and 0 A, unless its sums are changed."""
     at_us = (sequence + 1) * PERIOD_US if board_us is None else board_us
-    return SampleMessage(sequence % MODULUS, at_us % MODULUS, voltage_sum, 51_200, 100, 0, 0, status)
+    return SampleMessage(
+        sequence=sequence % MODULUS,
+        board_us=at_us % MODULUS,
+        voltage_sum=voltage_sum,
+        current_sum=51_200,
+        count=100,
+        aux_sum=0,
+        aux_count=0,
+        status=status,
+    )
 
 
 def frames(first: int, count: int, **options: Any) -> bytes:
+    """Return the frames of ``count`` samples with sequence numbers from ``first`` on."""
     return b"".join(sample(n, **options).encode() for n in range(first, first + count))
 
 
 class SkippingClock:
-    """The host's, which a test lets go on by ``skipped_s``."""
+    """Monotonic clock of the host that a test advances by ``skipped_s``."""
 
     def __init__(self) -> None:
         self.skipped_s = 0.0
@@ -60,10 +70,10 @@ class Service:
     ) -> None:
         self.line, self.sink, self.task, self._stop, self.clock = line, sink, task, stop, clock
 
-    async def until(self, wanted: Callable[[Snapshot], bool]) -> Snapshot:
-        return await self.sink.until(wanted)
+    async def until(self, condition: Callable[[Snapshot], bool]) -> Snapshot:
+        return await self.sink.until(condition)
 
-    async def received(self, frames: int) -> None:
+    async def wait_for_frames(self, frames: int) -> None:
         await self.until(lambda s: s.health.line["frames_received"] >= frames)
 
     async def end(self) -> tuple[Estimator, Health]:
@@ -74,7 +84,7 @@ class Service:
 
 @asynccontextmanager
 async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -> AsyncIterator[Service]:
-    """A running service with a board that has sent its hello message."""
+    """Run a service with a board that has sent its hello message."""
     line.plug()
     settings = Settings(
         pack=PackSettings(initial_soc=0.5),
@@ -96,24 +106,26 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
         await asyncio.wait_for(task, LONG_S)
 
 
-async def test_good_frames_arrive_with_the_board_s_own_scaling_and_name(line: Line) -> None:
+async def test_samples_have_the_scaling_of_the_hello_and_info_has_its_serial_number(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 20))
-        fresh = await live.until(lambda s: s.estimate is not None)
-        named = await live.until(lambda s: bool(s.info.board))
-    assert fresh.estimate
-    assert fresh.estimate.voltage_v == pytest.approx(3.8, abs=1e-3)
-    assert fresh.estimate.current_a == pytest.approx(0.0, abs=1e-6)
-    assert fresh.health.sensor_message is None
-    assert named.info.board["firmware"] == "1.2.3"
-    assert named.info.board["serial"] == "0000beef"
+        first_estimate = await live.until(lambda s: s.estimate is not None)
+        first_info = await live.until(lambda s: bool(s.info.board))
+    assert first_estimate.estimate
+    assert first_estimate.estimate.voltage_v == pytest.approx(3.8, abs=1e-3)
+    assert first_estimate.estimate.current_a == pytest.approx(0.0, abs=1e-6)
+    assert first_estimate.health.sensor_message is None
+    assert first_info.info.board["firmware"] == "1.2.3"
+    assert first_info.info.board["serial"] == "0000beef"
 
 
-async def test_garbage_and_cut_frames_cost_only_themselves(line: Line) -> None:
+async def test_frames_after_garbage_and_a_truncated_frame_are_decoded(line: Line) -> None:
     async with service(line) as live:
-        good = sample(10).encode()
-        live.line.write(frames(0, 10) + bytes(range(1, 200)) + b"\0" + good[:9] + frames(10, 10) + frames(20, 10))
-        await live.received(29)  # the cut frame took the next one with it
+        valid_frame = sample(10).encode()
+        live.line.write(
+            frames(0, 10) + bytes(range(1, 200)) + b"\0" + valid_frame[:9] + frames(10, 10) + frames(20, 10)
+        )
+        await live.wait_for_frames(29)  # the truncated frame has no delimiter, so that the next one is lost, too
         estimator, health = await live.end()
     assert estimator.state["samples"][0] == 29
     assert health.line["frames_lost"] == 1
@@ -122,10 +134,10 @@ async def test_garbage_and_cut_frames_cost_only_themselves(line: Line) -> None:
 
 async def test_a_frame_with_a_wrong_checksum_is_counted_and_dropped(line: Line) -> None:
     async with service(line) as live:
-        wrong = bytearray(sample(1).encode())
-        wrong[7] ^= 0x10
-        live.line.write(frames(0, 1) + bytes(wrong) + frames(2, 8))
-        await live.received(9)
+        damaged_frame = bytearray(sample(1).encode())
+        damaged_frame[7] ^= 0x10
+        live.line.write(frames(0, 1) + bytes(damaged_frame) + frames(2, 8))
+        await live.wait_for_frames(9)
         _, health = await live.end()
     assert health.line["crc_errors"] == 1
     assert health.line["frames_lost"] == 1
@@ -144,7 +156,7 @@ async def test_a_board_with_a_newer_protocol_is_reported(line: Line) -> None:
 async def test_duplicates_and_late_frames_are_dropped(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 10) + frames(9, 1) + frames(5, 2) + frames(10, 10))
-        await live.received(20)
+        await live.wait_for_frames(20)
         estimator, health = await live.end()
     assert estimator.state["samples"][0] == 20
     assert health.line["duplicates"] + health.line["out_of_order"] == 3
@@ -158,7 +170,7 @@ async def test_sequence_number_and_microseconds_may_wrap_around(line: Line) -> N
         wrapping = (sample(start + n, board_us=at_us + n * PERIOD_US) for n in range(10))
         live.line.write(replace(HELLO, sequence=start, board_us=at_us - PERIOD_US, boot_id=8).encode())
         live.line.write(b"".join(message.encode() for message in wrapping))
-        await live.received(10)
+        await live.wait_for_frames(10)
         estimator, health = await live.end()
     assert health.line["frames_lost"] == 0
     assert health.line["frames_received"] == 10
@@ -169,9 +181,9 @@ async def test_sequence_number_and_microseconds_may_wrap_around(line: Line) -> N
 async def test_time_continues_after_a_reset_of_the_board(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 50))
-        await live.received(50)
+        await live.wait_for_frames(50)
         live.line.write(replace(HELLO, boot_id=9, reset_cause=8).encode() + frames(0, 20))
-        await live.received(70)
+        await live.wait_for_frames(70)
         estimator, health = await live.end()
     assert estimator.state["samples"][0] == 70
     assert estimator.state["time_steps_back"][0] == 0
@@ -182,10 +194,10 @@ async def test_time_continues_after_a_reset_of_the_board(line: Line) -> None:
 async def test_ten_seconds_without_frames_are_one_gap_and_the_lock_holds(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 50))
-        await live.received(50)
+        await live.wait_for_frames(50)
         live.clock.skipped_s += 10.0
         live.line.write(frames(1050, 50))
-        await live.received(100)
+        await live.wait_for_frames(100)
         estimator, health = await live.end()
     assert health.line["frames_lost"] == 1000
     assert health.samples["gaps"] == 1
@@ -250,8 +262,8 @@ async def test_the_state_names_the_lowest_and_highest_cell(line: Line) -> None:
     assert (snapshot.estimate.cell_lowest_v, snapshot.estimate.cell_highest_v) == (3.79, 3.81)
 
 
-async def test_a_former_reason_is_no_longer_reported(line: Line) -> None:
-    """A board whose hello scales by zero has no numbers; before, its voltage was out of range."""
+async def test_new_reason_replaces_an_earlier_one(line: Line) -> None:
+    """The voltage is out of range at first. Then a hello with a slope of zero makes the current NaN."""
     async with service(line) as live:
         live.line.write(frames(0, 5, voltage_sum=16_000_000))
         await live.until(lambda s: "where 1.5..4.5 V" in (s.health.sensor_message or ""))

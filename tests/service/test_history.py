@@ -1,4 +1,4 @@
-"""What a pack's runs leave to the next: counters, crashes, unseen time, files of all formats, an SOC that a rest corrects."""
+"""Successive runs of a pack: counters, crashes, gaps, checkpoints of all formats, and the SOC after a long gap."""
 
 import asyncio
 import dataclasses
@@ -41,7 +41,7 @@ def at(hours: float) -> BootTimestamp:
 
 
 async def run_at(hours: float, folder: Path, *rows: tuple[float, float, float], settings: Settings = SETTINGS) -> Any:
-    """A run over ``rows`` that begins so late. Returns its estimator and its last snapshot."""
+    """Run a service over ``rows``, starting at this time [h]. Return its estimator and its last snapshot."""
     source, sink = ScriptedSource(), Collector()
     source.give(*rows)
     source.finish()
@@ -106,14 +106,14 @@ async def test_charge_and_energy_are_published_once_saved_so_that_a_kill_does_no
 async def test_a_run_without_samples_changes_neither_counters_nor_the_age_of_the_state(tmp_path: Path) -> None:
     await run_at(0.0, tmp_path, (0.0, 0.1, 3.8))
     await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))
-    found = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(2.0)).load()
-    assert found.unseen_s == pytest.approx(7200.0)
-    assert found.counters.restarts == 2
-    assert found.counters.total.samples["dropped_range"] == 1
+    loaded = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(2.0)).load()
+    assert loaded.unseen_s == pytest.approx(7200.0)
+    assert loaded.counters.restarts == 2
+    assert loaded.counters.total.samples["dropped_range"] == 1
 
 
-async def killed(folder: Path, *, with_a_sample: bool) -> None:
-    """A run that leaves no word: its last save is not made."""
+async def run_and_kill(folder: Path, *, with_a_sample: bool) -> None:
+    """Run a service that ends without its final save."""
 
     class Killed(CheckpointFile):
         def _write(self, content: dict[str, Any], ledger: RunCounters) -> None:
@@ -129,14 +129,14 @@ async def killed(folder: Path, *, with_a_sample: bool) -> None:
 
 
 async def test_a_start_after_an_unclean_end_counts_as_a_crash(tmp_path: Path) -> None:
-    counted = []
+    crashes = []
     await run_samples(tmp_path, samples=1)
     for with_a_sample in (True, False):
-        counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
-        await killed(tmp_path, with_a_sample=with_a_sample)
-    counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
-    counted.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
-    assert counted == [0, 1, 2, 2]
+        crashes.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
+        await run_and_kill(tmp_path, with_a_sample=with_a_sample)
+    crashes.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
+    crashes.append((await run_samples(tmp_path, samples=1)).health.total.crashes)
+    assert crashes == [0, 1, 2, 2]
 
 
 async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: Path) -> None:
@@ -149,14 +149,14 @@ async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: 
         assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: at(hours)).load().reason == reason
 
 
-COUNTED = RunCounters(
+COUNTERS = RunCounters(
     6, Totals(since="2023-11-14T22:13:20Z", crashes=2, samples={"samples": 70}, unseen_s=30.0), clean=True
 )
 
 
 async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0))
-    file.save(learned_estimator().record, COUNTED)
+    file.save(learned_estimator().record, COUNTERS)
     _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edit("state", longest_days=2.0))
     assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
 
@@ -164,19 +164,19 @@ async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Pat
 async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_continue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A later version is tried and left more often than files are preserved; the first files have learned most."""
+    """The later version runs once more than there are preserved files. The oldest files remain, and the last is replaced."""
     file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     for attempt in range(MAX_LATER_FILES + 1):
-        counted = dataclasses.replace(COUNTED, restarts=6 + attempt)
-        save_as(FORMAT + 1, file, learned_estimator(), monkeypatch, counted)
+        counters = dataclasses.replace(COUNTERS, restarts=6 + attempt)
+        save_as(FORMAT + 1, file, learned_estimator(), monkeypatch, counters)
         inodes.append(file.path.stat().st_ino)
         health = (await run_samples(tmp_path, samples=1)).health
         files = min(attempt + 1, MAX_LATER_FILES)
         assert f"reads {FORMAT}; set aside as pack.later-{files}.npz; once the version" in health.checkpoint
         assert (health.restarts, health.total.crashes, health.total.unseen_s) == (7 + attempt, 2, 30.0)
-    kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, MAX_LATER_FILES + 1)]
-    assert kept_inodes == [*inodes[: MAX_LATER_FILES - 1], inodes[MAX_LATER_FILES]]
+    preserved_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, MAX_LATER_FILES + 1)]
+    assert preserved_inodes == [*inodes[: MAX_LATER_FILES - 1], inodes[MAX_LATER_FILES]]
     assert (tmp_path / "pack.refused.npz").read_bytes() == b"an older one"
 
 
@@ -210,8 +210,8 @@ async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after
 )
 async def test_implausible_counters_are_reset_and_the_state_is_restored(tmp_path: Path, wrong: dict[str, Any]) -> None:
     learned = learned_estimator()
-    total = COUNTED.total.model_copy(update=wrong)
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTED, total=total))
+    total = COUNTERS.total.model_copy(update=wrong)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTERS, total=total))
     with capture_logs() as lines:
         health = (await run_samples(tmp_path, samples=1)).health
     assert "restart from zero" in lines[0]["event"]
@@ -225,10 +225,11 @@ async def test_a_deleted_state_folder_is_recreated_with_access_for_the_owner_onl
     folder = tmp_path / "state"
     async with run_with_frequent_saves(CheckpointFile(folder, SETTINGS, CELL)) as (source, sink, _):
         for second in range(3):
-            seen = len(sink.snapshots)
+            snapshots_before = len(sink.snapshots)
             source.give((float(second), 0.1, 3.8))
             await sink.until(
-                lambda s, n=second + 1: s.health.samples["samples"] == n and s.health.checkpoint == "saved", skip=seen
+                lambda s, n=second + 1: s.health.samples["samples"] == n and s.health.checkpoint == "saved",
+                skip=snapshots_before,
             )
             while not folder.exists():  # noqa: ASYNC110 - a file has no event
                 await asyncio.sleep(0.01)
@@ -249,13 +250,13 @@ async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
             release.wait()
 
     with capture_logs() as lines:
-        await stopped_by_nothing(Hung(tmp_path, SETTINGS, CELL))
+        await run_with_hanging_disk(Hung(tmp_path, SETTINGS, CELL))
     assert "the disk hangs: the last checkpoint is not written" in {line["event"] for line in lines}
     release.set()
 
 
-async def stopped_by_nothing(hung: CheckpointFile) -> None:
-    """A run on a disk that hangs."""
+async def run_with_hanging_disk(hung: CheckpointFile) -> None:
+    """Run a service on a disk that hangs until its source ends."""
     async with run_with_frequent_saves(hung) as (source, sink, task):
         source.give((0.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs")
@@ -284,13 +285,13 @@ def test_gap_lengths_agree_with_the_kernel() -> None:
     gap_s = float(estimator.settings["gap_s"][0])
     steps = rng.choice([0.1, 1.0, 2.0 * gap_s, 100.0, -50.0], 400)
     times = np.cumsum(steps)
-    found = []
+    lengths = []
     for time_s in times:
         gaps, before_s, step_s = (float(estimator.state[n][0]) for n in ("gaps", "time_s", "step_s"))
         started = estimator.state["started"][0]
         estimator.step(float(time_s), 0.0, 3.8)
         if started:
-            one = gap_lengths(np.array([time_s]), before_s, step_s, gap_s, np.inf)
-            assert len(one) == estimator.state["gaps"][0] - gaps
-            found += one
-    assert gap_lengths(times[1:], float(times[0]), 0.0, gap_s, np.inf) == pytest.approx(found)
+            new_lengths = gap_lengths(np.array([time_s]), before_s, step_s, gap_s, np.inf)
+            assert len(new_lengths) == estimator.state["gaps"][0] - gaps
+            lengths += new_lengths
+    assert gap_lengths(times[1:], float(times[0]), 0.0, gap_s, np.inf) == pytest.approx(lengths)

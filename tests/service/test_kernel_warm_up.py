@@ -1,4 +1,4 @@
-"""What is done before samples come, so that it stops nothing later."""
+"""Kernel warm-up before the first sample, which prevents long garbage collections later."""
 
 import gc
 

@@ -36,6 +36,8 @@ SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), publish=PublishSettings(
 
 @dataclass
 class Run:
+    """Running estimation loop with its inputs and outputs."""
+
     source: ScriptedSource
     sink: Collector
     requests: RequestDispatcher
@@ -44,7 +46,7 @@ class Run:
     delivery: DeliveryStats
 
     async def ask(self, name: str, **arguments: Any) -> Any:
-        """The data of the response; UserError where there is an error."""
+        """Send a request. Return the data of the response, or raise its error as a UserError."""
         response = await self.requests.handle(name, json.dumps(arguments).encode())
         assert response
         answer = json.loads(response)
@@ -61,9 +63,9 @@ class Run:
 async def running(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
     source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), DeliveryStats()
     requests = RequestDispatcher(delivery, ("set_soc", "current_zero", "publish_rate"))
-    edges = {"requests": requests, "delivery": delivery}
+    arguments = {"requests": requests, "delivery": delivery}
     task = asyncio.create_task(
-        run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, **edges, **options)
+        run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, **arguments, **options)
     )
     try:
         yield Run(source, sink, requests, task, stop, delivery)
@@ -83,7 +85,7 @@ async def test_voltage_current_and_power_are_means_of_the_publish_window() -> No
     (window,) = estimates(run.sink)
     assert window.voltage_v == pytest.approx(3.85)
     assert window.current_a == pytest.approx(0.5)
-    assert window.power_w == pytest.approx(3.9 / 2)  # the mean of products, not the product of means
+    assert window.power_w == pytest.approx(3.9 / 2)  # the mean of the products of current and voltage
     assert window.sample_rate_hz == pytest.approx(100.0)
     assert window.frames_received == 100
 
@@ -95,10 +97,10 @@ async def test_blocks_and_single_steps_give_equal_states() -> None:
         for i in range(0, 500, 7):
             run.source.give(*rows[i : i + 7])
         live = await run.end()
-    alone = new_estimator(SETTINGS, CELL)
+    single_steps = new_estimator(SETTINGS, CELL)
     for row in rows:
-        alone.step(*row)
-    assert live.record.tobytes() == alone.record.tobytes()
+        single_steps.step(*row)
+    assert live.record.tobytes() == single_steps.record.tobytes()
 
 
 async def test_unusable_samples_are_dropped_and_counted() -> None:
@@ -116,8 +118,8 @@ async def test_unusable_samples_are_dropped_and_counted() -> None:
         )
         await run.sink.until(lambda s: s.health.samples["gaps"] == 1)
         await run.end()
-    counted = run.sink.snapshots[-1].health.samples
-    assert counted == {
+    counters = run.sink.snapshots[-1].health.samples
+    assert counters == {
         "samples": 3,
         "dropped_not_finite": 2,
         "dropped_range": 2,
@@ -138,12 +140,12 @@ async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> Non
         silent = await run.sink.until(lambda s: s.health.samples["samples"] == 1 and not s.health.sensor_online)
         assert silent.estimate is None
         assert "no usable sample" in (silent.health.sensor_message or "")
-        seen = len(run.sink.snapshots)
+        snapshots_before = len(run.sink.snapshots)
         run.source.give((1.0, 0.1, 380.0))
-        snapshot = await run.sink.until(lambda s: "dropped" in (s.health.sensor_message or ""), skip=seen)
+        snapshot = await run.sink.until(lambda s: "dropped" in (s.health.sensor_message or ""), skip=snapshots_before)
         assert "dropped since: 1 outside the cell's range" in (snapshot.health.sensor_message or "")
         run.source.give((2.0, 0.1, 3.8))
-        await run.sink.until(lambda s: s.health.sensor_online, skip=seen)
+        await run.sink.until(lambda s: s.health.sensor_online, skip=snapshots_before)
         later = await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
         assert "dropped" not in (later.health.sensor_message or "")
 
@@ -199,9 +201,9 @@ async def test_a_step_of_the_wall_clock_changes_time_stamps_only() -> None:
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.estimate is not None)
         offset = -7200.0
-        seen = len(run.sink.snapshots)
+        snapshots_before = len(run.sink.snapshots)
         run.source.give((0.1, 0.1, 3.8))
-        after = await run.sink.until(lambda s: s.estimate is not None, skip=seen)
+        after = await run.sink.until(lambda s: s.estimate is not None, skip=snapshots_before)
         state = await run.end()
     assert after.estimate
     assert after.estimate.publish_time.startswith("2023-11-14T20:13:20")
@@ -244,47 +246,47 @@ async def test_the_properties_of_a_silent_board_stay_published(again: dict[str, 
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: bool(s.info.board))
         run.source.board = {}
-        seen = len(run.sink.snapshots)
+        snapshots_before = len(run.sink.snapshots)
         at_s = run.sink.snapshots[-1].health.uptime_s
-        await run.sink.until(lambda s: s.health.uptime_s > at_s + 1.0, skip=seen)
+        await run.sink.until(lambda s: s.health.uptime_s > at_s + 1.0, skip=snapshots_before)
         run.source.board = again
         await run.end()
-    boards = [s.info.board for s in run.sink.snapshots[seen:]]
+    boards = [s.info.board for s in run.sink.snapshots[snapshots_before:]]
     assert {} not in boards
     assert boards[-1] == (again or {"serial": "A1", "firmware": "1.0"})
 
 
-class Zeroed:
-    """What has the board take the present current as zero, and a clock that the test sets."""
+class ZeroRecorder:
+    """Counter of the commands that set the board's current zero, with a clock that the test sets."""
 
     def __init__(self) -> None:
-        self.times, self.now_s = 0, 0.0
+        self.calls, self.now_s = 0, 0.0
         self.clock = Clock(monotonic=lambda: self.now_s)
 
     async def __call__(self) -> None:
-        self.times += 1
+        self.calls += 1
 
-    async def watch(self, run: Run, rows: list[tuple[float, float]]) -> None:
-        """A second for each (current, voltage), from the first publication on."""
+    async def feed(self, run: Run, rows: list[tuple[float, float]]) -> None:
+        """Feed one sample a second with these currents and voltages, after the first publication."""
         while not run.sink.snapshots:
             self.now_s += 0.1
             await asyncio.sleep(0.01)
         for current_a, voltage_v in rows:
             self.now_s += 1.0
-            seen = len(run.sink.snapshots)
+            snapshots_before = len(run.sink.snapshots)
             run.source.give((self.now_s, current_a, voltage_v))
-            await run.sink.until(lambda s: s.estimate is not None, skip=seen)
+            await run.sink.until(lambda s: s.estimate is not None, skip=snapshots_before)
 
 
 AT_REST = [(0.03, 3.8)] * (round(REST_S) + 2)
 
 
 async def test_current_zero_is_accepted_at_rest() -> None:
-    zero = Zeroed()
+    zero = ZeroRecorder()
     async with running(current_zero=zero, clock=zero.clock) as run:
-        await zero.watch(run, AT_REST)
+        await zero.feed(run, AT_REST)
         assert await run.ask("current_zero") == {}
-    assert zero.times == 1
+    assert zero.calls == 1
 
 
 @pytest.mark.parametrize(
@@ -298,24 +300,24 @@ async def test_current_zero_is_accepted_at_rest() -> None:
     ],
 )
 async def test_current_zero_is_rejected_while_current_flows(rows: list[tuple[float, float]], why: str) -> None:
-    zero = Zeroed()
+    zero = ZeroRecorder()
     async with running(current_zero=zero, clock=zero.clock) as run:
-        await zero.watch(run, rows)
+        await zero.feed(run, rows)
         with pytest.raises(UserError, match=why):
             await run.ask("current_zero")
-    assert zero.times == 0
+    assert zero.calls == 0
 
 
 async def test_rest_before_a_silence_does_not_count() -> None:
-    zero = Zeroed()
+    zero = ZeroRecorder()
     async with running(current_zero=zero, clock=zero.clock) as run:
-        await zero.watch(run, AT_REST)
+        await zero.feed(run, AT_REST)
         zero.now_s += REST_S
         await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
-        await zero.watch(run, AT_REST[:2])
+        await zero.feed(run, AT_REST[:2])
         with pytest.raises(UserError, match="watched for"):
             await run.ask("current_zero")
-    assert zero.times == 0
+    assert zero.calls == 0
 
 
 async def test_current_zero_is_rejected_by_a_source_without_it() -> None:
@@ -326,8 +328,8 @@ async def test_current_zero_is_rejected_by_a_source_without_it() -> None:
 
 
 async def test_a_parameter_has_its_source_and_a_missing_capacitance_its_reason() -> None:
-    known = {"pack": PackSettings(initial_soc=0.001), "identifier": IdentifierSettings(soc_std=0.005)}
-    nearly_empty = SETTINGS.model_copy(update=known)
+    changes = {"pack": PackSettings(initial_soc=0.001), "identifier": IdentifierSettings(soc_std=0.005)}
+    nearly_empty = SETTINGS.model_copy(update=changes)
     async with running(nearly_empty) as run:
         run.source.give((0.0, 0.0, 2.5))
         run.source.finish()

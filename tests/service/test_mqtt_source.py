@@ -1,4 +1,4 @@
-"""A BMS by MQTT, through to the state: stale values, garbage, a publisher that falls silent, a broker that dies."""
+"""Service with a BMS that publishes by MQTT: retained and invalid values, silent publishers, broker restarts."""
 
 import asyncio
 import contextlib
@@ -26,7 +26,7 @@ ONLINE = AVAILABILITY, b"online"
 
 
 def settings(broker: Broker, **source: object) -> Settings:
-    """Of a pack whose JK-BMS an ESPHome node publishes."""
+    """Return the settings of a pack whose JK-BMS is published by an ESPHome node."""
     jk = {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms", "interval_s": 0.2}
     return Settings.model_validate(
         {
@@ -48,15 +48,15 @@ async def publish(broker: Broker, voltage: str, current: str) -> None:
 
 @contextlib.asynccontextmanager
 async def publishing(broker: Broker, voltage: str, current: str) -> AsyncIterator[None]:
-    """So again and again, whatever becomes of the broker."""
+    """Publish the values repeatedly, also after a restart of the broker."""
 
-    async def on() -> None:
+    async def repeat() -> None:
         while True:
             with contextlib.suppress(aiomqtt.MqttError):
                 await publish(broker, voltage, current)
             await asyncio.sleep(0.02)
 
-    task = asyncio.create_task(on())
+    task = asyncio.create_task(repeat())
     try:
         yield
     finally:
@@ -77,14 +77,14 @@ async def serving(settings_: Settings, tap: CaptureRecorder | None = None) -> As
 async def test_readings_over_mqtt_are_estimated_through_disconnections_and_restarts(
     broker: Broker, tmp_path: Path
 ) -> None:
-    await publish(broker, "40.00", "99.0")  # of yesterday: the broker keeps it
-    settings_, path = settings(broker), tmp_path / "heard.raw"
+    await publish(broker, "40.00", "99.0")  # retained messages of an earlier run
+    settings_, path = settings(broker), tmp_path / "lines.raw"
     with CaptureRecorder(path, make_header(settings_.sensor, settings_.source)) as recording:
         async with serving(settings_, recording):
             async with Listener(broker, "bms/#") as listener:
-                await estimated(broker, listener)
-                await silent(listener)
-                await garbled(broker, listener)
+                await check_live_and_retained(broker, listener)
+                await check_silence(listener)
+                await check_invalid_payloads(broker, listener)
             broker.stop()
             broker.start()
             async with Listener(broker, "bms/#") as listener, publishing(broker, "52.00", "3.5"):
@@ -94,8 +94,8 @@ async def test_readings_over_mqtt_are_estimated_through_disconnections_and_resta
     assert min(block["voltage_v"].min() for block in RawCapture(path)) == 52.0
 
 
-async def estimated(broker: Broker, listener: Listener) -> None:
-    """Live messages are used, retained ones are not."""
+async def check_live_and_retained(broker: Broker, listener: Listener) -> None:
+    """Check that live messages are used and retained ones are ignored."""
     await listener.wait_json(HEALTH, lambda h: h["line"]["retained"] == 4)
     async with publishing(broker, "53.00", "-12.5"):
         state = await listener.wait_json(STATE)
@@ -104,16 +104,16 @@ async def estimated(broker: Broker, listener: Listener) -> None:
         await listener.wait_json(HEALTH, lambda h: h["sensor_online"])
 
 
-async def silent(listener: Listener) -> None:
-    """Nobody publishes any more."""
+async def check_silence(listener: Listener) -> None:
+    """Check that the sensor goes offline after the last message."""
     online = max(i for i, (topic, payload, _) in enumerate(listener.messages) if (topic, payload) == ONLINE)
     await listener.wait(AVAILABILITY, lambda payload: payload == b"offline", skip=online)
     health = await listener.wait_json(HEALTH, lambda h: not h["sensor_online"], skip=online)
     assert health["sensor_message"]
 
 
-async def garbled(broker: Broker, listener: Listener) -> None:
-    """Payloads without a number are counted, and the reason is reported."""
+async def check_invalid_payloads(broker: Broker, listener: Listener) -> None:
+    """Check that payloads without a number are counted and reported."""
     skip = len(listener.messages)
     await publish(broker, "unavailable", "nan")
     reason = f"esphome-jk jk-bms by MQTT, {broker.url}: voltage: jk-bms/sensor/jk-bms_total_voltage/state: no number: "

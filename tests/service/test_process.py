@@ -1,4 +1,4 @@
-"""The real program: signals, kills, their effect at the broker, and errors at the start."""
+"""Service as a process: signals, kills, last wills at the broker, full and hanging disks, and errors at the start."""
 
 import asyncio
 import contextlib
@@ -51,10 +51,10 @@ from bms_estimator.service import checkpoint_writer
 checkpoint_writer.DISK_HUNG_S = checkpoint_writer.FINAL_SAVE_S = 0.1
 main()
 """
-"""The program on a disk that never answers once something is to be on it."""
+"""Program whose fsync never returns."""
 
 
-WITH_HANGUP = """
+DEFAULT_HANGUP = """
 import signal
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 from bms_estimator.cli.main import main
@@ -63,7 +63,7 @@ main()
 """Program with the default SIGHUP, which the tests themselves may ignore, as under nohup."""
 
 
-STARTING = """
+SIGNAL_DURING_START = """
 import os, signal
 from bms_estimator.cli.live import run
 from bms_estimator.cli.main import main
@@ -101,8 +101,8 @@ def checkpoints(state_home: Path) -> list[Path]:
     return list((state_home / "bms-estimator").glob("*.npz"))
 
 
-async def ended(process: Process) -> list[Any]:
-    """Ask it to end. Returns its log."""
+async def stop_service(process: Process) -> list[Any]:
+    """Stop the service by SIGTERM. Return its log."""
     process.send_signal(signal.SIGTERM)
     assert process.stderr
     log = await asyncio.wait_for(process.stderr.read(), LONG_S)
@@ -136,7 +136,7 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
         before = len(live.messages)
         async with service(pack) as process:
             await live.wait("bms/pack/state", skip=before)
-            lines = await ended(process)
+            lines = await stop_service(process)
         await live.wait("bms/pack/availability", lambda p: p == b"offline", skip=before)
     board.cancel()
     (checkpoint,) = checkpoints(state_home)  # no folder is configured
@@ -147,7 +147,7 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
 async def test_a_full_disk_does_not_end_the_service(
     tmp_path: Path, line: Line, broker: Broker, full_disk: Path
 ) -> None:
-    """It takes neither checkpoints nor the log, and the estimate goes on."""
+    """Neither checkpoints nor the log can be written, and the estimates continue."""
     line.plug()
     board = asyncio.create_task(feed(line))
     pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{full_disk}"\ncheckpoint_s = 1\n')
@@ -189,10 +189,10 @@ async def test_a_stopping_service_saves_first_although_its_broker_hangs(
     async with Listener(broker) as live, service(pack_file(tmp_path, line, broker)) as process:
         state = await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 50)
         broker.freeze()
-        await ended(process)
-        seen = len(live.messages)
+        await stop_service(process)
+        messages_before = len(live.messages)
         broker.thaw()
-        await live.wait("bms/pack/availability", lambda payload: payload == b"offline", skip=seen)
+        await live.wait("bms/pack/availability", lambda payload: payload == b"offline", skip=messages_before)
     board.cancel()
     (checkpoint,) = checkpoints(state_home)
     with np.load(checkpoint) as saved:
@@ -203,7 +203,7 @@ async def test_a_stopping_service_saves_first_although_its_broker_hangs(
 async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shutdown(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
-    """As where the log is on that disk, too."""
+    """The log is not read, as if it were on the hanging disk, too."""
     line.plug()
     board = asyncio.create_task(feed(line))
     program, pack = [sys.executable, "-c", HUNG_DISK], pack_file(tmp_path, line, broker)
@@ -229,7 +229,7 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
 async def test_hangup_ends_the_service_cleanly(
     tmp_path: Path, line: Line, broker: Broker, number: signal.Signals
 ) -> None:
-    pack, program = pack_file(tmp_path, line, broker, "house"), [sys.executable, "-c", WITH_HANGUP]
+    pack, program = pack_file(tmp_path, line, broker, "house"), [sys.executable, "-c", DEFAULT_HANGUP]
     async with Listener(broker) as live, service(pack, program=program) as process:
         await live.wait("bms/house/health")
         process.send_signal(number)
@@ -240,7 +240,7 @@ async def test_hangup_ends_the_service_cleanly(
 async def test_a_service_that_is_still_starting_ends_cleanly_on_a_signal(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
-    program = [sys.executable, "-c", STARTING]
+    program = [sys.executable, "-c", SIGNAL_DURING_START]
     async with service(pack_file(tmp_path, line, broker), program=program) as process:
         assert process.stderr
         log = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
@@ -273,7 +273,7 @@ async def test_two_packs_in_one_process_have_their_own_board_topics_log_and_chec
         other.plug()
         boards.append(asyncio.create_task(feed(other)))
         await live.wait_json("bms/shed/state")
-        lines = await ended(process)
+        lines = await stop_service(process)
         for name in ("house", "shed"):
             await live.wait(f"bms/{name}/availability", lambda p: p == b"offline")
     for board in boards:

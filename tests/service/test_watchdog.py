@@ -1,4 +1,4 @@
-"""What systemd and health wait_for of a loop that turns, of a source that hangs, and of what waits."""
+"""Watchdog and status messages to systemd, and latency, idle time and waiting reads in health."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ from tests.scripted_source import ScriptedSource
 
 
 class Systemd:
-    """Hears one pack."""
+    """Receiver of the notifications of one pack's service."""
 
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -33,16 +33,16 @@ class Systemd:
         self._socket.setblocking(False)
         self.notifier = SystemdNotifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "30000"})
 
-    async def wait_for(self, wanted: str) -> str:
-        """Wait for a state that begins so."""
+    async def wait_for(self, prefix: str) -> str:
+        """Wait for a notification that begins with ``prefix``."""
         async with asyncio.timeout(LONG_S):
             while True:
                 state = (await asyncio.get_running_loop().sock_recv(self._socket, 4096)).decode()
-                if state.startswith(wanted):
+                if state.startswith(prefix):
                     return state
 
     def received(self) -> list[str]:
-        """What has come since."""
+        """Return the notifications that have arrived since the last call."""
         states = []
         with contextlib.suppress(BlockingIOError):
             while True:
@@ -63,8 +63,8 @@ def systemd(tmp_path: Path):
 async def test_a_hanging_source_stops_the_watchdog_notifications(systemd: Systemd) -> None:
     health = SourceHealth(0.0, 0.0, 0)
     source, sink = ScriptedSource(), Collector()
-    edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
-    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges, source_health=lambda: health))
+    arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
+    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **arguments, source_health=lambda: health))
     await systemd.wait_for("WATCHDOG=1")  # no sample arrives, but the source still tries
     health = SourceHealth(publisher.SOURCE_HUNG_S + 1.0, 0.0, 0)
     for _ in range(3):
@@ -105,24 +105,22 @@ async def test_the_idle_time_of_a_source_s_task_grows_while_it_hangs(
 
 async def test_systemctl_status_shows_the_soc_or_the_reason_for_missing_samples(systemd: Systemd) -> None:
     source, sink = ScriptedSource(), Collector()
-    edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
-    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges))
+    arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
+    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **arguments))
     assert await systemd.wait_for("READY=1") == "READY=1\nSTATUS=estimating pack"
     source.message = "waiting for /dev/none: it does not exist"
     await systemd.wait_for("STATUS=estimating pack: no samples: ")
     source.give((0.0, 0.1, 3.8))
-    assert (await systemd.wait_for("STATUS=estimating pack: SOC 0.")).removeprefix("STATUS=estimating pack: SOC ")[
-        :3
-    ] == "0.5"
+    assert (await systemd.wait_for("STATUS=estimating pack: SOC 0.")).startswith("STATUS=estimating pack: SOC 0.5")
     source.finish()
     await asyncio.wait_for(task, LONG_S)
 
 
 async def test_health_contains_latency_and_waiting_reads() -> None:
     source, sink = ScriptedSource(), Collector()
-    late_s = [0.3]
-    edges = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
-    live = run_estimation_loop(SETTINGS, CELL, **edges, source_health=lambda: SourceHealth(0.0, late_s[0], 7))
+    latency_s = [0.3]
+    arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
+    live = run_estimation_loop(SETTINGS, CELL, **arguments, source_health=lambda: SourceHealth(0.0, latency_s[0], 7))
     task = asyncio.create_task(live)
     first = await sink.until(lambda _: True)
     assert first.health.loop.latency_p50_s is None
@@ -138,14 +136,14 @@ async def test_health_contains_latency_and_waiting_reads() -> None:
 def test_latency_percentiles_are_accurate_to_a_fifth() -> None:
     latency = Latency()
     assert latency.take() is None
-    for late_s in [0.002] * 97 + [0.05, 0.05, 0.7]:
-        latency.add(late_s)
-    p50_s, p99_s, most_s = latency.take() or (0.0, 0.0, 0.0)
+    for latency_s in [0.002] * 97 + [0.05, 0.05, 0.7]:
+        latency.add(latency_s)
+    p50_s, p99_s, max_s = latency.take() or (0.0, 0.0, 0.0)
     assert 0.002 <= p50_s < 0.0024
     assert 0.05 <= p99_s < 0.06
-    assert most_s == 0.7
-    for late_s in (-1.0, 0.0, 1e6):
-        latency.add(late_s)
+    assert max_s == 0.7
+    for latency_s in (-1.0, 0.0, 1e6):
+        latency.add(latency_s)
     assert latency.take() == pytest.approx((1e-5, 284.0, 1e6), rel=0.5)
 
 

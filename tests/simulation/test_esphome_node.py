@@ -1,4 +1,4 @@
-"""The simulated JK-BMS by MQTT, heard by the profile that it is made for."""
+"""Simulated ESPHome node of a JK-BMS, read by the MQTT source with the profile esphome-jk."""
 
 import asyncio
 
@@ -13,32 +13,32 @@ from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
 
-async def test_what_the_node_publishes_is_heard_with_signs_and_cells(broker: Broker) -> None:
-    told = Settings.model_validate(
+async def test_published_values_are_received_with_signs_and_cells(broker: Broker) -> None:
+    settings = Settings.model_validate(
         {"source": {"kind": "mqtt", "url": broker.url, "profile": "esphome-jk", "prefix": "bms7"}}
     )
-    source = open_line_source(told)
+    source = open_line_source(settings)
     assert source
     pack = lambda time_s: Reading(12.5 if time_s > 0 else 0.0, 53.0, 21.5)  # noqa: E731 - a signal
     node = SimulatedNode(pack, cells=16, mqtt=MqttSettings(url=broker.url), prefix="bms7", speed=20.0)
     async with asyncio.timeout(LONG_S), Listener(broker, "bms7/status") as listener, source:
-        playing = asyncio.create_task(node.run(1e9))
-        taken = 0
+        node_task = asyncio.create_task(node.run(1e9))
+        received_samples = 0
         async for block in source:
             assert (block["voltage_v"] == 53.0).all()
             assert (block["current_a"] == 12.5).all()
-            taken += block.size
-            if taken >= 3:
+            received_samples += block.size
+            if received_samples >= 3:
                 break
         assert block["temperature_c"][-1] == 21.5
         assert source.cells.shape == (1, 16)
         assert source.cells.mean() == pytest.approx(53.0 / 16, abs=1e-3)
-        playing.cancel()  # as Ctrl-C does: the broker says it by the will
-        await asyncio.gather(playing, return_exceptions=True)
+        node_task.cancel()  # as Ctrl-C does; then the broker publishes the will
+        await asyncio.gather(node_task, return_exceptions=True)
         await listener.wait("bms7/status", lambda payload: payload == b"offline")
 
 
-async def test_it_ends_after_its_seconds_and_says_so(broker: Broker) -> None:
+async def test_node_stops_after_its_duration_and_publishes_offline(broker: Broker) -> None:
     node = SimulatedNode(lambda _: Reading(1.0, 3.3, 21.5), cells=1, mqtt=MqttSettings(url=broker.url), speed=1000.0)
     async with asyncio.timeout(LONG_S), Listener(broker, "jk-bms/#") as listener:
         await node.run(10.0)

@@ -1,4 +1,4 @@
-"""Simulated BMS on a pseudo-terminal read by the real serial source: values, cells, faults, silence, replay."""
+"""Simulated BMS on a pseudo-terminal, read by the serial source: values, cells, faults, silence and replay."""
 
 import asyncio
 import contextlib
@@ -21,29 +21,32 @@ from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import LONG_S
 
 CELLS = 16
-RESOLVED = {"jbd": (0.01, 0.01, 0.1), "daly": (0.1, 0.1, 1.0), "jk": (0.01, 0.01, 1.0), "jk-pb": (0.001, 0.001, 0.1)}
-"""Voltage [V], current [A], temperature [K] by protocol."""
-COUNTED = {
+RESOLUTIONS = {"jbd": (0.01, 0.01, 0.1), "daly": (0.1, 0.1, 1.0), "jk": (0.01, 0.01, 1.0), "jk-pb": (0.001, 0.001, 0.1)}
+"""Resolution of voltage [V], current [A] and temperature [K] by protocol."""
+FAULT_COUNTERS = {
     BmsFault.CORRUPT: ("crc_errors", "length_errors", "noise_bytes"),
     BmsFault.SHORT: ("short_frames", "crc_errors", "noise_bytes"),
     BmsFault.NOISE: ("noise_bytes",),
 }
-"""Where a fault shows."""
-FASTER = {
+"""Counters of which at least one increases with a fault."""
+SHORT_INTERVALS = {
     "protocols.base.polled_protocol.POLL_CYCLE_S": 0.1,
     "protocols.base.polled_protocol.QUERY_INTERVAL_S": 0.01,
     "sources.serial.serial_source.SEND_INTERVAL_S": 0.02,
 }
-"""Than a BMS is asked, to spare time."""
+"""Intervals that are shortened to save test time."""
+AMPLITUDE_A = 40.0
+MEAN_V = 52.8
+TEMPERATURE_C = 21.0
 
 
-def swinging(time_s: float) -> Reading:
-    """A load that charges and discharges; current and voltage are the same sine."""
-    return Reading(40.0 * math.sin(time_s), 52.8 - math.sin(time_s), 21.0)
+def alternating_load(time_s: float) -> Reading:
+    """Return a reading of a sinusoidal current. The voltage deviates from its mean in proportion to the current."""
+    return Reading(AMPLITUDE_A * math.sin(time_s), MEAN_V - math.sin(time_s), TEMPERATURE_C)
 
 
-class Taken:
-    """What a source has brought."""
+class SampleRecord:
+    """Samples and cell voltages that a source has delivered."""
 
     def __init__(self) -> None:
         self.blocks = list[SampleBlock]()
@@ -53,14 +56,15 @@ class Taken:
     def count(self) -> int:
         return sum(block.size for block in self.blocks)
 
-    async def take(self, source: SerialSource) -> None:
+    async def read(self, source: SerialSource) -> None:
         async for block in source:
             self.blocks.append(block.copy())
             self.cells += source.cells.tolist()
 
-    async def more(self, samples: int) -> None:
-        enough = self.count + samples
-        await until(lambda: self.count >= enough)
+    async def wait_for_more(self, samples: int) -> None:
+        """Wait until this number of further samples has arrived."""
+        final_count = self.count + samples
+        await until(lambda: self.count >= final_count)
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -70,15 +74,17 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 @contextlib.asynccontextmanager
-async def read(bms: SimulatedBms, protocol: str, tap: CaptureRecorder) -> AsyncIterator[tuple[SerialSource, Taken]]:
-    """The reader of the line of a BMS that answers."""
+async def read_bms(
+    bms: SimulatedBms, protocol: str, tap: CaptureRecorder
+) -> AsyncIterator[tuple[SerialSource, SampleRecord]]:
+    """Run the BMS and a serial source that reads it. Yield the source and the record of its samples."""
     with bms:
         sensor = SensorSettings.model_validate({"port": bms.path, "protocol": protocol})
-        taken = Taken()
+        record = SampleRecord()
         async with SerialSource(sensor, tap=tap, first_retry_s=0.05, silent_s=0.5) as board:
-            tasks = [asyncio.create_task(bms.run()), asyncio.create_task(taken.take(board))]
+            tasks = [asyncio.create_task(bms.run()), asyncio.create_task(record.read(board))]
             try:
-                yield board, taken
+                yield board, record
             finally:
                 for task in tasks:
                     task.cancel()
@@ -86,38 +92,40 @@ async def read(bms: SimulatedBms, protocol: str, tap: CaptureRecorder) -> AsyncI
 
 
 @pytest.mark.parametrize("name", BMS_ANSWERS)
-async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happens_to_its_answers(
+async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for constant, value in FASTER.items():
+    for constant, value in SHORT_INTERVALS.items():
         monkeypatch.setattr(f"bms_estimator.{constant}", value)
     protocol, path = name.removesuffix("-pb"), tmp_path / "line.bms"
-    bms = SimulatedBms(name, swinging, cells=CELLS)
+    bms = SimulatedBms(name, alternating_load, cells=CELLS)
     header = make_header(SensorSettings.model_validate({"protocol": protocol}))
     with CaptureRecorder(path, header) as recording:
-        async with read(bms, protocol, recording) as (board, taken):
-            await taken.more(2)
+        async with read_bms(bms, protocol, recording) as (board, record):
+            await record.wait_for_more(2)
             assert (board.message, board.counters["crc_errors"], board.counters["noise_bytes"]) == (None, 0, 0)
-            for fault, names in COUNTED.items():
+            for fault, names in FAULT_COUNTERS.items():
                 before = sum(board.counters[counter] for counter in names)
                 bms.inject(fault)
                 await until(lambda: sum(board.counters[c] for c in names) > before)  # noqa: B023 - awaited here
-                await taken.more(1)
+                await record.wait_for_more(1)
             bms.inject(BmsFault.SILENCE, 1_000_000)
             await until(lambda: board.message)
             assert "open, but silent" in (board.message or "")
             bms.clear_faults()
-            await taken.more(1)
+            await record.wait_for_more(1)
             assert board.message is None
             counters = board.counters
-    live = np.concatenate(taken.blocks)
-    step_v, step_a, step_k = RESOLVED[name]
-    assert np.abs(live["temperature_c"] - 21.0).max() <= step_k / 2 + 1e-9
-    assert np.abs(live["current_a"] / 40.0 - (52.8 - live["voltage_v"])).max() <= (step_v + step_a / 40.0) / 2 + 1e-9
-    whole = [row for row in taken.cells if not any(math.isnan(v) for v in row)]
-    assert len(whole) >= 3
-    assert {len(row) for row in whole} == {CELLS}
-    assert max(abs(v - sum(row) / CELLS) for row in whole for v in row) < 2 * SPREAD_V + 1e-3
+    live = np.concatenate(record.blocks)
+    step_v, step_a, step_k = RESOLUTIONS[name]
+    assert np.abs(live["temperature_c"] - TEMPERATURE_C).max() <= step_k / 2 + 1e-9
+    voltage_drop_v = MEAN_V - live["voltage_v"]  # 1 V at the amplitude of the current
+    max_error_v = (step_v + step_a / AMPLITUDE_A) / 2 + 1e-9
+    assert np.abs(live["current_a"] / AMPLITUDE_A - voltage_drop_v).max() <= max_error_v
+    complete_rows = [row for row in record.cells if not any(math.isnan(v) for v in row)]
+    assert len(complete_rows) >= 3
+    assert {len(row) for row in complete_rows} == {CELLS}
+    assert max(abs(v - sum(row) / CELLS) for row in complete_rows for v in row) < 2 * SPREAD_V + 1e-3
     replay = RawCapture(path)
     replayed = np.concatenate(list(replay))
     for column in ("time_s", "voltage_v", "current_a", "temperature_c", "status"):
@@ -125,6 +133,6 @@ async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happen
     assert replay.decoder.counters == {counter: counters[counter] for counter in replay.decoder.counters}
 
 
-def test_more_cells_than_a_bms_has_room_for_are_refused() -> None:
+def test_too_many_cells_for_a_bms_are_rejected() -> None:
     with pytest.raises(ValueError, match="40 cells: a simulated BMS has 1 to 32"):
-        SimulatedBms("jbd", swinging, cells=40)
+        SimulatedBms("jbd", alternating_load, cells=40)

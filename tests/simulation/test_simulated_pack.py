@@ -1,10 +1,10 @@
-"""The pack that simulated boards measure."""
+"""Simulated pack, which simulated boards measure."""
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.simulation.simulated_pack import FULL_SOC, SimulatedPack, constant
 
 
-def test_a_full_pack_is_not_charged_by_its_load_and_gives_what_it_asks_for():
+def test_full_pack_accepts_no_charge_but_can_be_discharged():
     cell = load_cell("chen_mora")
     charged = SimulatedPack(cell, constant(-cell.cell.capacity_ah), soc=FULL_SOC - 0.01)
     currents = [charged(second).current_a for second in range(1, 601)]

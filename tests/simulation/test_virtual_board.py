@@ -1,4 +1,4 @@
-"""The board in Python: what it sends is what it was fed, and faults arrive as what they are."""
+"""Virtual board in Python: its frames contain the simulated readings, and its faults are counted by the decoder."""
 
 import asyncio
 import contextlib
@@ -36,79 +36,89 @@ from bms_estimator.simulation.virtual_adc import BoardParts, Reading, compute_wi
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
 from tests.patience import LONG_S
 
-STEADY = Reading(2.5, 22.2, 25.0)
-
-LAST = b"and that is all"
+STEADY = Reading(current_a=2.5, voltage_v=22.2, temperature_c=25.0)
+DIVIDER = 6.1
+VOLTS_PER_AMPERE = 0.1
+END_MARK = b"and that is all"
+"""Bytes that a board sends at the end of a test."""
 
 Event = Callable[[VirtualBoard], None]
 
 
-async def received(board: VirtualBoard, samples: int, events: dict[int, Event] | None = None) -> bytes:
-    """All that a board sends while it takes ``samples`` samples; events by the number of samples before them."""
+async def receive(board: VirtualBoard, samples: int, events: dict[int, Event] | None = None) -> bytes:
+    """Run a board for ``samples`` samples. Return the bytes that it sends.
+
+    Args:
+        board: A board at 100 Hz.
+        samples: Number of samples.
+        events: Events by the number of samples before them.
+    """
     data = bytearray()
+    period_s = compute_window(100)[1] * 1e-9
 
     async def run() -> None:
         try:
-            for at in sorted({*(events or {}), samples}):
+            for count in sorted({*(events or {}), samples}):
                 await board.run(
-                    (at - board.samples - 0.5) * compute_window(100)[1] * 1e-9
-                )  # the last one begins by then
-                if events and at in events:
-                    events[at](board)
+                    (count - board.samples - 0.5) * period_s
+                )  # half a period early: no further sample begins
+                if events and count in events:
+                    events[count](board)
         finally:
-            board.send(LAST)
+            board.send(END_MARK)
 
     with board:
         host = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
             async with asyncio.timeout(LONG_S):
                 task = asyncio.create_task(run())
-                while not data.endswith(LAST):
+                while not data.endswith(END_MARK):
                     await asyncio.sleep(0.005)
                     with contextlib.suppress(BlockingIOError):
                         data += os.read(host, 1 << 16)
                 await task
         finally:
             os.close(host)
-    return bytes(data.removesuffix(LAST))
+    return bytes(data.removesuffix(END_MARK))
 
 
-def board(reading: Reading = STEADY, **options: Any) -> VirtualBoard:
+def make_board(reading: Reading = STEADY, **options: Any) -> VirtualBoard:
+    """Return a board that measures a constant reading as fast as possible."""
     return VirtualBoard(lambda _: reading, speed=math.inf, **options)
 
 
-def decoded(data: bytes) -> tuple[SampleBlock, FrameCounters]:
+def decode(data: bytes) -> tuple[SampleBlock, FrameCounters]:
     decoder = FrameDecoder()
     return decoder.feed(0.0, data), decoder.counters
 
 
-async def test_frames_hold_the_readings_within_the_converters_resolution() -> None:
-    block, counters = decoded(await received(board(), 500))
+async def test_frames_contain_the_readings_within_the_resolution_of_the_adc() -> None:
+    block, counters = decode(await receive(make_board(), 500))
     assert block.size == 500
     assert np.allclose(np.diff(block["time_s"]), 0.01, rtol=0.0, atol=1e-9)
     step_v = 5.0 / 1024
-    assert np.abs(block["voltage_v"] - 22.2).max() < 6.1 * step_v
-    assert np.abs(block["current_a"] - 2.5).max() < step_v / 0.1
-    assert block["voltage_v"].mean() == pytest.approx(22.2, abs=0.2 * 6.1 * step_v)
+    assert np.abs(block["voltage_v"] - 22.2).max() < DIVIDER * step_v
+    assert np.abs(block["current_a"] - 2.5).max() < step_v / VOLTS_PER_AMPERE
+    assert block["voltage_v"].mean() == pytest.approx(22.2, abs=0.2 * DIVIDER * step_v)
     assert block["temperature_c"][-1] == pytest.approx(25.0, abs=0.3)
     assert counters == FrameCounters(bytes_received=counters.bytes_received, frames_received=500)
 
 
-async def test_a_supply_that_is_not_five_volts_is_found_out() -> None:
-    block, _ = decoded(await received(board(parts=BoardParts(supply_v=4.75)), 300))
+async def test_supply_other_than_5_v_does_not_change_the_values() -> None:
+    block, _ = decode(await receive(make_board(parts=BoardParts(supply_v=4.75)), 300))
     assert block["voltage_v"].mean() == pytest.approx(22.2, rel=1e-3)
     assert block["current_a"].mean() == pytest.approx(2.5, rel=2e-3)
 
 
-async def test_a_current_sensor_with_a_slope_of_its_own_is_measured_right_at_any_supply() -> None:
+async def test_supply_does_not_change_the_current_of_an_absolute_sensor() -> None:
     parts = BoardParts(supply_v=4.75, volts_per_ampere=0.09, ratiometric=False)
-    block, _ = decoded(await received(board(parts=parts), 300))
+    block, _ = decode(await receive(make_board(parts=parts), 300))
     assert block["current_a"].mean() == pytest.approx(2.5, rel=2e-3)
 
 
-async def test_the_same_seed_sends_the_same_bytes() -> None:
-    assert await received(board(seed=3), 50) == await received(board(seed=3), 50)
-    assert await received(board(seed=3), 50) != await received(board(seed=4), 50)
+async def test_equal_seeds_give_equal_bytes() -> None:
+    assert await receive(make_board(seed=3), 50) == await receive(make_board(seed=3), 50)
+    assert await receive(make_board(seed=3), 50) != await receive(make_board(seed=4), 50)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +130,7 @@ async def test_the_same_seed_sends_the_same_bytes() -> None:
     ],
 )
 async def test_saturation_is_marked(reading: Reading, status: SampleStatus) -> None:
-    block, _ = decoded(await received(board(reading), 10))
+    block, _ = decode(await receive(make_board(reading), 10))
     assert (block["status"] == status).all()
 
 
@@ -135,34 +145,34 @@ async def test_saturation_is_marked(reading: Reading, status: SampleStatus) -> N
         (BoardFault.GARBAGE, {"frames_received": 60, "frames_lost": 0}),
     ],
 )
-async def test_faults_are_counted_as_what_they_are(fault: BoardFault, expected: dict[str, int]) -> None:
-    data = await received(board(), 60, {20: lambda b: b.inject(fault, 3)})
-    _, counters = decoded(data)
+async def test_each_fault_is_counted_by_its_kind(fault: BoardFault, expected: dict[str, int]) -> None:
+    data = await receive(make_board(), 60, {20: lambda b: b.inject(fault, 3)})
+    _, counters = decode(data)
     assert {name: getattr(counters, name) for name in expected} == expected
     damaged = counters.crc_errors + counters.cobs_errors + counters.length_errors
     assert (damaged >= 3) == (fault in {BoardFault.CORRUPT, BoardFault.TRUNCATE, BoardFault.GARBAGE})
 
 
-async def test_a_sample_after_its_successor_is_out_of_order() -> None:
-    _, counters = decoded(await received(board(), 60, {20: lambda b: b.inject(BoardFault.SWAP)}))
+async def test_swapped_samples_count_as_out_of_order() -> None:
+    _, counters = decode(await receive(make_board(), 60, {20: lambda b: b.inject(BoardFault.SWAP)}))
     assert (counters.out_of_order + counters.duplicates, counters.frames_lost) == (1, 1)
     assert counters.frames_received == 59
 
 
-async def test_a_reset_in_mid_run_goes_on_and_is_marked() -> None:
-    block, counters = decoded(await received(board(), 60, {30: lambda b: b.reset(ResetCause.EXTERNAL)}))
+async def test_sample_after_a_reset_is_marked_and_time_increases() -> None:
+    block, counters = decode(await receive(make_board(), 60, {30: lambda b: b.reset(ResetCause.EXTERNAL)}))
     assert (counters.frames_received, counters.resets, counters.frames_lost) == (60, 1, 0)
     assert list(np.flatnonzero(block["status"] & SampleStatus.RESET)) == [30]
     assert (np.diff(block["time_s"]) > 0.0).all()
 
 
-async def test_the_wrap_of_the_microseconds_is_no_step() -> None:
-    block, counters = decoded(await received(board(clock_us=2**32 - 100_000), 50))
+async def test_wrap_of_the_board_clock_does_not_change_the_sample_times() -> None:
+    block, counters = decode(await receive(make_board(clock_us=2**32 - 100_000), 50))
     assert np.allclose(np.diff(block["time_s"]), 0.01, rtol=0.0, atol=1e-9)
     assert counters.resets == 0
 
 
-async def test_commands_are_obeyed_and_answered() -> None:
+async def test_commands_are_executed_and_acknowledged() -> None:
     virtual = VirtualBoard(lambda _: STEADY)
     decoder = FrameDecoder()
     with virtual:
@@ -206,7 +216,7 @@ async def test_commands_are_obeyed_and_answered() -> None:
             os.close(host)
 
 
-async def test_a_host_that_does_not_read_loses_samples_and_is_told() -> None:
+async def test_samples_lost_by_a_host_that_does_not_read_are_marked_as_overrun() -> None:
     virtual = VirtualBoard(lambda _: STEADY, rate_hz=1000, speed=50.0)
     with virtual:
         host = os.open(virtual.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -233,8 +243,8 @@ async def test_a_host_that_does_not_read_loses_samples_and_is_told() -> None:
     assert decoder.counters.crc_errors == 0
 
 
-async def test_text_mode_prints_what_a_hobby_sketch_prints() -> None:
-    data = await received(board(mode="text"), 50)
+async def test_text_mode_prints_lines_of_the_text_protocol() -> None:
+    data = await receive(make_board(mode="text"), 50)
     decoder = make_protocol(SensorSettings(port="x", protocol="text", baud=115_200))
     block = decoder.feed(0.0, data)
     assert block.size == 50
@@ -243,7 +253,7 @@ async def test_text_mode_prints_what_a_hobby_sketch_prints() -> None:
     assert block["temperature_c"] == pytest.approx(25.0, abs=0.3)
 
 
-async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_opens_the_line() -> None:
+async def test_board_takes_no_sample_before_a_host_opens_the_line() -> None:
     sampled = asyncio.Event()
 
     def signal(_: float) -> Reading:
@@ -260,25 +270,35 @@ async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_opens_th
         os.close(host)
 
 
-async def test_the_relay_goes_where_it_was_told_to_once_the_host_is_silent_and_low_at_a_reset() -> None:
-    def told(high: bool, then: bool | None, silent_s: int = 0) -> Event:
-        return lambda b: b._handle_command(unseal(set_relay_command(Relay(high, then, silent_s))))
+async def test_relay_changes_to_its_fallback_level_when_the_host_is_silent_and_to_low_at_a_reset() -> None:
+    def set_relay(high: bool, high_when_silent: bool | None, silent_s: int = 0) -> Event:
+        return lambda b: b._handle_command(unseal(set_relay_command(Relay(high, high_when_silent, silent_s))))
 
-    seen: dict[int, bool] = {}
-    look: Event = lambda b: seen.update({b.samples: b.relay_high})  # noqa: E731
-    plan: dict[int, Event] = {10: told(True, None), 20: look, 30: told(True, False, 2), 200: look, 240: look}
-    plan |= {250: told(False, True, 1), 300: look, 360: look, 370: lambda b: b.reset(), 380: look}
-    one = board()
-    acks = FrameDecoder()
-    acks.feed(0.0, b"\0" + await received(one, 400, plan))
-    assert seen == {20: True, 200: True, 240: False, 300: False, 360: True, 380: False}
-    assert [ack.result for ack in acks.take_acks()] == [AckResult.OK] * 3
+    levels: dict[int, bool] = {}
+    read_level: Event = lambda b: levels.update({b.samples: b.relay_high})  # noqa: E731
+    events: dict[int, Event] = {
+        10: set_relay(high=True, high_when_silent=None),
+        20: read_level,
+        30: set_relay(high=True, high_when_silent=False, silent_s=2),
+        200: read_level,
+        240: read_level,
+        250: set_relay(high=False, high_when_silent=True, silent_s=1),
+        300: read_level,
+        360: read_level,
+        370: lambda b: b.reset(),
+        380: read_level,
+    }
+    decoder = FrameDecoder()
+    decoder.feed(0.0, b"\0" + await receive(make_board(), 400, events))
+    assert levels == {20: True, 200: True, 240: False, 300: False, 360: True, 380: False}
+    assert [ack.result for ack in decoder.take_acks()] == [AckResult.OK] * 3
 
 
-async def test_a_relay_command_that_is_none_changes_nothing() -> None:
-    bad = command(MessageType.COMMAND_SET_RELAY, (1 << 8).to_bytes(4, "little"))  # a level in silence, but no time
-    one = board()
-    acks = FrameDecoder()
-    acks.feed(0.0, b"\0" + await received(one, 20, {10: lambda b: b._handle_command(unseal(bad))}))
-    assert [(ack.result, ack.value) for ack in acks.take_acks()] == [(AckResult.BAD_VALUE, 0)]
-    assert not one.relay_high
+async def test_invalid_relay_command_changes_nothing() -> None:
+    """The command has a fallback level without the time after which it applies."""
+    invalid = command(MessageType.COMMAND_SET_RELAY, (1 << 8).to_bytes(4, "little"))
+    board = make_board()
+    decoder = FrameDecoder()
+    decoder.feed(0.0, b"\0" + await receive(board, 20, {10: lambda b: b._handle_command(unseal(invalid))}))
+    assert [(ack.result, ack.value) for ack in decoder.take_acks()] == [(AckResult.BAD_VALUE, 0)]
+    assert not board.relay_high

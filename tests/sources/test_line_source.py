@@ -21,17 +21,17 @@ from tests.patience import LONG_S
 TEXT = SensorSettings(protocol="text")
 
 
-class Scripted(LineProducer):
-    """Producer that plays the next script at each start; after the last one it stays silent."""
+class ScriptedProducer(LineProducer):
+    """Producer that yields the lines of the next script at each start, and nothing after the last script."""
 
     name = "a device"
 
     def __init__(self, *scripts: Sequence[bytes | Exception]) -> None:
         self._scripts = list(scripts)
-        self.begun = 0
+        self.starts = 0
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        self.begun += 1
+        self.starts += 1
         for line in self._scripts.pop(0) if self._scripts else ():
             if isinstance(line, Exception):
                 raise line
@@ -51,10 +51,10 @@ async def take(source: LineSource, samples: int) -> SampleBlock:
     return np.concatenate(blocks)
 
 
-async def message(source: LineSource, wanted: str) -> None:
-    """Once this is what it says."""
+async def wait_for_message(source: LineSource, expected: str) -> None:
+    """Wait until the source reports this message."""
     async with asyncio.timeout(LONG_S):
-        while source.message != wanted:  # noqa: ASYNC110 - it has no event for it
+        while source.message != expected:  # noqa: ASYNC110 - it has no event for it
             await asyncio.sleep(0.001)
 
 
@@ -64,7 +64,7 @@ def lines(*volts: float) -> list[bytes]:
 
 async def test_lost_source_is_reopened_with_reason_and_counter():
     script = [SourceUnavailableError("no answer")], [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
-    source = LineSource(Scripted(*script), TEXT, first_retry_s=0.001)
+    source = LineSource(ScriptedProducer(*script), TEXT, first_retry_s=0.001)
     with capture_logs() as logged:
         async with source:
             block = await take(source, 2)
@@ -80,43 +80,43 @@ async def test_lost_source_is_reopened_with_reason_and_counter():
 
 
 async def test_capture_of_lines_replays_bit_identically(tmp_path: Path):
-    path = tmp_path / "brought.raw"
+    path = tmp_path / "lines.raw"
     sensor = SensorSettings(protocol="text", current_sign="charge_positive")
-    brought = [*lines(50.0, 51.0), b"junk\n", *lines(52.0)[1:], sample_json_line(53.0, 1.25, time_s=7.5)]
+    sent_lines = [*lines(50.0, 51.0), b"junk\n", *lines(52.0)[1:], sample_json_line(53.0, 1.25, time_s=7.5)]
     with CaptureRecorder(path, make_header(sensor)) as recording:
-        source = LineSource(Scripted(brought), sensor, tap=recording)
+        source = LineSource(ScriptedProducer(sent_lines), sensor, tap=recording)
         async with source:
             live = await take(source, 4)
-    again = RawCapture(path)
-    replayed = np.concatenate(list(again))
+    capture = RawCapture(path)
+    replayed = np.concatenate(list(capture))
     assert [replayed[name].tobytes() for name in SAMPLE.names or ()] == [live[name].tobytes() for name in SAMPLE.names]
     assert live["current_a"].tolist() == [2.0, 2.0, 2.0, -1.25]
-    assert source.counters == {**again.decoder.counters, "reconnects": 0, "missed_reads": 0}
-    assert again.decoder.counters["text_errors"] == 1
+    assert source.counters == {**capture.decoder.counters, "reconnects": 0, "missed_reads": 0}
+    assert capture.decoder.counters["text_errors"] == 1
 
 
 async def test_missing_and_invalid_lines_are_reported():
     junk = [CONNECTED, b'{"soc":1}\n', b'{"voltage":"unavailable"}\n']
-    for script, said in (
+    for script, message in (
         ([CONNECTED], "a device: connected, but silent"),
         (junk, 'a device: lines without voltage and current arrive; the first: \'{"voltage":"unavailable"}\''),
     ):
-        source = LineSource(Scripted(script), TEXT, period_s=0.001, check_interval_s=0.001)
+        source = LineSource(ScriptedProducer(script), TEXT, period_s=0.001, check_interval_s=0.001)
         async with source:
             taking = asyncio.create_task(take(source, 1))
-            await message(source, said)
+            await wait_for_message(source, message)
             taking.cancel()
 
 
 async def test_internal_error_is_raised():
-    source = LineSource(Scripted([*lines(50.0), KeyError("ours")]), TEXT)
+    source = LineSource(ScriptedProducer([*lines(50.0), KeyError("ours")]), TEXT)
     async with source:
         with pytest.raises(KeyError, match="ours"):
             await take(source, 2)
 
 
 @pytest.mark.parametrize("values", [(float("nan"), 1.0), (50.0, float("inf"))])
-def test_a_line_is_a_sample(values: tuple[float, float]):
+def test_line_of_a_value_that_is_not_finite_is_rejected(values: tuple[float, float]):
     with pytest.raises(ValueError, match="no sample"):
         sample_json_line(*values)
 
@@ -124,7 +124,7 @@ def test_a_line_is_a_sample(values: tuple[float, float]):
 def test_source_sets_sensor_defaults():
     settings = Settings.model_validate({"source": {"kind": "linux", "voltage_scale": 4.0}})
     assert (settings.sensor.protocol, settings.sensor.voltage_resolution_v) == ("text", 5e-3)
-    told = SensorSettings(voltage_resolution_v=0.1, current_sign="charge_positive")
-    settings = Settings.model_validate({"source": {"kind": "linux"}, "sensor": told})
-    assert settings.sensor == told.model_copy(update={"protocol": "text", "period_s": 1.0})
+    sensor = SensorSettings(voltage_resolution_v=0.1, current_sign="charge_positive")
+    settings = Settings.model_validate({"source": {"kind": "linux"}, "sensor": sensor})
+    assert settings.sensor == sensor.model_copy(update={"protocol": "text", "period_s": 1.0})
     assert settings.sensor.sample_period_s == 1.0

@@ -4,7 +4,6 @@ import binascii
 import gzip
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,11 @@ import pytest
 from bms_estimator.model.decimal_text import measured, number
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.devices.text import TextProtocol
-from bms_estimator.protocols.firmware.messages import Hello, SampleMessage, unseal
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.raw_capture import MAGIC, CaptureHeader, CaptureWriter, read_capture, read_header
 from bms_estimator.sources.captures.replay import Replay, load_capture, open_capture
-from tests.protocols.firmware.test_decoder_fuzz import HELLO
+from tests.protocols.firmware.board_messages import HELLO, NTC_STATUS, encode_hello, encode_sample
 
 HEAD = "time_s,current_a,voltage_v,temperature_c\n"
 
@@ -32,7 +30,7 @@ def test_decimal_number_is_accepted(text: str) -> None:
     "text",
     ["3_9", "", " ", "٣", "\uff13", "nan", "inf", "1e999", "0x1f", "1d5", "3,9", "3.9V", "--3", "1e", ".", "1 2"],
 )
-def test_other_text_is_no_decimal_number(text: str) -> None:
+def test_other_text_is_rejected_as_a_number(text: str) -> None:
     with pytest.raises(ValueError, match="no decimal number"):
         number(text)
 
@@ -72,15 +70,15 @@ def test_none_in_a_column_is_nan() -> None:
     assert columns["current_a"].tolist() == pytest.approx([math.nan, 1.0], nan_ok=True)
 
 
-def test_a_curve_takes_decimal_numbers(tmp_path: Path) -> None:
+def test_curve_with_a_cell_that_is_no_decimal_number_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "ocv.csv"
     path.write_text("soc,ocv_v\n0,3.0\n1,4_2\n")
     with pytest.raises(UserError, match=r"ocv\.csv: line 3: ocv_v = '4_2': must be a number"):
         read_curve(path)
 
 
-def header(path: Path, text: bytes) -> Path:
-    """A capture whose header is ``text``, with a right CRC."""
+def write_header(path: Path, text: bytes) -> Path:
+    """Write a capture that consists of the header ``text`` with a valid CRC. Return its path."""
     crc = binascii.crc_hqx(text, 0xFFFF)
     path.write_bytes(MAGIC + len(text).to_bytes(4, "little") + text + crc.to_bytes(2, "little"))
     return path
@@ -96,10 +94,10 @@ def header(path: Path, text: bytes) -> Path:
     ],
     ids=lambda text: text[:24].decode("latin-1"),
 )
-@pytest.mark.parametrize("packed", [False, True])
-def test_capture_with_invalid_header_is_rejected_with_its_path(tmp_path: Path, text: bytes, packed: bool) -> None:
-    path = header(tmp_path / "odd.bms", text)
-    if packed:
+@pytest.mark.parametrize("compressed", [False, True])
+def test_capture_with_invalid_header_is_rejected_with_its_path(tmp_path: Path, text: bytes, compressed: bool) -> None:
+    path = write_header(tmp_path / "odd.bms", text)
+    if compressed:
         path = tmp_path / "odd.bms.gz"
         path.write_bytes(gzip.compress((tmp_path / "odd.bms").read_bytes()))
     for read in (read_header, lambda path: list(read_capture(path)), open_capture):
@@ -108,26 +106,26 @@ def test_capture_with_invalid_header_is_rejected_with_its_path(tmp_path: Path, t
 
 
 def test_later_version_and_unknown_protocol_are_reported(tmp_path: Path) -> None:
-    path = header(tmp_path / "new.bms", b'{"version": 2, "mode": {"any": "thing"}}')
+    path = write_header(tmp_path / "new.bms", b'{"version": 2, "mode": {"any": "thing"}}')
     with pytest.raises(UserError, match=r"new\.bms: version 2, this program reads version 1"):
         read_header(path)
-    path = header(path, json.dumps({"version": 1, "mode": "modbus", "more": [1]}).encode())
+    path = write_header(path, json.dumps({"version": 1, "mode": "modbus", "more": [1]}).encode())
     with pytest.raises(UserError, match=r"new\.bms: recorded from mode 'modbus'"):
         open_capture(path)
 
 
-def test_a_packed_capture_whose_end_is_damaged_ends_there(tmp_path: Path) -> None:
+def test_damaged_end_of_a_compressed_capture_raises_no_error(tmp_path: Path) -> None:
     path = tmp_path / "line.bms"
     with CaptureWriter(path, CaptureHeader()) as writer:
         writer.write(1.0, HELLO)
-    packed = bytearray(gzip.compress(path.read_bytes()))
-    packed[-6] ^= 1  # of the CRC of what was packed
+    compressed = bytearray(gzip.compress(path.read_bytes()))
+    compressed[-6] ^= 1  # the last eight bytes are CRC and size of the uncompressed data
     damaged = path.with_suffix(".bms.gz")
-    damaged.write_bytes(packed)
+    damaged.write_bytes(compressed)
     assert sum(batch.ends.size for batch in read_capture(damaged)) <= 1
 
 
-def test_a_text_line_s_temperature_and_cells_beyond_reason_are_dropped_and_counted() -> None:
+def test_implausible_temperature_and_cell_voltages_of_a_text_line_are_dropped_and_counted() -> None:
     decoder = TextProtocol()
     block = decoder.feed(0.0, b"\nV=7.2 I=1 T=1e308 cells=3.6,1e308\nV=7.2 I=1 T=25 cells=3.6,3.6\n")
     assert block["temperature_c"].tolist() == pytest.approx([math.nan, 25.0], nan_ok=True)
@@ -135,10 +133,10 @@ def test_a_text_line_s_temperature_and_cells_beyond_reason_are_dropped_and_count
     assert decoder.counters["implausible"] == 2
 
 
-def test_a_board_s_temperature_beyond_reason_is_dropped_and_counted() -> None:
+def test_implausible_temperature_of_a_board_is_dropped_and_counted() -> None:
+    """The NTC's beta value is far too small, which gives a temperature outside the plausible range."""
     decoder = BoardProtocol()
-    odd = replace(Hello.decode(unseal(HELLO)), ntc_beta_k=200)
-    ntc = [SampleMessage(i, 10_000 * (i + 1), 34_571, 21_405, 38, 60, 1, 0x18).encode() for i in range(3)]
-    block = decoder.feed(0.0, odd.encode() + b"".join(ntc))
+    ntc_samples = [encode_sample(i, 10_000 * (i + 1), aux_sum=60, status=NTC_STATUS) for i in range(3)]
+    block = decoder.feed(0.0, encode_hello(ntc_beta_k=200) + b"".join(ntc_samples))
     assert np.isnan(block["temperature_c"]).all()
     assert decoder.counters["implausible"] == 3

@@ -1,4 +1,4 @@
-"""Captures of a board that prints JSON lines, each second one, replayed through estimator and publisher."""
+"""Captures of a board that prints one JSON line per second, replayed through estimator and publisher."""
 
 import json
 import math
@@ -20,7 +20,7 @@ from tests.collector import Collector
 
 WALL_S = 1_700_000_000.0
 PACK = load_cell("nmc", 10.0).pack(2, 1)
-"""Two cells: 5.4 to 8.5 V, 10 A of charge, 50 A of load."""
+"""Pack of two cells with limits of 5.4 and 8.5 V, 10 A of charge and 50 A of discharge."""
 
 
 class Line(NamedTuple):

@@ -1,4 +1,4 @@
-"""What is left in the pack, state of health, what is suspected: from the estimator to what is published."""
+"""Published values: remaining charge, identified parameters, state of health and suspected input faults."""
 
 import math
 
@@ -23,14 +23,15 @@ Q_AH = CELL.cell.capacity_ah
 NOW_S = 1.7e9
 
 
-def at(soc: float) -> Estimator:
+def estimator_at(soc: float) -> Estimator:
+    """Return an estimator after one sample at rest at this SOC."""
     estimator = Estimator(CELL, initial_soc=soc, identifier=None)
     estimator.step(0.0, 0.0, chen_mora.emf(soc, CELL.a))
     return estimator
 
 
 def pulses(current_a: float, hours: float) -> np.ndarray:
-    """The cell's voltage under pulses of a minute at 10 Hz."""
+    """Return 10 Hz samples of the cell under current pulses of one minute with rests of one minute."""
     block = np.zeros(int(36_000 * hours), dtype=SAMPLE)
     block["temperature_c"] = 25.0
     block["time_s"] = 0.1 * np.arange(block.size)
@@ -42,36 +43,39 @@ def pulses(current_a: float, hours: float) -> np.ndarray:
 
 
 def test_charge_energy_and_time_at_a_load() -> None:
-    left = remaining_charge(at(0.5), 0.055)
+    left = remaining_charge(estimator_at(0.5), 0.055)
     assert left.capacity_ah == pytest.approx(0.5 * Q_AH)
     assert left.time_to_empty_s == pytest.approx(0.5 * Q_AH / 0.055 * 3600.0)
     energy_wh = Q_AH * quad(chen_mora.emf, 0.0, 0.5, args=(CELL.a,))[0]
-    assert remaining_charge(at(0.5), 0.0).energy_wh == pytest.approx(energy_wh, rel=1e-4)
-    assert remaining_charge(at(0.5), 0.0).energy_wh - left.energy_wh == pytest.approx(
-        0.055 * 0.5 * Q_AH * sum(f(0.5, at(0.5).state[0]["a"]) for f in (chen_mora.r_s, chen_mora.r_ts, chen_mora.r_tl))
+    assert remaining_charge(estimator_at(0.5), 0.0).energy_wh == pytest.approx(energy_wh, rel=1e-4)
+    assert remaining_charge(estimator_at(0.5), 0.0).energy_wh - left.energy_wh == pytest.approx(
+        0.055
+        * 0.5
+        * Q_AH
+        * sum(f(0.5, estimator_at(0.5).state[0]["a"]) for f in (chen_mora.r_s, chen_mora.r_ts, chen_mora.r_tl))
     )
 
 
 def test_usable_charge_ends_at_the_margins() -> None:
-    estimator = at(0.5)
+    estimator = estimator_at(0.5)
     state = estimator.state[0]
     usable_ah = remaining_charge(estimator, 0.0).usable_ah
     assert usable_ah == pytest.approx((0.5 - max(state["delta_1"], state["delta_2"])) * Q_AH)
-    assert remaining_charge(at(0.001), 0.0).usable_ah == 0.0
+    assert remaining_charge(estimator_at(0.001), 0.0).usable_ah == 0.0
 
 
 @pytest.mark.parametrize("current_a", [0.0, -1.0, 1e-5])
-def test_a_pack_that_does_not_discharge_has_no_time_to_empty(current_a: float) -> None:
-    assert math.isnan(remaining_charge(at(0.5), current_a).time_to_empty_s)
+def test_time_to_empty_is_none_unless_the_pack_is_discharged(current_a: float) -> None:
+    assert math.isnan(remaining_charge(estimator_at(0.5), current_a).time_to_empty_s)
 
 
-def test_a_pack_that_charges_has_a_time_to_full_and_no_other_has() -> None:
-    assert remaining_charge(at(0.4), -0.055).time_to_full_s == pytest.approx(0.6 * Q_AH / 0.055 * 3600.0)
-    assert remaining_charge(at(1.0), -0.055).time_to_full_s == 0.0
-    assert all(math.isnan(remaining_charge(at(0.5), a).time_to_full_s) for a in (0.0, 1.0, -1e-5))
+def test_time_to_full_is_none_unless_the_pack_is_charged() -> None:
+    assert remaining_charge(estimator_at(0.4), -0.055).time_to_full_s == pytest.approx(0.6 * Q_AH / 0.055 * 3600.0)
+    assert remaining_charge(estimator_at(1.0), -0.055).time_to_full_s == 0.0
+    assert all(math.isnan(remaining_charge(estimator_at(0.5), a).time_to_full_s) for a in (0.0, 1.0, -1e-5))
 
 
-def test_nothing_is_known_before_the_first_sample() -> None:
+def test_values_are_none_before_the_first_sample() -> None:
     estimator = Estimator(CELL, initial_soc=0.5, identifier=None)
     assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)
     assert make_parameters_payload(estimator, NOW_S).elements == {}
@@ -112,7 +116,7 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert "configured" not in (a1.reason or "")
 
 
-def test_what_the_identifier_did_not_believe_is_counted_since_the_start() -> None:
+def test_samples_rejected_by_the_identifier_are_counted_since_the_start() -> None:
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     block = pulses(0.2, 0.1)
     block["voltage_v"][3000:3003] = 2.6
@@ -123,7 +127,7 @@ def test_what_the_identifier_did_not_believe_is_counted_since_the_start() -> Non
     assert suspicions(estimator.record[0], estimator.settings_record[0]) == []
 
 
-def test_nothing_is_identified_before_a_load_has_told_of_it() -> None:
+def test_parameters_are_the_configured_ones_before_the_first_load() -> None:
     estimator = Estimator(CELL, initial_soc=0.5)
     block = pulses(0.0, 0.1)
     estimator.run(block)
@@ -132,8 +136,8 @@ def test_nothing_is_identified_before_a_load_has_told_of_it() -> None:
     assert {p.valid for p in report.state_of_health.values()} == {False}
 
 
-def test_the_curve_is_published_with_what_was_learned() -> None:
-    """Generic cells of another make: at rest at SOC 0.9, the difference of 20 mV is found with a small std there."""
+def test_published_ocv_curve_contains_the_learned_correction() -> None:
+    """The true curve lies 20 mV above the generic one. A rest at SOC 0.9 corrects the curve and its std only there."""
     estimator = Estimator(load_cell("nmc", 3.0), initial_soc=0.9, identifier=IdentifierSettings(soc_std=0.005))
     p = estimator.settings_record[0]["filter"]
     truth_v = chen_mora.ocv(0.9, p["ocv_v"], p["ocv_slope_v"]) + 0.020
@@ -144,32 +148,32 @@ def test_the_curve_is_published_with_what_was_learned() -> None:
     curve = make_parameters_payload(estimator, NOW_S).ocv
     assert first is not None
     assert curve is not None
-    at, far = curve.soc.index(0.9), curve.soc.index(0.2)
-    assert abs(curve.ocv_v[at] - truth_v) < 0.3 * 0.020
-    assert curve.std_v[at] < 0.5 * float(np.interp(0.9, np.linspace(0.0, 1.0, 41), p["curve_error_v"]))
+    near, far = curve.soc.index(0.9), curve.soc.index(0.2)
+    assert abs(curve.ocv_v[near] - truth_v) < 0.3 * 0.020
+    assert curve.std_v[near] < 0.5 * float(np.interp(0.9, np.linspace(0.0, 1.0, 41), p["curve_error_v"]))
     assert curve.std_v[far] > 0.8 * float(np.interp(0.2, np.linspace(0.0, 1.0, 41), p["curve_error_v"]))
     assert abs(curve.ocv_v[far] - chen_mora.ocv(0.2, p["ocv_v"], p["ocv_slope_v"])) < curve.std_v[far]
 
 
 @pytest.mark.parametrize("name", ["ncr18650", "nmc", "lfp"])
-def test_a_table_has_its_formula_too(name: str) -> None:
-    """Packs and single cells: the same curve, as near as (2.10) can come to it."""
+def test_parameters_of_a_tabulated_curve_are_those_of_the_fitted_formula(name: str) -> None:
+    """The formula, (2.10) of the thesis, is fitted to the table of the cell file, for a cell and for a pack."""
     for cells in (1, 6):
         estimator = Estimator(load_cell(name, 3.0).pack(cells, 1))
         a = make_parameters_payload(estimator, NOW_S).a
         values = np.array([math.nan] * 16 + [a[f"a{i}"].value for i in range(16, 22)])
         curve_v = estimator.settings[0]["ocv_v"][::4]
-        off_v = np.array([chen_mora.emf(soc, values) for soc in np.linspace(0.0, 1.0, curve_v.size)]) - curve_v
-        rms_mv = 1e3 * np.sqrt(np.mean(off_v**2))
+        error_v = np.array([chen_mora.emf(soc, values) for soc in np.linspace(0.0, 1.0, curve_v.size)]) - curve_v
+        rms_mv = 1e3 * np.sqrt(np.mean(error_v**2))
         assert rms_mv < 30.0 * cells
         assert a["a18"].reason == f"(2.10) fitted to the table of the cell file, {rms_mv:.1f} mV RMS off it"
         assert (a["a18"].source, a["a18"].valid) == ("configured", False)
         assert 0.0 < (a["a18"].std or 0.0) < 0.02 * cells
 
 
-def test_what_is_not_to_be_learned_is_taken_as_declared() -> None:
-    off = IdentifierSettings(capacity_std=0.0, current_offset_std_a=0.0)
-    estimator = Estimator(CELL, identifier=off, initial_soc=1.0)
+def test_quantities_with_a_std_of_zero_are_not_identified() -> None:
+    exact = IdentifierSettings(capacity_std=0.0, current_offset_std_a=0.0)
+    estimator = Estimator(CELL, identifier=exact, initial_soc=1.0)
     estimator.run(pulses(0.2, 0.1))
     health = make_parameters_payload(estimator, NOW_S).state_of_health
     assert (health["capacity"].value, health["current_offset_a"].value) == (1.0, 0.0)
@@ -189,7 +193,7 @@ def test_a_temperature_outside_the_cell_file_s_range_is_reported(temperature_c: 
     assert bool(texts) == bool(expected)
 
 
-def test_a_current_of_the_wrong_sign_is_named() -> None:
+def test_current_of_the_wrong_sign_is_suspected() -> None:
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     block = pulses(0.2, 1.0)
     block["current_a"] *= -1.0
@@ -203,14 +207,15 @@ def test_a_current_of_the_wrong_sign_is_named() -> None:
     assert suspicions(good.record[0], good.settings_record[0]) == []
 
 
-def test_the_series_resistance_of_a_cold_cell_is_compared_with_that_of_its_file_in_the_cold() -> None:
+def test_series_resistance_is_compared_with_that_of_the_cell_file_at_the_same_temperature() -> None:
     ratios = []
     for temperature_c in (25.0, 0.0):
-        seen = capture(Case("R_s", temperature_c=temperature_c, hours=0.5))
-        estimator = Estimator(seen.cell, initial_soc=float(seen.soc[0]))
-        estimator.run(seen.samples)
+        recording = capture(Case("R_s", temperature_c=temperature_c, hours=0.5))
+        estimator = Estimator(recording.cell, initial_soc=float(recording.soc[0]))
+        estimator.run(recording.samples)
         r_s = make_parameters_payload(estimator, NOW_S).state_of_health["r_s"]
         assert r_s.source == "identified"
         ratios.append(r_s.value)
-    assert ratios == pytest.approx([1.0, 1.0], abs=0.15)  # the file is of another such cell, and errs by 10 %
+    # The cell file describes another cell of this type, whose resistance differs by 10 %.
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.15)
     assert ratios[1] == pytest.approx(ratios[0], rel=0.1)

@@ -31,7 +31,7 @@ from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.published_states import HOME, VAN, Pack, load, publish, publish_heartbeat, state
 from tests.free_port import free_port
 from tests.page.chromium import Tab, chromium, tab
-from tests.page.house import starting
+from tests.page.house import start_program
 from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE
 
@@ -286,7 +286,7 @@ def test_served_files_are_small_and_refer_to_no_other_host() -> None:
 async def test_command_serves_until_sigterm(fleet: Fleet, tmp_path: Path) -> None:
     port = free_port()
     arguments = ("--server", fleet.cluster.url, "--listen", f"127.0.0.1:{port}", "--no-browser")
-    process = await starting(tmp_path, "fleet", "page", *arguments, port=port)
+    process = await start_program(tmp_path, "fleet", "page", *arguments, port=port)
     async with aiohttp.ClientSession() as session, session.get(f"http://127.0.0.1:{port}/") as response:
         assert response.status == 200
     process.terminate()

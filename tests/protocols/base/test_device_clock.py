@@ -1,4 +1,4 @@
-"""Timestamps of a device place its samples, unless they are implausible."""
+"""Sample times from a device's timestamps, or from the arrival times if the timestamps are implausible."""
 
 import itertools
 from math import nan
@@ -12,51 +12,53 @@ from bms_estimator.protocols.devices.text import TextProtocol
 
 
 @pytest.mark.parametrize(
-    ("stamps", "placed", "jumps"),
+    ("arrivals_and_stamps", "times_s", "jumps"),
     [
-        ([(10, 7.0), (11.5, 8.0), (12, 9.0)], [0, 1, 2], 0),  # told ones count, late or not
-        ([(10, 7.0), (70, 8.0), (70, 9.0), (70, 10.0)], [0, 1, 2, 3], 0),  # waited for a minute, then came at once
-        ([(10, 7.0), (11, 8.0), (12, 0.5), (13, 1.5)], [0, 1, 2, 3], 1),  # began anew
-        ([(10, 7.0), (11, 3608.0), (12, 3609.0)], [0, 1, 2], 1),  # was set
+        ([(10, 7.0), (11.5, 8.0), (12, 9.0)], [0, 1, 2], 0),
+        ([(10, 7.0), (70, 8.0), (70, 9.0), (70, 10.0)], [0, 1, 2, 3], 0),
+        ([(10, 7.0), (11, 8.0), (12, 0.5), (13, 1.5)], [0, 1, 2, 3], 1),
+        ([(10, 7.0), (11, 3608.0), (12, 3609.0)], [0, 1, 2], 1),
         ([(10, nan), (12, nan), (13, 5.0), (14, 6.0)], [0, 2, 3, 4], 0),
-        ([(10, 0.0), (15, 0.0), (21, 0.0), (25, 0.0)], [0, 0, 11, 11], 1),  # stands still
+        ([(10, 0.0), (15, 0.0), (21, 0.0), (25, 0.0)], [0, 0, 11, 11], 1),
     ],
+    ids=["delayed by 0.5 s", "delayed by a minute", "restarted", "set ahead", "without timestamps", "constant"],
 )
-def test_times(stamps: list[tuple[float, float]], placed: list[float], jumps: int):
+def test_sample_times(arrivals_and_stamps: list[tuple[float, float]], times_s: list[float], jumps: int):
     clock = DeviceClock()
-    assert [clock.sample_time(*stamp) for stamp in stamps] == placed
+    assert [clock.sample_time(arrival_s, stamp_s) for arrival_s, stamp_s in arrivals_and_stamps] == times_s
     assert clock.jumps == jumps
 
 
-def test_a_clock_that_is_slow_loses_no_time():
+def test_slow_clock_loses_no_time():
+    """The device counts milliseconds as seconds."""
     clock = DeviceClock()
-    placed = [clock.sample_time(float(second), 1e-3 * second) for second in range(200)]
-    assert placed[-1] == pytest.approx(199.0)
-    assert max(b - a for a, b in itertools.pairwise(placed)) <= LAG_S + 2.0
+    times_s = [clock.sample_time(float(second), 1e-3 * second) for second in range(200)]
+    assert times_s[-1] == pytest.approx(199.0)
+    assert max(b - a for a, b in itertools.pairwise(times_s)) <= LAG_S + 2.0  # the lost time, and two samples
     assert clock.jumps == 1
 
 
-def test_bursts_are_no_slow_clock():
+def test_samples_in_bursts_do_not_look_like_a_slow_clock():
     clock = DeviceClock()
-    placed = [clock.sample_time(100.0 * (second // 100 + 1), float(second)) for second in range(1000)]
-    assert placed == [float(second) for second in range(1000)]
+    times_s = [clock.sample_time(100.0 * (second // 100 + 1), float(second)) for second in range(1000)]
+    assert times_s == [float(second) for second in range(1000)]
     assert clock.jumps == 0
 
 
 @given(st.lists(st.tuples(st.floats(0, 10), st.floats() | st.just(1.0))))
-def test_time_never_decreases_or_leads_the_arrivals(stamps: list[tuple[float, float]]):
+def test_sample_time_never_decreases(arrival_steps_and_stamps: list[tuple[float, float]]):
     clock, arrival_s, last_s = DeviceClock(), 0.0, 0.0
-    for step_s, told_s in stamps:
+    for step_s, stamp_s in arrival_steps_and_stamps:
         arrival_s += step_s
-        placed_s = clock.sample_time(arrival_s, told_s)
-        assert placed_s >= last_s
-        last_s = placed_s
+        time_s = clock.sample_time(arrival_s, stamp_s)
+        assert time_s >= last_s
+        last_s = time_s
 
 
-def test_a_line_tells_its_time_in_seconds():
+def test_time_of_a_text_line_is_used():
     decoder = TextProtocol()
-    times = [
-        decoder.feed(at, b'{"voltage":1,"current":0,"time_s":%.1f}\n' % told)["time_s"][0]
-        for at, told in [(1, 5), (9, 6.5)]
+    times_s = [
+        decoder.feed(arrival_s, b'{"voltage":1,"current":0,"time_s":%.1f}\n' % stamp_s)["time_s"][0]
+        for arrival_s, stamp_s in [(1, 5), (9, 6.5)]
     ]
-    assert times == [0.0, 1.5]
+    assert times_s == [0.0, 1.5]

@@ -49,7 +49,7 @@ def test_formats_with_temperature(line: bytes) -> None:
     "line",
     [b"V=6.6 I=2 cells=3.31,3.29", b'{"V": 6.6, "I": 2, "cells": [3.31, 3.29]}', b"cells_mV=3310,3290 V=6.6 I=2"],
 )
-def test_the_voltages_of_single_cells(line: bytes) -> None:
+def test_formats_of_cell_voltages(line: bytes) -> None:
     reading = read_line(line)
     assert reading is not None
     assert reading.cells_v == pytest.approx((3.31, 3.29))
@@ -87,7 +87,7 @@ def test_the_voltages_of_single_cells(line: bytes) -> None:
         b'{"voltage": 1e999, "current": 2}',
     ],
 )
-def test_line_without_voltage_or_current_is_no_reading(line: bytes) -> None:
+def test_line_without_valid_voltage_and_current_is_rejected(line: bytes) -> None:
     assert read_line(line) is None
 
 
@@ -98,7 +98,7 @@ def test_word_for_a_missing_temperature_is_nan(line: bytes) -> None:
     assert math.isnan(reading.temperature_c)
 
 
-def test_incomplete_list_of_cells_is_no_reading() -> None:
+def test_invalid_list_of_cells_is_ignored() -> None:
     assert read_line(b"V=6.6 I=2 cells=3.31,3_2") == Reading(6.6, 2.0)
 
 
@@ -129,7 +129,7 @@ fragments = st.sampled_from(
 
 
 @given(st.binary(max_size=300) | st.lists(fragments, max_size=40).map(b"".join))
-def test_no_bytes_raise_or_give_infinite_values(line: bytes) -> None:
+def test_no_line_raises_or_gives_an_infinite_value(line: bytes) -> None:
     reading = read_line(line)
     if reading is not None:
         assert all(map(math.isfinite, (reading.voltage_v, reading.current_a, *reading.cells_v)))

@@ -1,4 +1,4 @@
-"""Battery monitors and batteries that speak their makers' protocols: real frames, damaged ones, and devices on a PTY."""
+"""Battery monitors and batteries with manufacturers' protocols: recorded frames, damaged frames, simulated devices."""
 
 import asyncio
 import itertools
@@ -23,39 +23,40 @@ from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import LONG_S
 
 
-def lines(text: str) -> bytes:
+def vedirect_block(text: str) -> bytes:
+    """Return a VE.Direct block from lines of a name and a value."""
     return text.replace(" ", "\t").replace("\n", "\r\n").encode("latin-1")
 
 
-# test/bvm702.dump of github.com/karioja/vedirect: a BMV-700 under 7.6 A of load
-BMV_NOW = lines(
+# test/bvm702.dump of github.com/karioja/vedirect: a BMV-700 with a load of 7.6 A
+BMV_NOW = vedirect_block(
     "\nPID 0x203\nV 12065\nI -7625\nP -92\nCE -65473\nSOC 839\nTTG 942\nAlarm OFF\nRelay OFF\nAR 0\nBMV 700\nFW 0308\nChecksum q"
 )
-BMV_HISTORY = lines(
+BMV_HISTORY = vedirect_block(
     "\nH1 -149322\nH2 -82854\nH3 0\nH4 0\nH5 0\nH6 -5526294\nH7 11733\nH8 16161\nH9 368003\nH10 26\nH11 0\nH12 0\n"
     "H17 6843\nH18 8527\nChecksum \xbc"
 )
-BMV_NEXT = lines(
+BMV_NEXT = vedirect_block(
     "\nPID 0x203\nV 12065\nI -7626\nP -92\nCE -65476\nSOC 839\nTTG 942\nAlarm OFF\nRelay OFF\nAR 0\nBMV 700\nFW 0308\nChecksum m"
 )
 # test/test_ved.py of github.com/jblance/mpp-solar: a SmartShunt without load
-SMART_SHUNT = lines(
+SMART_SHUNT = vedirect_block(
     "\nPID 0xA389\nV 12868\nVS -12\nI 0\nP 0\nCE 0\nSOC 1000\nTTG -1\nAlarm OFF\nAR 0\nBMV SmartShunt~500A/50mV\nFW 0405\n"
     "Checksum K"
 ).replace(b"~", b" ")
-# the CUnit test of a VE.Direct parser in C on GitHub (test__parse_block__bmv_001): a BMV-712 with a sensor, charging
-BMV_WARM = lines(
+# CUnit test of a VE.Direct parser in C on GitHub (test__parse_block__bmv_001): a BMV-712 with a sensor, charging
+BMV_WARM = vedirect_block(
     "\nPID 0xA381\nV 13043\nT 23\nI 3856\nP 50\nCE 0\nSOC 1000\nTTG -1\nAlarm OFF\nRelay OFF\nAR 0\nBMV 712~Smart\nFW 0403\n"
     "Checksum \xb5"
 ).replace(b"~", b" ")
 HEX = b":7F0ED0071\n"
 
-# the manual of the KH-F, page 29; Potoonite/juntek-rs485 and mysystem32/juntek_kg on GitHub: a KG140F
+# Manual of the KH-F, page 29; Potoonite/juntek-rs485 and mysystem32/juntek_kg on GitHub: a KG140F
 KH_CHARGING = b":r50=1,123,1198,1090,7421,2749,437,298,113,0,0,1,69,100,230208,112418,\r\n"
 KG_DISCHARGING = b":r50=1,34,5166,1030,109337,11738441,62100651,48663,125,0,99,0,644,9117,\r\n"
 KG_CHARGING = b":r50=1,220,5366,5410,416983,289634,1427701,88851,128,0,0,1,3,4277,\r\n"
 
-# an US5000 and two US2000 with their console as pylon2mqtt's test and another's notes on GitHub have it
+# Console output of a US5000 (test of pylon2mqtt on GitHub) and of two US2000 (notes of another user on GitHub)
 US5000_PWR = (
     b"pwr\n\r@\r\r\n"
     b"Power Volt   Curr   Tempr  Tlow   Tlow.Id  Thigh  Thigh.Id Vlow   Vlow.Id  Vhigh  Vhigh.Id Base.St  Volt.St  "
@@ -79,7 +80,7 @@ TAIL = b"\r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
 
 
 def bat(battery: int, cells_mv: list[int]) -> bytes:
-    """The answer to ``bat N``, as those notes have that of an US2000."""
+    """Return the response to ``bat N`` in the format of a US2000."""
     rows = b"\r\r\n".join(
         b"%-8d %-8d 4076     14000    Charge       Normal       Normal       Normal        89%%      42586 mAH"
         % (n, mv)
@@ -89,21 +90,21 @@ def bat(battery: int, cells_mv: list[int]) -> bytes:
     return b"bat %d\n\r@\r\r\n" % battery + head + rows + TAIL
 
 
-US2000_CELLS = [3379, 3379, 3379, 3379, 3381, 3378, 3378, 3378, 3380, 3379, 3380, 3380, 3378, 3380, 3380]
+US2000_CELLS_MV = [3379, 3379, 3379, 3379, 3381, 3378, 3378, 3378, 3380, 3379, 3380, 3380, 3378, 3380, 3380]
 
-DIALECTS: Mapping[str, Callable[[], DeviceProtocol]] = {
+PROTOCOLS: Mapping[str, Callable[[], DeviceProtocol]] = {
     "vedirect": VeDirectProtocol,
     "junctek": JunctekProtocol,
     "pylontech": PylontechProtocol,
 }
 
 
-def values(block: SampleBlock) -> list[tuple[float, float]]:
+def voltages_and_currents(block: SampleBlock) -> list[tuple[float, float]]:
     return list(zip(block["voltage_v"].round(6).tolist(), block["current_a"].round(6).tolist(), strict=True))
 
 
 @pytest.mark.parametrize(
-    ("name", "sent", "told"),
+    ("name", "data", "expected"),
     [
         ("vedirect", BMV_NOW, (12.065, 7.625, math.nan)),
         ("vedirect", SMART_SHUNT, (12.868, 0.0, math.nan)),
@@ -115,11 +116,11 @@ def values(block: SampleBlock) -> list[tuple[float, float]]:
         ("pylontech", US2000_PWR, (50.682, -7.893, 13.5)),
     ],
 )
-def test_recorded_frames_are_decoded(name: str, sent: bytes, told: tuple[float, float, float]) -> None:
+def test_recorded_frames_are_decoded(name: str, data: bytes, expected: tuple[float, float, float]) -> None:
     decoder = make_protocol(SensorSettings.model_validate({"protocol": name}))
-    block = decoder.feed(1.0, sent)
+    block = decoder.feed(1.0, data)
     assert [block[name].item() for name in ("voltage_v", "current_a", "temperature_c")] == pytest.approx(
-        told, nan_ok=True
+        expected, nan_ok=True
     )
     assert decoder.fault is None
     assert decoder.description is not None
@@ -141,12 +142,12 @@ def test_history_and_hex_messages_between_blocks_are_ignored() -> None:
     decoder = VeDirectProtocol()
     cut_in_two = BMV_NEXT.replace(b"\r\nSOC", HEX + b"\r\nSOC")
     block = decoder.feed(1.0, BMV_NOW[9:] + BMV_HISTORY + HEX + BMV_NEXT + BMV_HISTORY + cut_in_two)
-    assert values(block) == [(12.065, 7.626)] * 2
-    assert decoder.counters["checksum_errors"] == 0  # the half block at the start is no fault
+    assert voltages_and_currents(block) == [(12.065, 7.626)] * 2
+    assert decoder.counters["checksum_errors"] == 0  # the incomplete first block does not count
 
 
 @pytest.mark.parametrize(
-    ("name", "good", "damaged", "counter", "said"),
+    ("name", "valid", "damaged", "counter", "message"),
     [
         ("vedirect", BMV_NOW, BMV_NOW.replace(b"7625", b"7635"), "checksum_errors", "wrong checksum"),
         ("vedirect", BMV_NOW, bytes(range(128, 256)) * 20, "length_errors", "19200 baud"),
@@ -168,19 +169,19 @@ def test_history_and_hex_messages_between_blocks_are_ignored() -> None:
     ],
 )
 def test_damaged_frame_is_reported_until_a_valid_one(
-    name: str, good: bytes, damaged: bytes, counter: str, said: str
+    name: str, valid: bytes, damaged: bytes, counter: str, message: str
 ) -> None:
-    decoder = DIALECTS[name]()
-    assert decoder.feed(1.0, good).size == 1
+    decoder = PROTOCOLS[name]()
+    assert decoder.feed(1.0, valid).size == 1
     assert decoder.feed(2.0, damaged).size == 0
     assert decoder.counters[counter] == 1
-    assert said in (decoder.fault or "")
-    assert decoder.feed(3.0, b"\n" + good + good).size >= 1
+    assert message in (decoder.fault or "")
+    assert decoder.feed(3.0, b"\n" + valid + valid).size >= 1
     assert decoder.fault is None
 
 
-def test_a_charger_is_no_battery_monitor() -> None:
-    body = lines("\nPID 0xA042\nV 12740\nI 800\nVPV 0\nPPV 0\nCS 0\nERR 0\nLOAD ON\nChecksum ")
+def test_vedirect_charger_is_rejected() -> None:
+    body = vedirect_block("\nPID 0xA042\nV 12740\nI 800\nVPV 0\nPPV 0\nCS 0\nERR 0\nLOAD ON\nChecksum ")
     decoder = VeDirectProtocol()
     assert decoder.feed(1.0, body + bytes((-sum(body) & 0xFF,))).size == 0
     assert "product 0xA042 is no battery monitor" in (decoder.fault or "")
@@ -188,9 +189,9 @@ def test_a_charger_is_no_battery_monitor() -> None:
 
 def test_cells_are_attached_once_all_batteries_reported_them() -> None:
     decoder = PylontechProtocol()
-    decoder.feed(1.0, bat(1, US2000_CELLS) + US2000_PWR)
+    decoder.feed(1.0, bat(1, US2000_CELLS_MV) + US2000_PWR)
     assert decoder.cells.size == 0
-    block = decoder.feed(2.0, bat(2, [mv - 1 for mv in US2000_CELLS]) + US2000_PWR)
+    block = decoder.feed(2.0, bat(2, [mv - 1 for mv in US2000_CELLS_MV]) + US2000_PWR)
     assert block.size == 1
     assert decoder.cells.shape == (1, 30)
     assert decoder.cells[0, [0, 4, 15]].tolist() == pytest.approx([3.379, 3.381, 3.378])
@@ -201,9 +202,12 @@ def test_console_is_polled_for_the_stack_and_each_battery_in_turn() -> None:
     assert [decoder.next_output(now) for now in (0.0, 0.25)] == [b"pwr\n", b""]
     decoder.feed(0.3, US2000_PWR)
     assert decoder.next_output(0.5) == b"bat 2\n"
-    decoder.feed(0.6, bat(2, US2000_CELLS))
+    decoder.feed(0.6, bat(2, US2000_CELLS_MV))
     assert [decoder.next_output(now) for now in (0.75, 2.0)] == [b"", b"pwr\n"]
-    assert [decoder.next_output(now) for now in (6.0, 7.0)] == [b"", b"pwr\n"]  # no answer: again
+    assert [decoder.next_output(now) for now in (6.0, 7.0)] == [
+        b"",
+        b"pwr\n",
+    ]  # the request without a response is repeated
 
 
 def test_junctek_is_polled_each_second_and_after_reopening() -> None:
@@ -215,9 +219,9 @@ def test_junctek_is_polled_each_second_and_after_reopening() -> None:
 
 def test_old_cells_are_not_attached() -> None:
     decoder = PylontechProtocol()
-    decoder.feed(1.0, bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + US2000_PWR)
+    decoder.feed(1.0, bat(1, US2000_CELLS_MV) + bat(2, US2000_CELLS_MV) + US2000_PWR)
     assert decoder.cells.shape == (1, 30)
-    decoder.feed(60.0, bat(1, US2000_CELLS) + US2000_PWR)
+    decoder.feed(60.0, bat(1, US2000_CELLS_MV) + US2000_PWR)
     assert decoder.cells.shape == (1, 30)
     assert decoder.feed(100.0, US2000_PWR).size == 1
     assert decoder.cells.size == 0
@@ -228,7 +232,7 @@ def test_old_cells_are_not_attached() -> None:
     [
         ("vedirect", BMV_NOW[40:] + BMV_NEXT),
         ("junctek", KH_CHARGING[20:] + KG_DISCHARGING),
-        ("pylontech", bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + b"\rpyl" + US2000_PWR),
+        ("pylontech", bat(1, US2000_CELLS_MV) + bat(2, US2000_CELLS_MV) + b"\rpyl" + US2000_PWR),
     ],
 )
 def test_reopening_the_port_changes_no_sample(name: str, data: bytes) -> None:
@@ -238,7 +242,7 @@ def test_reopening_the_port_changes_no_sample(name: str, data: bytes) -> None:
     for arrival_s, read in reads:
         live.on_port_opened()
         blocks = live.feed(arrival_s, read), replayed.feed(arrival_s, read)
-        assert repr(blocks[0].tolist()) == repr(blocks[1].tolist())  # NaN is no number, and equals none
+        assert repr(blocks[0].tolist()) == repr(blocks[1].tolist())  # repr, because NaN does not equal NaN
         assert live.cells.tolist() == replayed.cells.tolist()
     assert live.counters == replayed.counters
     assert live.counters["frames_received"] > 0
@@ -247,9 +251,9 @@ def test_reopening_the_port_changes_no_sample(name: str, data: bytes) -> None:
 FRAMES = {
     "vedirect": [BMV_NOW, BMV_HISTORY, BMV_WARM, HEX],
     "junctek": [KH_CHARGING, KG_CHARGING, b":R50=1,2,1,\r\n", b":r00=1,217,2140,110,6,\r\n"],
-    "pylontech": [US5000_PWR, US2000_PWR, bat(1, US2000_CELLS), b"\n\rpylon>"],
+    "pylontech": [US5000_PWR, US2000_PWR, bat(1, US2000_CELLS_MV), b"\n\rpylon>"],
 }
-pieces = st.sampled_from(sorted(FRAMES)).flatmap(
+cases = st.sampled_from(sorted(FRAMES)).flatmap(
     lambda name: st.tuples(
         st.just(name),
         st.lists(st.sampled_from(FRAMES[name]) | st.binary(max_size=40), max_size=8).map(b"".join),
@@ -260,8 +264,8 @@ pieces = st.sampled_from(sorted(FRAMES)).flatmap(
 
 
 @settings(max_examples=300)
-@given(pieces)
-def test_no_bytes_raise_and_the_division_into_reads_changes_no_value(
+@given(cases)
+def test_no_bytes_raise_and_chunk_boundaries_do_not_change_the_values(
     case: tuple[str, bytes, list[int], list[tuple[int, int]]],
 ) -> None:
     name, data, cuts, changes = case
@@ -269,28 +273,28 @@ def test_no_bytes_raise_and_the_division_into_reads_changes_no_value(
     for at, value in changes:
         if damaged:
             damaged[at % len(damaged)] = value
-    whole, cut = DIALECTS[name](), DIALECTS[name]()
-    block, cells = whole.feed(1.0, bytes(damaged)), whole.cells
+    whole_decoder, cut_decoder = PROTOCOLS[name](), PROTOCOLS[name]()
+    block, cells = whole_decoder.feed(1.0, bytes(damaged)), whole_decoder.cells
     edges = [0, *sorted(min(at, len(damaged)) for at in cuts), len(damaged)]
     blocks, rows = [], 0
     for n, (a, b) in enumerate(itertools.pairwise(edges)):
-        blocks.append(cut.feed(1.0 + n, bytes(damaged[a:b])))
-        rows += cut.cells.shape[0]
-        cut.next_output(1.0 + n)
-    assert values(np.concatenate(blocks)) == values(block)
+        blocks.append(cut_decoder.feed(1.0 + n, bytes(damaged[a:b])))
+        rows += cut_decoder.cells.shape[0]
+        cut_decoder.next_output(1.0 + n)
+    assert voltages_and_currents(np.concatenate(blocks)) == voltages_and_currents(block)
     assert rows <= cells.shape[0]
-    assert whole.counters["frames_received"] == block.size
-    assert (whole.fault is None) == (cut.fault is None)
+    assert whole_decoder.counters["frames_received"] == block.size
+    assert (whole_decoder.fault is None) == (cut_decoder.fault is None)
 
 
 @pytest.mark.parametrize(("name", "cells"), [("vedirect", 0), ("junctek", 0), ("pylontech", 15)])
-async def test_simulated_device_is_read_over_a_line(name: str, cells: int) -> None:
+async def test_simulated_device_is_read_by_the_serial_source(name: str, cells: int) -> None:
     with METERS[name](lambda _: Reading(-3.25, 49.87, 21.0), 1.0) as meter:
         sensor = SensorSettings.model_validate({"protocol": name, "port": meter.path})
         running = asyncio.create_task(meter.run())
         async with asyncio.timeout(LONG_S), SerialSource(sensor) as source:
             async for block in source:
-                assert values(block) == [(49.87, -3.25)] * block.size
+                assert voltages_and_currents(block) == [(49.87, -3.25)] * block.size
                 assert set(block["temperature_c"]) == {21.0}
                 if source.cells.shape[1] == cells:
                     break
@@ -300,8 +304,8 @@ async def test_simulated_device_is_read_over_a_line(name: str, cells: int) -> No
         assert source.cells.sum() == pytest.approx(49.87 * source.cells.shape[0] * (cells > 0), abs=0.01 * cells)
 
 
-def test_silence_is_no_protocol_fault() -> None:
-    for make in DIALECTS.values():
-        decoder = make()
+def test_silence_does_not_count_as_a_protocol_fault() -> None:
+    for make_decoder in PROTOCOLS.values():
+        decoder = make_decoder()
         assert decoder.feed(1.0, b"").size == 0
         assert (decoder.fault, decoder.description) == (None, None)

@@ -1,7 +1,7 @@
-"""Boards that print text: the result does not depend on how their bytes are divided, and unreadable lines are
-shown."""
+"""Decoder of printed lines: chunk boundaries do not change the result, and invalid lines are reported."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -19,40 +19,40 @@ lines = (
     | st.just(b'{"voltage": 3.4, "current": 1}')
 )
 streams = st.lists(lines, max_size=12).map(b"\n".join)
-cuttings = st.lists(st.integers(0, 8 * MAX_LINE_BYTES), max_size=12)
+cut_positions = st.lists(st.integers(0, 8 * MAX_LINE_BYTES), max_size=12)
 
 
-def fed(data: bytes, cuts: list[int]) -> tuple[TextProtocol, SampleBlock, list[list[float]]]:
-    """The decoder after ``data`` in pieces; its samples; their cells."""
+def decode(data: bytes, cuts: list[int]) -> tuple[TextProtocol, SampleBlock, list[list[float]]]:
+    """Return the decoder after ``data``, which is cut into chunks, and the samples and their cell voltages."""
     decoder = TextProtocol()
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     blocks, cells = [], []
     for a, b in itertools.pairwise(edges):
         blocks.append(decoder.feed(1.0, data[a:b]))
-        cells += [[v for v in row if v == v] for row in decoder.cells.tolist()] or [[]] * blocks[-1].size
+        cells += [[v for v in row if not math.isnan(v)] for row in decoder.cells.tolist()] or [[]] * blocks[-1].size
     return decoder, np.concatenate(blocks), cells
 
 
 @settings(max_examples=300)
-@given(streams, cuttings)
-def test_no_bytes_raise_and_the_division_into_reads_changes_no_value(data: bytes, cuts: list[int]) -> None:
-    decoder, whole, cells = fed(data, [])
-    cut_decoder, cut, cut_cells = fed(data, cuts)
+@given(streams, cut_positions)
+def test_no_bytes_raise_and_chunk_boundaries_do_not_change_the_result(data: bytes, cuts: list[int]) -> None:
+    decoder, whole_block, cells = decode(data, [])
+    cut_decoder, cut_block, cut_cells = decode(data, cuts)
     for name in ("voltage_v", "current_a", "temperature_c"):
-        assert whole[name].tobytes() == cut[name].tobytes()
+        assert whole_block[name].tobytes() == cut_block[name].tobytes()
     assert cells == cut_cells
     assert (decoder.counters, decoder.fault) == (cut_decoder.counters, cut_decoder.fault)
-    assert decoder.counters["frames_received"] == whole.size
+    assert decoder.counters["frames_received"] == whole_block.size
 
 
-def test_the_end_of_a_line_that_is_too_long_is_no_line_of_its_own() -> None:
+def test_end_of_a_line_above_the_maximum_length_is_not_decoded() -> None:
     data = b"\n" + MAX_LINE_BYTES * b"x" + b"3.3,0.1\n3.4,0.2\n"
-    _, block, _ = fed(data, [MAX_LINE_BYTES + 1])
+    _, block, _ = decode(data, [MAX_LINE_BYTES + 1])
     assert block["voltage_v"].tolist() == [3.4]
 
 
 @pytest.mark.parametrize(
-    ("sent", "shown"),
+    ("data", "message"),
     [
         (b"V=13.3kV I=2\r\n", "the first: 'V=13.3kV I=2'"),
         (b"\x1b[31mhot\n", "the first: '\\x1b[31mhot'"),
@@ -60,17 +60,18 @@ def test_the_end_of_a_line_that_is_too_long_is_no_line_of_its_own() -> None:
         (200 * b"x" + b"\n", f"the first: '{60 * 'x'}'..."),
     ],
 )
-def test_first_invalid_line_is_reported_verbatim(sent: bytes, shown: str) -> None:
-    decoder, _, _ = fed(b"half\n" + sent, [])
+def test_first_invalid_line_is_reported_verbatim(data: bytes, message: str) -> None:
+    incomplete_first_line = b"half\n"
+    decoder, _, _ = decode(incomplete_first_line + data, [])
     assert decoder.fault is not None
-    assert shown in decoder.fault
+    assert message in decoder.fault
     assert "baud" not in decoder.fault
     decoder.feed(2.0, b"3.3,0.1\n")
     assert decoder.fault is None
 
 
 def test_binary_bytes_are_reported_as_wrong_baud_rate() -> None:
-    decoder, _, _ = fed(bytes(range(128, 256)) * (MAX_LINE_BYTES // 100), [])
+    decoder, _, _ = decode(bytes(range(128, 256)) * (MAX_LINE_BYTES // 100), [])
     assert "wrong baud rate" in (decoder.fault or "")
 
 
@@ -86,10 +87,10 @@ def test_cells_are_attached_to_their_samples() -> None:
 
 def test_batch_of_reads_gives_the_same_samples_and_cells() -> None:
     reads = [b"6.6,2,25\nV=6.6 I=2 T=25 ce", b"lls=3.31,3.29\n", b"6.7,2,25\n"]
-    one, many = TextProtocol(), TextProtocol()
-    blocks = [one.feed(float(i), read) for i, read in enumerate(reads)]
+    single_reads_decoder, batch_decoder = TextProtocol(), TextProtocol()
+    blocks = [single_reads_decoder.feed(float(i), read) for i, read in enumerate(reads)]
     data = np.frombuffer(b"".join(reads), dtype=np.uint8)
     ends = np.cumsum([len(read) for read in reads])
-    block = many.feed_reads(np.arange(3.0), ends, data)
-    np.testing.assert_array_equal(block, np.concatenate(blocks))
-    np.testing.assert_equal(many.cells, [[np.nan, np.nan], [3.31, 3.29], [np.nan, np.nan]])
+    batch_block = batch_decoder.feed_reads(np.arange(3.0), ends, data)
+    np.testing.assert_array_equal(batch_block, np.concatenate(blocks))
+    np.testing.assert_equal(batch_decoder.cells, [[np.nan, np.nan], [3.31, 3.29], [np.nan, np.nan]])

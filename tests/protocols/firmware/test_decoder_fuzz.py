@@ -1,7 +1,6 @@
-"""Decoder with arbitrary bytes, compared with a slow independent one."""
+"""Decoder of the firmware protocol with arbitrary bytes, compared with a simple, independent one."""
 
 import binascii
-import dataclasses
 import itertools
 import struct
 
@@ -13,42 +12,24 @@ from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.firmware.frame_decoder import FrameCounters, FrameDecoder
-from bms_estimator.protocols.firmware.messages import Hello, SampleMessage, seal, unseal
+from bms_estimator.protocols.firmware.messages import Hello, SampleMessage, seal
+from tests.protocols.firmware.board_messages import HELLO, NTC_STATUS, encode_hello, encode_sample
 
-HELLO = Hello(
-    *(0, 1, 0),
-    reset_cause=1,
-    boot_id=256,
-    serial=0,
-    sequence=0,
-    board_us=0,
-    rate_hz=100,
-    period_ns=10_000_000,
-    adc_bits=10,
-    channels=1,
-    divider_ppm=5_000_000,
-    current_uv_per_a=100_000,
-    current_zero_ppm=500_000,
-    bandgap_uv=1_100_000,
-    bandgap_sum=57_672,
-    bandgap_count=256,
-    ntc_series_ohm=10_000,
-    ntc_r25_ohm=10_000,
-    ntc_beta_k=3950,
-).encode()
 MAX_PACKET = 64
-COUNTED = ("crc_errors", "cobs_errors", "length_errors", "version_errors", "type_errors")
+"""Maximum size of a packet [bytes]. COBS adds two bytes to it."""
+ERROR_COUNTERS = ("crc_errors", "cobs_errors", "length_errors", "version_errors", "type_errors")
 
 
-def sample(i: int) -> bytes:
-    return SampleMessage(i, 10_000 * (i + 1), 34_571 + i, 21_405, 38, 225, 1, 16).encode()
+def sample(number: int) -> bytes:
+    """Return a sample at 100 Hz. Its voltage depends on the number, so that no two samples are equal."""
+    return encode_sample(number, 10_000 * (number + 1), voltage_sum=34_571 + number)
 
 
-NTC_SAMPLE = SampleMessage(1, 20_000, 34_571, 21_405, 38, 512, 1, 0x18).encode()
+NTC_SAMPLE = encode_sample(1, 20_000, aux_sum=512, status=NTC_STATUS)
 
 
-def slowly(data: bytes) -> list[bytes]:
-    """Packets with a right CRC, without it."""
+def decode_independently(data: bytes) -> list[bytes]:
+    """Return the packets with a valid CRC, without the CRC, by the libraries cobs and binascii."""
     packets = []
     for frame in data.split(b"\0")[:-1]:
         try:
@@ -62,12 +43,13 @@ def slowly(data: bytes) -> list[bytes]:
     return packets
 
 
-def samples_among(packets: list[bytes]) -> int:
+def count_samples(packets: list[bytes]) -> int:
+    """Return the number of packets that are samples: 22 bytes with version 1 and message type 1."""
     return sum(len(p) == 22 and p[:2] == b"\x01\x01" for p in packets)
 
 
 def decode(data: bytes, cuts: list[int]) -> tuple[SampleBlock, FrameCounters]:
-    """Samples and counters of ``data`` fed in chunks, all at one time."""
+    """Return samples and counters after ``data``, which is cut into chunks that arrive at one time."""
     decoder = FrameDecoder()
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     blocks = [decoder.feed(1.0, data[a:b]) for a, b in itertools.pairwise(edges)]
@@ -85,77 +67,79 @@ frames = st.builds(
     aux_count=st.integers(0, 255),
     status=st.integers(0, 255),
 ).map(SampleMessage.encode)
-widths = {"B": 8, "H": 16, "I": 32}
-numbers = [st.integers(0, 2 ** widths[code] - 1) for code in "BBBBHIIIHIBBIIIIIHIIH"]
-hellos = st.builds(Hello, *numbers).map(Hello.encode)
-sealed_nonsense = st.binary(max_size=80).map(seal)
-damaged = st.builds(
+bits_by_format = {"B": 8, "H": 16, "I": 32}
+hello_fields = [st.integers(0, 2 ** bits_by_format[code] - 1) for code in "BBBBHIIIHIBBIIIIIHIIH"]
+hellos = st.builds(Hello, *hello_fields).map(Hello.encode)
+random_packets = st.binary(max_size=80).map(seal)
+frames_with_a_changed_byte = st.builds(
     lambda frame, at, byte: frame[: at % len(frame)] + bytes((byte,)) + frame[at % len(frame) + 1 :],
     frames | st.just(HELLO),
     st.integers(0, 100),
     st.integers(0, 255),
 )
 streams = st.lists(
-    st.binary(max_size=120) | frames | hellos | damaged | sealed_nonsense | st.just(HELLO), max_size=12
+    st.binary(max_size=120) | frames | hellos | frames_with_a_changed_byte | random_packets | st.just(HELLO),
+    max_size=12,
 ).map(b"".join)
-cuttings = st.lists(st.integers(0, 1000), max_size=12)
+cut_positions = st.lists(st.integers(0, 1000), max_size=12)
 
 
 @settings(max_examples=300)
-@given(streams, cuttings)
-def test_no_bytes_raise_and_the_division_into_reads_changes_nothing(data: bytes, cuts: list[int]) -> None:
-    whole, counters = decode(data, [])
-    cut, cut_counters = decode(data, cuts)
-    for name in whole.dtype.names or ():  # not the padding between them
-        assert whole[name].tobytes() == cut[name].tobytes()
-    assert counters == cut_counters
-    assert counters.bytes_received <= len(data)
+@given(streams, cut_positions)
+def test_no_bytes_raise_and_chunk_boundaries_do_not_change_the_result(data: bytes, cuts: list[int]) -> None:
+    whole_block, whole_counters = decode(data, [])
+    cut_block, cut_counters = decode(data, cuts)
+    for name in whole_block.dtype.names or ():  # the padding between the fields is not compared
+        assert whole_block[name].tobytes() == cut_block[name].tobytes()
+    assert whole_counters == cut_counters
+    assert whole_counters.bytes_received <= len(data)
 
 
 @settings(max_examples=300)
 @given(streams)
-def test_every_frame_with_a_right_crc_is_a_sample_or_counted_and_no_other_is(data: bytes) -> None:
-    packets = slowly(HELLO + data)
+def test_each_sample_with_a_valid_crc_is_decoded_or_counted_as_dropped(data: bytes) -> None:
+    packets = decode_independently(HELLO + data)
     block, counters = decode(HELLO + data, [])
     assert block.size == counters.frames_received
     dropped = counters.duplicates + counters.out_of_order + counters.before_hello
-    assert counters.frames_received + dropped == samples_among(packets)
-    foreign = sum(p[0] != 1 for p in packets)
-    assert counters.version_errors == foreign
+    assert counters.frames_received + dropped == count_samples(packets)
+    packets_of_other_versions = sum(p[0] != 1 for p in packets)
+    assert counters.version_errors == packets_of_other_versions
 
 
 @settings(max_examples=200)
 @given(st.lists(st.binary(max_size=200), min_size=1, max_size=8))
-def test_frames_between_garbage_are_all_recovered(garbage: list[bytes]) -> None:
+def test_all_frames_between_garbage_are_decoded(garbage: list[bytes]) -> None:
     data = HELLO + b"".join(noise + b"\0" + sample(i) for i, noise in enumerate(garbage))
     block, counters = decode(data, [])
-    assert counters.frames_received - (samples_among(slowly(data)) - len(garbage)) == len(garbage)
+    samples_in_garbage = count_samples(decode_independently(data)) - len(garbage)
+    assert counters.frames_received - samples_in_garbage == len(garbage)
     assert counters.frames_lost == 0
     assert np.allclose(np.diff(block["time_s"]), 0.01)
 
 
 @settings(max_examples=200)
 @given(st.integers(0, 23), st.integers(1, 255))
-def test_a_sample_with_one_byte_changed_is_no_sample(at: int, change: int) -> None:
-    """CRC-16 finds every burst of up to 16 bits; a byte of COBS touches two bytes of the packet at most."""
+def test_sample_with_one_changed_byte_is_rejected(at: int, change: int) -> None:
+    """CRC-16 detects every burst of up to 16 bits, and a byte of a COBS frame affects at most two bytes of the packet."""
     frame = sample(1)
-    spoilt = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
-    block, counters = decode(HELLO + sample(0) + spoilt + sample(2), [])
+    changed_frame = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
+    block, counters = decode(HELLO + sample(0) + changed_frame + sample(2), [])
     assert list(block["time_s"]) == [block["time_s"][0], block["time_s"][0] + 0.02]
     assert counters.frames_lost == 1
-    assert sum(getattr(counters, name) for name in COUNTED) >= 1
+    assert sum(getattr(counters, name) for name in ERROR_COUNTERS) >= 1
 
 
 @pytest.mark.parametrize("field", ["current_uv_per_a", "ntc_r25_ohm", "ntc_beta_k"])
 def test_hello_with_a_zero_field_does_not_raise(field: str) -> None:
-    zeroed = dataclasses.replace(Hello.decode(unseal(HELLO)), **{field: 0}).encode()
-    decode(zeroed + sample(0) + NTC_SAMPLE + sample(2), [])
+    decode(encode_hello(**{field: 0}) + sample(0) + NTC_SAMPLE + sample(2), [])
 
 
 @given(st.binary(max_size=60))
-def test_half_a_frame_at_the_start_is_no_fault(tail: bytes) -> None:
-    begin = bytes(byte or 1 for byte in tail)
-    _, counters = decode(begin + b"\0" + HELLO + sample(0), [])
+def test_incomplete_first_frame_counts_as_no_error(data: bytes) -> None:
+    """A host that opens the port while the board sends receives the end of a frame first."""
+    frame_end = bytes(byte or 1 for byte in data)  # zero is the delimiter
+    _, counters = decode(frame_end + b"\0" + HELLO + sample(0), [])
     assert counters.frames_received == 1
-    assert not slowly(begin + b"\0")
-    assert sum(getattr(counters, name) for name in COUNTED) == 0
+    assert not decode_independently(frame_end + b"\0")
+    assert sum(getattr(counters, name) for name in ERROR_COUNTERS) == 0

@@ -1,4 +1,4 @@
-"""Protocol of the board without a line: requests, retries and answers."""
+"""Protocol of the board without a serial line: requests, retries and responses."""
 
 from dataclasses import replace
 
@@ -23,10 +23,12 @@ from bms_estimator.protocols.firmware.protocol import RETRY_S, BoardProtocol
 from tests.service.test_bad_line import HELLO, frames, sample
 
 ZERO = MessageType.COMMAND_ZERO_CURRENT
+ASH_RESET = b"\x1a\xc1\x02\x0b\x0a\x52\x7e"
+"""Bytes that a Zigbee stick sends after its reset."""
 
 
-def talking(hello: Hello = HELLO, rate_hz: int = 100) -> BoardProtocol:
-    """After the board's hello."""
+def protocol_after_hello(hello: Hello = HELLO, rate_hz: int = 100) -> BoardProtocol:
+    """Return a protocol that has received the board's hello."""
     decoder = BoardProtocol(rate_hz=rate_hz)
     decoder.feed(0.0, b"\0" + hello.encode())
     return decoder
@@ -35,7 +37,7 @@ def talking(hello: Hello = HELLO, rate_hz: int = 100) -> BoardProtocol:
 def test_nothing_is_sent_before_a_complete_frame() -> None:
     decoder = BoardProtocol(rate_hz=100)
     assert decoder.next_output(0.0) == b""
-    decoder.feed(1.0, b"\x1a\xc1\x02\x0b\x0a\x52\x7e" + sample(0).encode()[:-4])
+    decoder.feed(1.0, ASH_RESET + sample(0).encode()[:-4])
     assert decoder.next_output(1.0) == b""
     decoder.feed(2.0, b"\0" + sample(1).encode())
     assert decoder.next_output(2.0) == hello_command()
@@ -49,16 +51,16 @@ def test_unanswered_request_is_repeated_after_the_retry_interval() -> None:
     assert decoder.next_output(1.1 * RETRY_S) == hello_command()
 
 
-def test_rate_is_set_if_the_board_has_another() -> None:
-    assert talking(rate_hz=100).next_output(0.0) == b""
-    decoder = talking(rate_hz=250)
+def test_rate_is_set_if_the_board_reports_another_rate() -> None:
+    assert protocol_after_hello(rate_hz=100).next_output(0.0) == b""
+    decoder = protocol_after_hello(rate_hz=250)
     assert decoder.next_output(0.0) == set_rate_command(250) + hello_command()
     decoder.feed(0.1, replace(HELLO, rate_hz=250).encode())
     assert decoder.next_output(10.0) == b""
 
 
 def test_nothing_is_sent_after_reopening_before_a_frame() -> None:
-    decoder = talking()
+    decoder = protocol_after_hello()
     decoder.on_port_opened()
     assert decoder.next_output(1.0) == b""
     assert decoder.board == {}
@@ -68,11 +70,11 @@ def test_nothing_is_sent_after_reopening_before_a_frame() -> None:
     assert decoder.board["serial"] == "00000007"
 
 
-def test_a_command_is_done_with_the_hello_that_follows_it() -> None:
-    decoder = talking()
+def test_command_is_done_when_the_hello_after_it_arrives() -> None:
+    decoder = protocol_after_hello()
     command = decoder.command("current_zero")
     assert decoder.next_output(0.0) == zero_current_command()
-    assert decoder.next_output(3.0) == b""  # the board measures; asked twice it would be busy
+    assert decoder.next_output(3.0) == b""  # the board still measures and would reject a second command as busy
     decoder.feed(3.0, Ack(ZERO, AckResult.OK, 510_000).encode())
     assert (command.done, decoder.next_output(3.0)) == (False, hello_command())
     decoder.feed(3.1, replace(HELLO, current_zero_ppm=510_000).encode())
@@ -80,7 +82,7 @@ def test_a_command_is_done_with_the_hello_that_follows_it() -> None:
 
 
 def test_rejected_command_has_a_reason() -> None:
-    decoder = talking()
+    decoder = protocol_after_hello()
     command = decoder.command("current_zero")
     decoder.feed(1.0, Ack(ZERO, AckResult.BAD_VALUE, 0).encode())
     assert command.done
@@ -96,7 +98,7 @@ def test_cancelled_command_is_not_sent() -> None:
 
 
 def test_command_is_cancelled_when_the_line_is_lost() -> None:
-    decoder = talking()
+    decoder = protocol_after_hello()
     command = decoder.command("current_zero")
     decoder.next_output(0.0)
     decoder.on_port_opened()
@@ -121,16 +123,16 @@ messages = (
 @given(st.lists(messages, max_size=20))
 def test_no_bytes_raise(reads: list[bytes]) -> None:
     decoder = BoardProtocol(rate_hz=250)
-    for at, data in enumerate(reads):
-        if at % 5 == 2:
+    for second, data in enumerate(reads):
+        if second % 5 == 2:
             decoder.command("current_zero")
-        decoder.feed(float(at), data)
-        decoder.next_output(float(at))
+        decoder.feed(float(second), data)
+        decoder.next_output(float(second))
     assert decoder.counters["bytes_received"] <= sum(map(len, reads))
 
 
 def test_relay_command_is_repeated_until_acknowledged() -> None:
-    decoder, relay = talking(), Relay(high=True, high_when_silent=False, silent_s=30)
+    decoder, relay = protocol_after_hello(), Relay(high=True, high_when_silent=False, silent_s=30)
     command = decoder.relay(relay)
     assert decoder.next_output(0.0) == set_relay_command(relay)
     assert decoder.next_output(1.1 * RETRY_S) == set_relay_command(relay)
@@ -141,7 +143,7 @@ def test_relay_command_is_repeated_until_acknowledged() -> None:
 
 
 def test_firmware_without_relay_is_reported() -> None:
-    decoder = talking()
+    decoder = protocol_after_hello()
     command = decoder.relay(Relay(high=True, high_when_silent=None))
     decoder.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.UNKNOWN_COMMAND, 0).encode())
     assert command.done

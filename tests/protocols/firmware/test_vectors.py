@@ -1,4 +1,4 @@
-"""The Python codec and the decoder against the vectors that hold the firmware as well."""
+"""Python codec and decoder, compared with the test vectors that are shared with the firmware."""
 
 import json
 from collections.abc import Callable
@@ -30,7 +30,7 @@ from bms_estimator.protocols.firmware.messages import (
 )
 
 VECTORS = json.loads((Path(__file__).parents[3] / "firmware" / "test_vectors.json").read_text())
-MAX_FRAME = 66
+MAX_FRAME_BYTES = 66
 COMMANDS: dict[str, Callable[..., bytes]] = {
     "hello": hello_command,
     "zero_current": zero_current_command,
@@ -41,41 +41,44 @@ COMMANDS: dict[str, Callable[..., bytes]] = {
     "set_divider": set_divider_command,
     "set_current_slope": set_current_slope_command,
     "set_ratiometric": set_ratiometric_command,
-    "set_relay": lambda told: set_relay_command(Relay(*told)),
+    "set_relay": lambda fields: set_relay_command(Relay(*fields)),
 }
-CLASSES: dict[str, type[SampleMessage | Hello | Ack]] = {"sample": SampleMessage, "hello": Hello, "ack": Ack}
+MESSAGE_CLASSES: dict[str, type[SampleMessage | Hello | Ack]] = {"sample": SampleMessage, "hello": Hello, "ack": Ack}
 
 Vector = dict[str, Any]
 
 
-def name(vector: Vector) -> str:
+def vector_id(vector: Vector) -> str:
+    """Return the id of a test case."""
     return "-".join(str(vector[key]) for key in ("message", "command", "argument", "what") if key in vector)
 
 
-def message(vector: Vector) -> SampleMessage | Hello | Ack:
+def make_message(vector: Vector) -> SampleMessage | Hello | Ack:
+    """Return the message with the fields of the vector."""
     fields = vector["fields"]
     if vector["message"] == "ack":
         fields = fields | {"result": AckResult(fields["result"])}
-    return CLASSES[vector["message"]](**fields)
+    return MESSAGE_CLASSES[vector["message"]](**fields)
 
 
-@pytest.mark.parametrize("vector", VECTORS["messages"], ids=name)
-def test_a_message_is_encoded_and_decoded_byte_for_byte(vector: Vector) -> None:
-    assert message(vector).encode().hex() == vector["frame"]
-    assert unseal(bytes.fromhex(vector["frame"])).hex() == vector["packet"][:-4]
-    assert CLASSES[vector["message"]].decode(bytes.fromhex(vector["packet"])[:-2]) == message(vector)
+@pytest.mark.parametrize("vector", VECTORS["messages"], ids=vector_id)
+def test_message_is_encoded_and_decoded_byte_for_byte(vector: Vector) -> None:
+    packet_without_crc = bytes.fromhex(vector["packet"])[:-2]
+    assert make_message(vector).encode().hex() == vector["frame"]
+    assert unseal(bytes.fromhex(vector["frame"])) == packet_without_crc
+    assert MESSAGE_CLASSES[vector["message"]].decode(packet_without_crc) == make_message(vector)
 
 
-@pytest.mark.parametrize("vector", VECTORS["commands"], ids=name)
-def test_a_command_is_encoded_byte_for_byte(vector: Vector) -> None:
+@pytest.mark.parametrize("vector", VECTORS["commands"], ids=vector_id)
+def test_command_is_encoded_byte_for_byte(vector: Vector) -> None:
     arguments = [] if vector["argument"] is None else [vector["argument"]]
     assert COMMANDS[vector["command"]](*arguments).hex() == vector["frame"]
 
 
-@pytest.mark.parametrize("vector", VECTORS["bad_frames"], ids=name)
-def test_a_bad_frame_is_refused_by_codec_and_decoder(vector: Vector) -> None:
+@pytest.mark.parametrize("vector", VECTORS["bad_frames"], ids=vector_id)
+def test_invalid_frame_is_rejected_by_codec_and_decoder(vector: Vector) -> None:
     frame = bytes.fromhex(vector["frame"])
-    if len(frame) <= MAX_FRAME:  # the length of a message is checked once its type is known
+    if len(frame) <= MAX_FRAME_BYTES:  # unseal does not check the length, which depends on the message type
         with pytest.raises(ProtocolError):
             unseal(frame)
     decoder = FrameDecoder()
@@ -84,16 +87,16 @@ def test_a_bad_frame_is_refused_by_codec_and_decoder(vector: Vector) -> None:
     assert counters.crc_errors + counters.cobs_errors + counters.length_errors == 1
 
 
-@pytest.mark.parametrize("vector", VECTORS["messages"], ids=name)
-def test_the_decoder_takes_every_message(vector: Vector) -> None:
+@pytest.mark.parametrize("vector", VECTORS["messages"], ids=vector_id)
+def test_decoder_accepts_every_message(vector: Vector) -> None:
     decoder = FrameDecoder()
     hello = next(v for v in VECTORS["messages"] if v["what"] == "of a fresh board")
     decoder.feed(0.0, bytes.fromhex(hello["frame"]))
     samples = decoder.feed(1.0, bytes.fromhex(vector["frame"]))
     assert samples.size == (vector["message"] == "sample")
     if vector["message"] == "hello":
-        assert decoder.hello == message(vector)
+        assert decoder.hello == make_message(vector)
     if vector["message"] == "ack":
-        assert decoder.take_acks() == [message(vector)]
+        assert decoder.take_acks() == [make_message(vector)]
     counters = decoder.counters
     assert counters.crc_errors + counters.cobs_errors + counters.length_errors + counters.type_errors == 0

@@ -1,6 +1,6 @@
-"""Simulated BlueZ on D-Bus, with one JBD BMS in reach: what bleak talks to, on a bus of its own.
+"""Simulated BlueZ on a private D-Bus, with one JBD BMS in range, for tests with bleak.
 
-Interfaces and properties as BlueZ documents them (doc/org.bluez.*.rst); nothing of the radio is simulated.
+The interfaces and properties are those of BlueZ's documentation (doc/org.bluez.*.rst). The radio is not simulated.
 """
 
 import asyncio
@@ -22,9 +22,9 @@ DEVICE = f"{ADAPTER}/dev_{ADDRESS.replace(':', '_')}"
 SERVICE, NOTIFY, WRITE = f"{DEVICE}/service0010", f"{DEVICE}/service0010/char0011", f"{DEVICE}/service0010/char0013"
 CELLS, BASIC = JBD_DISCHARGING.frames[:15], JBD_DISCHARGING.frames[15:]
 ADVERTISE_S = 0.02
-"""Between two advertisements [s]."""
+"""Interval of the advertisements [s]."""
 PACKET_BYTES = 20
-"""Of one notification."""
+"""Maximum size of a notification [bytes]."""
 
 
 def uuid(short: str) -> str:
@@ -37,17 +37,17 @@ def variants(**values: Any) -> dict[str, Variant]:
 
 
 class BlueZ:
-    """``org.bluez`` on a bus.
+    """Service ``org.bluez`` on a bus.
 
     Attributes:
-        near: Whether the BMS advertises and lets itself be connected.
-        asked: What was written to it.
+        in_range: True: the BMS advertises and accepts connections.
+        requests: Bytes that were written to the BMS.
     """
 
     def __init__(self, bus: MessageBus) -> None:
         self._bus = bus
-        self.near, self._discovering = True, False
-        self.asked: list[bytes] = []
+        self.in_range, self._discovering = True, False
+        self.requests: list[bytes] = []
         bus.add_message_handler(self._handle)
 
     def objects(self) -> dict[str, dict[str, dict[str, Variant]]]:
@@ -75,56 +75,56 @@ class BlueZ:
             **characteristics,
         }
 
-    def changed(self, path: str, interface: str, **values: Any) -> None:
+    def send_properties(self, path: str, interface: str, **values: Any) -> None:
         body = [interface, variants(**values), []]
         self._bus.send(
             Message.new_signal(path, "org.freedesktop.DBus.Properties", "PropertiesChanged", "sa{sv}as", body)
         )
 
     def _advertise(self) -> None:
-        """Now, and again and again while somebody looks for it."""
+        """Advertise the BMS periodically during a discovery."""
         if self._discovering:
-            if self.near:
-                self.changed(DEVICE, "org.bluez.Device1", RSSI=-50)
+            if self.in_range:
+                self.send_properties(DEVICE, "org.bluez.Device1", RSSI=-50)
             asyncio.get_running_loop().call_later(ADVERTISE_S, self._advertise)
 
     def leave(self) -> None:
-        """The BMS is out of reach."""
-        self.near = False
-        self.changed(DEVICE, "org.bluez.Device1", Connected=False, ServicesResolved=False)
+        """Move the BMS out of range."""
+        self.in_range = False
+        self.send_properties(DEVICE, "org.bluez.Device1", Connected=False, ServicesResolved=False)
 
     def _handle(self, message: Message) -> Message | None:
         if message.message_type != MessageType.METHOD_CALL or not (message.path or "").startswith(("/org/bluez", "/")):
             return None
         if message.member == "GetManagedObjects":
             return Message.new_method_return(message, "a{oa{sa{sv}}}", [self.objects()])
-        if message.member == "Connect" and not self.near:
+        if message.member == "Connect" and not self.in_range:
             return Message.new_error(message, "org.bluez.Error.Failed", "le-connection-abort-by-peer")
-        asyncio.get_running_loop().call_soon(self._follow, message)
+        asyncio.get_running_loop().call_soon(self._execute, message)
         return Message.new_method_return(message)
 
-    def _follow(self, message: Message) -> None:
-        """What comes of a call."""
+    def _execute(self, message: Message) -> None:
+        """Change the properties as BlueZ does after a method call."""
         if message.member == "StartDiscovery":
             self._discovering = True
-            self.changed(ADAPTER, "org.bluez.Adapter1", Discovering=True)
+            self.send_properties(ADAPTER, "org.bluez.Adapter1", Discovering=True)
             self._advertise()
         elif message.member == "StopDiscovery":
             self._discovering = False
-            self.changed(ADAPTER, "org.bluez.Adapter1", Discovering=False)
+            self.send_properties(ADAPTER, "org.bluez.Adapter1", Discovering=False)
         elif message.member in ("Connect", "Disconnect"):
-            there = message.member == "Connect"
-            self.changed(DEVICE, "org.bluez.Device1", Connected=there, ServicesResolved=there)
+            connected = message.member == "Connect"
+            self.send_properties(DEVICE, "org.bluez.Device1", Connected=connected, ServicesResolved=connected)
         elif message.member == "WriteValue":
-            self.asked.append(bytes(message.body[0]))
-            answer = {0x03: BASIC, 0x04: CELLS}.get(self.asked[-1][2], b"")
+            self.requests.append(bytes(message.body[0]))
+            answer = {0x03: BASIC, 0x04: CELLS}.get(self.requests[-1][2], b"")
             for at in range(0, len(answer), PACKET_BYTES):
-                self.changed(NOTIFY, "org.bluez.GattCharacteristic1", Value=answer[at : at + PACKET_BYTES])
+                self.send_properties(NOTIFY, "org.bluez.GattCharacteristic1", Value=answer[at : at + PACKET_BYTES])
 
 
 @asynccontextmanager
 async def system_bus(folder: Path) -> AsyncIterator[MessageBus]:
-    """A D-Bus of its own; who uses the system's is led to it by ``DBUS_SYSTEM_BUS_ADDRESS``."""
+    """Start a private D-Bus. ``DBUS_SYSTEM_BUS_ADDRESS`` makes it the system bus of this process."""
     program = shutil.which("dbus-daemon")
     assert program is not None
     process = await asyncio.create_subprocess_exec(

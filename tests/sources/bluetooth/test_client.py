@@ -1,4 +1,4 @@
-"""A JBD BMS over Bluetooth: real aiobmsble and bleak, which find BlueZ on a D-Bus of its own; only BlueZ is simulated."""
+"""JBD BMS over Bluetooth with aiobmsble and bleak, and with a simulated BlueZ on a private D-Bus."""
 
 import asyncio
 import json
@@ -21,17 +21,17 @@ bluez = pytest.importorskip("tests.sources.bluetooth.bluez", reason=WHY)
 if shutil.which("dbus-daemon") is None:
     pytest.skip("dbus-daemon is not installed", allow_module_level=True)
 
-TOLD = {"voltage_v": 15.6, "current_a": -2.87, "temperature_c": 22.133, "cells_v": [3.43, 3.425, 3.432, 3.417]}
-"""Charge is positive."""
+JBD_SAMPLE = {"voltage_v": 15.6, "current_a": -2.87, "temperature_c": 22.133, "cells_v": [3.43, 3.425, 3.432, 3.417]}
+"""Values of the simulated BMS. The current is positive on charge."""
 
 
-def producer(**told: object) -> LineProducer:
-    made: LineProducer = ble_bms.BleProducer(BleSource.model_validate({"kind": "ble", "poll_s": 0.5} | told))
-    return made
+def make_producer(**options: object) -> LineProducer:
+    producer: LineProducer = ble_bms.BleProducer(BleSource.model_validate({"kind": "ble", "poll_s": 0.5} | options))
+    return producer
 
 
-async def to_the_end(brought: AsyncGenerator[bytes, None]) -> None:
-    async for _ in brought:
+async def read_to_end(lines: AsyncGenerator[bytes, None]) -> None:
+    async for _ in lines:
         pass
 
 
@@ -39,23 +39,23 @@ async def test_bms_is_polled_and_reconnected_after_a_loss(tmp_path: Path, monkey
     async with asyncio.timeout(LONG_S), bluez.system_bus(tmp_path) as bus:
         stack = bluez.BlueZ(bus)
         await bus.request_name("org.bluez")
-        asked = producer(address=bluez.ADDRESS.lower())
-        async with aclosing(asked.iter_lines()) as brought:
-            assert await anext(brought) == CONNECTED
-            assert [json.loads(await anext(brought)) for _ in range(2)] == 2 * [TOLD]
+        producer = make_producer(address=bluez.ADDRESS.lower())
+        async with aclosing(producer.iter_lines()) as lines:
+            assert await anext(lines) == CONNECTED
+            assert [json.loads(await anext(lines)) for _ in range(2)] == 2 * [JBD_SAMPLE]
             stack.leave()
             with pytest.raises(SourceUnavailableError):
-                await to_the_end(brought)
+                await read_to_end(lines)
         monkeypatch.setattr(ble_bms, "SCAN_S", 0.2)
         with pytest.raises(SourceUnavailableError, match="does not advertise"):
-            await to_the_end(asked.iter_lines())
+            await read_to_end(producer.iter_lines())
         monkeypatch.undo()
-        stack.near = True
-        async with aclosing(producer(name=bluez.NAME, bms="jbd").iter_lines()) as brought:
-            assert await anext(brought) == CONNECTED
-            assert json.loads(await anext(brought)) == TOLD
+        stack.in_range = True
+        async with aclosing(make_producer(name=bluez.NAME, bms="jbd").iter_lines()) as lines:
+            assert await anext(lines) == CONNECTED
+            assert json.loads(await anext(lines)) == JBD_SAMPLE
 
 
 def test_unsupported_bms_is_rejected() -> None:
     with pytest.raises(UserError, match=r"source\.bms = 'jbdd': aiobmsble supports abc, .*jbd"):
-        producer(address=bluez.ADDRESS, bms="jbdd")
+        make_producer(address=bluez.ADDRESS, bms="jbdd")

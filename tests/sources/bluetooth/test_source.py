@@ -1,4 +1,4 @@
-"""Samples of a BMS over Bluetooth. They are aiobmsble's own: of its tests of JBD and Jikong BMS."""
+"""Readings from samples of aiobmsble. The samples are those of its tests of JBD and Jikong BMS."""
 
 import math
 import sys
@@ -15,7 +15,7 @@ from bms_estimator.sources.factory import open_line_source
 
 
 class Sensor:
-    """As aiobmsble's ``TempSensor``: a number with the name of what it is on."""
+    """Replacement of aiobmsble's ``TempSensor``: a temperature with the type of the sensor's place."""
 
     def __init__(self, value: float, on: str = "GENERIC") -> None:
         self.value, self.type = value, type("T", (), {"name": on})
@@ -36,10 +36,10 @@ JBD = {
     "temp_values": [Sensor(22.4), Sensor(22.3), Sensor(21.7)],
     "problem": False,
 }
-"""Discharging."""
+"""Sample of a JBD BMS during discharge."""
 
 
-def test_a_sample_of_aiobmsble_is_a_reading_with_charge_positive() -> None:
+def test_current_of_a_reading_is_positive_on_charge() -> None:
     reading = convert_sample(JBD)
     assert reading is not None
     assert reading[:4] == Reading(15.6, -2.87, 22.133, (3.43, 3.425, 3.432, 3.417))[:4]
@@ -65,14 +65,14 @@ def test_temperature_without_cell_sensors_and_bms_is_the_mean(sensors: list[floa
 @pytest.mark.parametrize(
     "sample", [{}, {"voltage": 13.2}, {"current": 1.0}, JBD | {"voltage": math.nan}, JBD | {"current": None}]
 )
-def test_without_voltage_or_current_there_is_no_reading(sample: dict[str, object]) -> None:
+def test_sample_without_voltage_or_current_is_rejected(sample: dict[str, object]) -> None:
     assert convert_sample(sample) is None
 
 
-@pytest.mark.parametrize("told", [{}, {"name": "a", "address": "A4:C1:38:00:11:22"}, {"address": "A4C138001122"}])
-def test_invalid_settings_are_rejected(told: dict[str, object]) -> None:
+@pytest.mark.parametrize("options", [{}, {"name": "a", "address": "A4:C1:38:00:11:22"}, {"address": "A4C138001122"}])
+def test_invalid_settings_are_rejected(options: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
-        Settings.model_validate({"source": {"kind": "ble"} | told})
+        Settings.model_validate({"source": {"kind": "ble"} | options})
 
 
 @pytest.mark.skipif(sys.hexversion >= MIN_PYTHON_HEX, reason="this Python is new enough")

@@ -1,3 +1,5 @@
+"""Files of OCV curves: order of the rows, hysteresis, and rejection of other files and invalid values."""
+
 import gzip
 
 import pytest
@@ -6,7 +8,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.curves import read_curve
 
 
-def test_a_curve_is_read_in_the_order_of_soc(tmp_path):
+def test_rows_of_a_curve_are_sorted_by_soc(tmp_path):
     path = tmp_path / "c.csv"
     path.write_text("# a book\nocv_v,soc\n4.2,1\n3.0,0\n3.7,0.5\n")
     soc, ocv_v, hysteresis_v = read_curve(path)
@@ -17,7 +19,7 @@ def test_a_curve_is_read_in_the_order_of_soc(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["time.csv", "absent.csv", "raw.bms", "broken.csv.gz"])
-def test_other_files_are_no_curves(tmp_path, name):
+def test_other_files_give_none(tmp_path, name):
     (tmp_path / "time.csv").write_text("time_s,current_a,voltage_v\n0,1,3.7\n")
     (tmp_path / "raw.bms").write_bytes(b"\x00\xff")
     (tmp_path / "broken.csv.gz").write_bytes(b"soc,ocv_v")
@@ -33,7 +35,7 @@ def test_other_files_are_no_curves(tmp_path, name):
         ("", "no rows"),
     ],
 )
-def test_a_bad_curve_is_refused(tmp_path, rows, message):
+def test_invalid_curve_is_rejected_with_a_reason(tmp_path, rows, message):
     path = tmp_path / "c.csv"
     path.write_text("soc,ocv_v\n" + rows)
     with pytest.raises(UserError, match=message):

@@ -23,7 +23,12 @@ READS = [(0.5 * i, b"3.%d,0.1\n" % i) for i in range(100)]
 
 
 class Disk:
-    """What ``CaptureWriter`` writes to: it can hang, and it can fail."""
+    """Simulated disk below ``CaptureWriter``.
+
+    Attributes:
+        works: Event; while it is cleared, writes hang.
+        fails: True: writes fail because the disk is full.
+    """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.works = threading.Event()
@@ -31,27 +36,28 @@ class Disk:
         self.fails = False
         write = CaptureWriter.write
 
-        def slowly(writer: CaptureWriter, arrival_s: float, data: bytes) -> None:
+        def write_to_disk(writer: CaptureWriter, arrival_s: float, data: bytes) -> None:
             assert self.works.wait(LONG_S)
             if self.fails:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             write(writer, arrival_s, data)
 
-        monkeypatch.setattr(CaptureWriter, "write", slowly)
+        monkeypatch.setattr(CaptureWriter, "write", write_to_disk)
 
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
-    made = Disk(monkeypatch)
-    yield made
-    made.works.set()
+    disk = Disk(monkeypatch)
+    yield disk
+    disk.works.set()
 
 
-def recorded(path: Path) -> list[tuple[float, bytes]]:
+def read_reads(path: Path) -> list[tuple[float, bytes]]:
+    """Return the arrival times and bytes in a capture."""
     return [read for batch in read_capture(path) for read in batch]
 
 
-def give(recording: CaptureRecorder) -> None:
+def write_reads(recording: CaptureRecorder) -> None:
     for read in READS:
         recording.write(*read)
 
@@ -59,10 +65,10 @@ def give(recording: CaptureRecorder) -> None:
 def test_hung_disk_blocks_no_writer_and_loses_nothing(tmp_path: Path, disk: Disk) -> None:
     disk.works.clear()
     with CaptureRecorder(tmp_path / "line.bms", CaptureHeader()) as recording:
-        give(recording)
-        assert recorded(tmp_path / "line.bms") == []
+        write_reads(recording)
+        assert read_reads(tmp_path / "line.bms") == []
         disk.works.set()
-    assert recorded(tmp_path / "line.bms") == READS
+    assert read_reads(tmp_path / "line.bms") == READS
     assert recording.bytes == sum(len(data) for _, data in READS)
     assert recording.missed_reads == 0
     assert recording.ended.exception() is None
@@ -71,16 +77,16 @@ def test_hung_disk_blocks_no_writer_and_loses_nothing(tmp_path: Path, disk: Disk
 def test_slow_disk_ends_the_recording_and_missed_reads_are_counted(tmp_path: Path, disk: Disk) -> None:
     disk.works.clear()
     with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(), max_queued_chunks=10) as recording:
-        give(recording)
+        write_reads(recording)
         disk.works.set()
-    kept = recorded(tmp_path / "line.bms")
-    assert 10 <= len(kept) <= 11  # one may be on its way to the disk
-    assert kept == READS[: len(kept)]
-    assert recording.missed_reads == len(READS) - len(kept)
+    saved_reads = read_reads(tmp_path / "line.bms")
+    assert 10 <= len(saved_reads) <= 11  # the writer may have removed one read from the queue of ten
+    assert saved_reads == READS[: len(saved_reads)]
+    assert recording.missed_reads == len(READS) - len(saved_reads)
     assert "is too slow" in str(recording.ended.exception())
 
 
-async def test_a_full_disk_ends_the_recording_and_not_the_samples(tmp_path: Path, disk: Disk, line: Line) -> None:
+async def test_full_disk_ends_the_recording_but_not_the_samples(tmp_path: Path, disk: Disk, line: Line) -> None:
     line.plug()
     with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(mode="text")) as recording:
         settings = SensorSettings(port=str(line.path), protocol="text")
@@ -91,7 +97,7 @@ async def test_a_full_disk_ends_the_recording_and_not_the_samples(tmp_path: Path
             disk.fails = True
             line.write(b"3.81,0.1\n")
             await anext(blocks)
-            while not recording.ended.done():  # noqa: ASYNC110 - of a thread
+            while not recording.ended.done():  # noqa: ASYNC110 - another thread sets the future
                 await asyncio.sleep(0.01)
             line.write(b"3.82,0.1\n")
             assert (await anext(blocks))["voltage_v"].tolist() == [3.82]
@@ -105,12 +111,12 @@ def test_capture_is_synced_while_it_grows(tmp_path: Path, monkeypatch: pytest.Mo
 
     def watched(descriptor: int) -> None:
         fdatasync(descriptor)
-        synced_reads.put(len(recorded(path)))
+        synced_reads.put(len(read_reads(path)))
 
     monkeypatch.setattr(os, "fdatasync", watched)
     with CaptureRecorder(path, CaptureHeader(), sync_s=0.02) as recording:
         for times in (1, 2):
-            give(recording)
+            write_reads(recording)
             while synced_reads.get(timeout=LONG_S) < times * len(READS):
                 pass
 
@@ -121,7 +127,7 @@ def test_failed_sync_ends_the_recording(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(os, "fdatasync", fails)
     with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(), sync_s=0.02) as recording:
-        give(recording)
+        write_reads(recording)
         assert isinstance(error := recording.ended.exception(LONG_S), OSError)
     assert error.errno == errno.EIO
 

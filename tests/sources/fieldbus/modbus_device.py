@@ -1,4 +1,4 @@
-"""Modbus devices for tests: pymodbus's own server with registers that a test sets, over TCP or a serial line."""
+"""Simulated Modbus devices: pymodbus's server with registers that a test sets, over TCP or a serial line."""
 
 import asyncio
 import os
@@ -17,25 +17,32 @@ Table = dict[int, int]
 
 
 class Registers:
-    """What the device holds, and which requests came: (function, address, count)."""
+    """Registers of a device.
+
+    Attributes:
+        holding: Holding registers by address.
+        input: Input registers by address.
+        requests: Function, address and count of the received requests.
+        refusal: Exception code of all responses; None: the registers are returned.
+    """
 
     def __init__(self, holding: Table | None = None, input_: Table | None = None) -> None:
         self.holding, self.input = holding or {}, input_ or {}
-        self.asked: list[tuple[int, int, int]] = []
+        self.requests: list[tuple[int, int, int]] = []
         self.refusal: ExcCodes | None = None
-        self._asked = asyncio.Condition()
+        self._new_request = asyncio.Condition()
 
-    async def was_asked(self, times: int) -> None:
-        """As soon as so many requests came."""
-        async with self._asked:
-            await self._asked.wait_for(lambda: len(self.asked) >= times)
+    async def wait_for_requests(self, count: int) -> None:
+        """Wait until ``count`` requests have arrived."""
+        async with self._new_request:
+            await self._new_request.wait_for(lambda: len(self.requests) >= count)
 
     async def answer(
         self, function: int, start: int, address: int, count: int, current: list[int], _: object
     ) -> ExcCodes | None:
-        self.asked.append((function, address, count))
-        async with self._asked:
-            self._asked.notify_all()
+        self.requests.append((function, address, count))
+        async with self._new_request:
+            self._new_request.notify_all()
         if self.refusal is not None:
             return self.refusal
         table = self.input if function == 4 else self.holding
@@ -59,7 +66,7 @@ def float_words(value: float) -> tuple[int, int]:
 async def tcp_device(
     registers: Registers, unit: int, port: int, framer: FramerType = FramerType.SOCKET
 ) -> AsyncIterator[None]:
-    """A device behind a gateway at 127.0.0.1 that finds no other unit."""
+    """Run a device behind a gateway at 127.0.0.1. The gateway rejects requests to other units."""
     others = Registers()
     others.refusal = ExcCodes.GATEWAY_NO_RESPONSE
     devices = [registers.device(unit), others.device(0)]
@@ -73,18 +80,18 @@ async def tcp_device(
 
 @asynccontextmanager
 async def serial_device(registers: Registers, unit: int, folder: Path) -> AsyncIterator[Path]:
-    """A device on a serial line that is silent to other units; its other end is a port at the path while it is there."""
+    """Run a device on a serial line that ignores requests to other units. Yield the path of the host's port."""
     (host, host_port), (device, device_port) = os.openpty(), os.openpty()
     loop, path = asyncio.get_running_loop(), folder / "modbus"
 
-    def carry(one: int, other: int) -> None:
-        data = os.read(one, 4096)
-        if one == device or data[0] == unit:
-            os.write(other, data)
+    def forward(reader: int, writer: int) -> None:
+        data = os.read(reader, 4096)
+        if reader == device or data[0] == unit:
+            os.write(writer, data)
 
-    for one, other, port in ((host, device, host_port), (device, host, device_port)):
+    for reader, writer, port in ((host, device, host_port), (device, host, device_port)):
         tty.setraw(port)
-        loop.add_reader(one, carry, one, other)
+        loop.add_reader(reader, forward, reader, writer)
     path.symlink_to(os.ttyname(host_port))
     server = ModbusSerialServer(registers.device(unit), port=os.ttyname(device_port), baudrate=9600)
     await server.serve_forever(background=True)
@@ -93,7 +100,7 @@ async def serial_device(registers: Registers, unit: int, folder: Path) -> AsyncI
     finally:
         await server.shutdown()
         path.unlink()
-        for one, port in ((host, host_port), (device, device_port)):
-            loop.remove_reader(one)
-            os.close(one)
+        for reader, port in ((host, host_port), (device, device_port)):
+            loop.remove_reader(reader)
+            os.close(reader)
             os.close(port)

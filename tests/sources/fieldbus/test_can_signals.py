@@ -1,4 +1,4 @@
-"""Readings from frames of a CAN bus."""
+"""Readings from CAN frames, by profiles and by DBC files."""
 
 import math
 from importlib.resources import files
@@ -16,7 +16,7 @@ from bms_estimator.settings.can_source import PROFILES, CanSource, CellSignals
 from bms_estimator.sources.fieldbus.can_signals import KEPT_S, CanMap, FrameId
 
 PYLONTECH = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])
-"""52.34 V, -12.3 A (charge is positive), 21.5 degC, as frame 0x356 has them."""
+"""Data of frame 0x356 with 52.34 V, -12.3 A (charge is positive) and 21.5 degC."""
 DBC = """
 VERSION ""
 BU_: BMS
@@ -44,7 +44,7 @@ BO_ 2566848512 Other: 8 BMS
  SG_ Fast : 0|8@1+ (1,0) [0|0] "" X
  SG_ Temp : 8|8@1+ (1,-40) [0|0] "degC" X
 """
-"""DBC file made for these tests: a multiplexer, an identifier of 29 bits, values in frames of their own."""
+"""DBC file for these tests, with a multiplexer, an identifier of 29 bits, and frames of one value each."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def dbc(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def named(dbc: Path) -> CanSource:
+def dbc_source(dbc: Path) -> CanSource:
     return source(
         dbc=str(dbc),
         voltage={"signal": "PackVoltage"},
@@ -65,12 +65,12 @@ def named(dbc: Path) -> CanSource:
     )
 
 
-def source(**told: object) -> CanSource:
-    return CanSource.model_validate({"kind": "can"} | told)
+def source(**options: object) -> CanSource:
+    return CanSource.model_validate({"kind": "can"} | options)
 
 
 @given(st.lists(st.tuples(st.sampled_from([0x355, 0x356, 0x357]), st.booleans(), st.binary(max_size=64)), max_size=20))
-def test_no_frames_make_it_raise(frames: list[tuple[int, bool, bytes]]) -> None:
+def test_no_frames_raise_with_a_profile(frames: list[tuple[int, bool, bytes]]) -> None:
     map_ = CanMap(source(profile="pylontech-can"))
     for identifier, extended, data in frames:
         reading = map_.feed(0.0, identifier, extended, data)
@@ -78,17 +78,17 @@ def test_no_frames_make_it_raise(frames: list[tuple[int, bool, bytes]]) -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from([0x500, 0x501]), st.binary(max_size=64)), max_size=20))
-def test_no_frames_make_signals_of_a_dbc_file_raise(named: CanSource, frames: list[tuple[int, bytes]]) -> None:
-    map_ = CanMap(named)
+def test_no_frames_raise_with_a_dbc_file(dbc_source: CanSource, frames: list[tuple[int, bytes]]) -> None:
+    map_ = CanMap(dbc_source)
     for identifier, data in frames:
         map_.feed(0.0, identifier, False, data)
 
 
-def test_a_known_bus_is_read() -> None:
-    given = source(profile="pylontech-can")
+def test_frame_of_a_profile_is_decoded() -> None:
+    source_settings = source(profile="pylontech-can")
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
-    assert given.sensor == {"current_sign": "charge_positive", **steps}
-    map_ = CanMap(given)
+    assert source_settings.sensor == {"current_sign": "charge_positive", **steps}
+    map_ = CanMap(source_settings)
     assert map_.places == (FrameId(0x356, False),)
     assert map_.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
     assert map_.feed(0.0, 0x355, False, bytes(4)) is None
@@ -97,7 +97,7 @@ def test_a_known_bus_is_read() -> None:
     assert reading[:4] == (52.34, -12.3, 21.5, ())
 
 
-def test_a_frame_that_is_too_short_for_a_value_brings_the_others() -> None:
+def test_truncated_frame_gives_the_values_that_it_contains() -> None:
     map_ = CanMap(source(profile="pylontech-can"))
     reading = map_.feed(0.0, 0x356, False, PYLONTECH[:4])
     assert reading is not None
@@ -107,7 +107,7 @@ def test_a_frame_that_is_too_short_for_a_value_brings_the_others() -> None:
     assert map_.counters["short_frames"] == 2
 
 
-def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest(dbc: Path) -> None:
+def test_reading_needs_recent_voltage_and_current_and_contains_the_newest_other_values(dbc: Path) -> None:
     map_ = CanMap(
         source(
             dbc=str(dbc),
@@ -130,7 +130,7 @@ def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest(
     assert map_.feed(2.0, 2, False, b"\xff") is None
     assert map_.counters["not_measured"] == 1
     assert map_.feed(3.0, 1, False, b"\x83") is None
-    assert map_.feed(6.1, 2, False, b"\x05") is None  # more than three periods apart
+    assert map_.feed(6.1, 2, False, b"\x05") is None  # voltage and current are more than three periods apart
     assert map_.feed(7.0, 1, False, b"\x83") is None
     assert map_.feed(10.0, 2, False, b"\x05") is not None
     assert map_.feed(11.0, 1, False, b"\x83") is None
@@ -142,13 +142,13 @@ def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest(
     assert math.isnan(late.temperature_c)
 
 
-def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
-    map_ = CanMap(named)
+def test_signals_of_a_dbc_file_are_decoded(dbc_source: CanSource) -> None:
+    map_ = CanMap(dbc_source)
     assert set(map_.places) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
     assert map_.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
     assert map_.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
     assert map_.feed(0.0, 0x501, False, bytes([1, 0xE6, 0x0C])) is None
-    assert map_.counters["short_frames"] == 0  # a multiplexer tells some of them at a time
+    assert map_.counters["short_frames"] == 0  # a multiplexed frame contains only some of the signals
     assert map_.feed(0.0, 0x501, False, bytes([7, 0, 0])) is None
     assert map_.counters["short_frames"] == 1
     reading = map_.feed(0.0, 0x500, False, (4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
@@ -157,7 +157,7 @@ def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "reason"),
     [
         (
             "Voltage",
@@ -167,20 +167,20 @@ def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
         ("Cells.PackVoltage", "no such signal"),
     ],
 )
-def test_a_name_that_is_not_one_signal(dbc: Path, name: str, said: str) -> None:
+def test_unknown_or_ambiguous_signal_is_rejected(dbc: Path, name: str, reason: str) -> None:
     with pytest.raises(UserError) as raised:
         CanMap(source(dbc=str(dbc), voltage={"signal": name}, current={"signal": "PackCurrent"}))
-    assert said in str(raised.value)
+    assert reason in str(raised.value)
 
 
-def test_a_dbc_file_that_is_none(tmp_path: Path) -> None:
-    named = {"voltage": {"signal": "V"}, "current": {"signal": "I"}}
+def test_missing_or_invalid_dbc_file_is_rejected(tmp_path: Path) -> None:
+    signals = {"voltage": {"signal": "V"}, "current": {"signal": "I"}}
     with pytest.raises(UserError, match="cannot be read: No such file"):
-        CanMap(source(dbc=str(tmp_path / "none.dbc"), **named))
+        CanMap(source(dbc=str(tmp_path / "none.dbc"), **signals))
     junk = tmp_path / "junk.dbc"
     junk.write_bytes(bytes(range(256)))
     with pytest.raises(UserError, match=f"source.dbc = {junk}: "):
-        CanMap(source(dbc=str(junk), **named))
+        CanMap(source(dbc=str(junk), **signals))
 
 
 def test_cells_are_numbered() -> None:
@@ -194,22 +194,22 @@ def test_resolutions_of_a_profile_are_the_factors_of_its_dbc_file(profile: str) 
     database = cantools.database.load_string(text, database_format="dbc")
     assert isinstance(database, Database)
     factors = {signal.name: signal.conversion.scale for message in database.messages for signal in message.signals}
-    given = source(profile=profile)
-    assert given.sensor["voltage_resolution_v"] == factors[given.voltage.signal]
-    assert given.sensor["current_resolution_a"] == factors[given.current.signal]
+    source_settings = source(profile=profile)
+    assert source_settings.sensor["voltage_resolution_v"] == factors[source_settings.voltage.signal]
+    assert source_settings.sensor["current_resolution_a"] == factors[source_settings.current.signal]
 
 
-def test_a_dbc_file_beside_a_profile_takes_its_place(dbc: Path) -> None:
-    given = source(profile="pylontech-can", dbc=str(dbc), temperature={"signal": "Temp"})
-    assert given.sensor == {"current_sign": "charge_positive"}
-    assert set(CanMap(given).places) == {FrameId(0x500, False), FrameId(0x18FF0000, True)}
+def test_configured_dbc_file_replaces_that_of_the_profile(dbc: Path) -> None:
+    source_settings = source(profile="pylontech-can", dbc=str(dbc), temperature={"signal": "Temp"})
+    assert source_settings.sensor == {"current_sign": "charge_positive"}
+    assert set(CanMap(source_settings).places) == {FrameId(0x500, False), FrameId(0x18FF0000, True)}
 
 
 V, I = {"signal": "V"}, {"signal": "I"}  # noqa: E741
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("options", "reason"),
     [
         ({"profile": "pylontech"}, "'pylontech' is none of pylontech-can"),
         ({"voltage": {}, "current": I, "dbc": "x"}, "voltage.signal\n  Field required"),
@@ -225,6 +225,6 @@ V, I = {"signal": "V"}, {"signal": "I"}  # noqa: E741
         ({"voltage": V, "current": I, "dbc": "x", "cells": [{"signal": "Cell", "count": 2}]}, "holds {}"),
     ],
 )
-def test_settings_that_cannot_be_say_why(told: dict[str, object], said: str) -> None:
-    with pytest.raises(ValidationError, match=said):
-        source(**told)
+def test_invalid_settings_are_rejected_with_a_reason(options: dict[str, object], reason: str) -> None:
+    with pytest.raises(ValidationError, match=reason):
+        source(**options)

@@ -1,4 +1,4 @@
-"""The examples of docs/pack/fieldbus.md are settings."""
+"""Examples of docs/pack/fieldbus.md: they are valid settings and decode the documented frames."""
 
 import re
 import tomllib
@@ -14,13 +14,13 @@ TEXT = (Path(__file__).parents[3] / "docs" / "pack" / "fieldbus.md").read_text(e
 
 
 @pytest.mark.parametrize("example", re.findall(r"^```toml\n(.*?)^```", TEXT, flags=re.MULTILINE | re.DOTALL))
-def test_an_example_is_accepted(example: str) -> None:
+def test_example_is_accepted_as_settings(example: str) -> None:
     settings = Settings.model_validate(tomllib.loads(example))
     assert settings.source is not None
     assert settings.sensor.protocol == "text"
 
 
-def test_the_dbc_file_belongs_to_the_settings_above_it(tmp_path: Path) -> None:
+def test_example_of_a_dbc_file_fits_the_settings_before_it(tmp_path: Path) -> None:
     match = re.search(
         r"^```toml\n([^`]*?dbc = [^`]*)^```.*?^```text\n(VERSION.*?)^```", TEXT, flags=re.MULTILINE | re.DOTALL
     )

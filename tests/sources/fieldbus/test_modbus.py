@@ -1,4 +1,4 @@
-"""A Modbus source against pymodbus's own server, over TCP and over a serial line."""
+"""Modbus source with a device simulated by pymodbus's server, over TCP and over a serial line."""
 
 import asyncio
 import json
@@ -23,90 +23,93 @@ from tests.sources.fieldbus.modbus_device import Registers, float_words, serial_
 UNIT = 5
 
 
-def source(**told: object) -> ModbusSource:
-    return ModbusSource.model_validate({"kind": "modbus", "unit": UNIT, "poll_s": 0.02, "timeout_s": LONG_S / 4} | told)
+def source(**options: object) -> ModbusSource:
+    defaults = {"kind": "modbus", "unit": UNIT, "poll_s": 0.02, "timeout_s": LONG_S / 4}
+    return ModbusSource.model_validate(defaults | options)
 
 
 def victron() -> Registers:
-    """52.34 V, 12.3 A discharge, 21.5 degC as a GX device counts them; nothing behind them."""
+    """Return the registers of a GX device that measures 52.34 V, 12.3 A of discharge and 21.5 degC."""
     return Registers({259: 5234, 260: 1200, 261: 0x10000 - 123, 262: 215})
 
 
-async def lines(producer: ModbusProducer, count: int) -> list[dict[str, object]]:
-    """The first lines that it brings, after it has said that it is connected."""
-    async with asyncio.timeout(LONG_S), aclosing(producer.iter_lines()) as brought:
-        assert await anext(brought) == CONNECTED
-        return [json.loads(await anext(brought)) for _ in range(count)]
+async def read_lines(producer: ModbusProducer, count: int) -> list[dict[str, object]]:
+    """Return the first ``count`` lines of samples after the line ``CONNECTED``."""
+    async with asyncio.timeout(LONG_S), aclosing(producer.iter_lines()) as lines:
+        assert await anext(lines) == CONNECTED
+        return [json.loads(await anext(lines)) for _ in range(count)]
 
 
-async def failure(producer: ModbusProducer) -> str:
-    """Why nothing comes."""
+async def failure_reason(producer: ModbusProducer) -> str:
+    """Return the reason for which the source is unavailable."""
     with pytest.raises(SourceUnavailableError) as raised:
-        await lines(producer, 1_000_000)
+        await read_lines(producer, 1_000_000)  # more lines than arrive before the failure
     return str(raised.value)
 
 
-async def test_a_known_device_is_read_over_tcp_in_one_request() -> None:
+async def test_device_with_a_profile_is_read_over_tcp_in_one_request() -> None:
     registers, port = victron(), free_port()
     producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
     async with tcp_device(registers, UNIT, port):
-        assert await lines(producer, 3) == 3 * [{"voltage_v": 52.34, "current_a": -12.3, "temperature_c": 21.5}]
-    assert set(registers.asked) == {(3, 259, 4)}
+        assert await read_lines(producer, 3) == 3 * [{"voltage_v": 52.34, "current_a": -12.3, "temperature_c": 21.5}]
+    assert set(registers.requests) == {(3, 259, 4)}
     assert not any(producer.counters.values())
 
 
-async def test_a_known_device_is_read_over_a_serial_line(tmp_path: Path) -> None:
+async def test_device_with_a_profile_is_read_over_a_serial_line(tmp_path: Path) -> None:
     registers = Registers(input_={0x1000 + i: 0 for i in range(17)} | {0x1100 + i: 3300 + i for i in range(26)})
     registers.input |= {0x1000: 5320, 0x1001: 150, 0x1009: 2981}
     async with serial_device(registers, UNIT, tmp_path) as path:
-        (line,) = await lines(ModbusProducer(source(profile="seplos-v3", unit=UNIT, port=str(path))), 1)
+        (line,) = await read_lines(ModbusProducer(source(profile="seplos-v3", unit=UNIT, port=str(path))), 1)
     assert line.pop("cells_v") == [round(3.3 + i / 1000, 3) for i in range(16)]
     assert line == {"voltage_v": 53.2, "current_a": 1.5, "temperature_c": 24.95}
-    assert set(registers.asked) == {(4, 0x1000, 10), (4, 0x1100, 16)}
+    assert set(registers.requests) == {(4, 0x1000, 10), (4, 0x1100, 16)}
 
 
-async def test_a_gateway_that_hands_on_serial_frames() -> None:
+async def test_rtu_frames_over_tcp_are_read() -> None:
     port = free_port()
     async with tcp_device(victron(), UNIT, port, FramerType.RTU):
         producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port, framing="rtu"))
-        assert (await lines(producer, 1))[0]["voltage_v"] == 52.34
+        assert (await read_lines(producer, 1))[0]["voltage_v"] == 52.34
 
 
 async def test_missing_registers_are_reported_or_omitted() -> None:
     registers, port = victron(), free_port()
-    del registers.holding[260], registers.holding[262]  # the register between two that are wanted, and a temperature
-    given = source(profile="victron-gx", host="127.0.0.1", tcp_port=port)
+    del registers.holding[260], registers.holding[262]  # 260 is not needed, and 262 is the temperature
+    source_settings = source(profile="victron-gx", host="127.0.0.1", tcp_port=port)
     async with tcp_device(registers, UNIT, port):
-        producer = ModbusProducer(given)
-        assert await lines(producer, 2) == 2 * [{"voltage_v": 52.34, "current_a": -12.3}]
+        producer = ModbusProducer(source_settings)
+        assert await read_lines(producer, 2) == 2 * [{"voltage_v": 52.34, "current_a": -12.3}]
         assert producer.counters["refused"] == 2
-        assert registers.asked == [(3, 259, 4), (3, 259, 1), (3, 261, 1), (3, 262, 1), (3, 259, 1), (3, 261, 1)]
+        assert registers.requests == [(3, 259, 4), (3, 259, 1), (3, 261, 1), (3, 262, 1), (3, 259, 1), (3, 261, 1)]
         del registers.holding[261]
-        said = await failure(ModbusProducer(given))
-    assert said == "source.current (holding register 261): illegal data address: the device has no such register"
+        reason = await failure_reason(ModbusProducer(source_settings))
+    assert reason == "source.current (holding register 261): illegal data address: the device has no such register"
 
 
-async def test_a_wrong_unit_behind_a_gateway_says_so() -> None:
+async def test_wrong_unit_behind_a_gateway_is_reported() -> None:
     port = free_port()
     async with tcp_device(victron(), UNIT, port):
-        said = await failure(ModbusProducer(source(profile="victron-gx", unit=9, host="127.0.0.1", tcp_port=port)))
-    assert said.endswith("gateway target device failed to respond: is source.unit right?")
+        reason = await failure_reason(
+            ModbusProducer(source(profile="victron-gx", unit=9, host="127.0.0.1", tcp_port=port))
+        )
+    assert reason.endswith("gateway target device failed to respond: is source.unit right?")
 
 
-async def test_a_wrong_unit_on_a_serial_line_is_silence(tmp_path: Path) -> None:
+async def test_wrong_unit_on_a_serial_line_is_reported_as_a_timeout(tmp_path: Path) -> None:
     async with serial_device(victron(), UNIT, tmp_path) as path:
-        given = source(profile="victron-gx", unit=9, port=str(path), timeout_s=0.2)
-        said = await failure(ModbusProducer(given))
-    assert said == (
+        source_settings = source(profile="victron-gx", unit=9, port=str(path), timeout_s=0.2)
+        reason = await failure_reason(ModbusProducer(source_settings))
+    assert reason == (
         "no response within 0.2 s to a request of source.voltage, source.current, source.temperature"
         " (holding registers 259 to 262)"
     )
 
 
 async def test_missing_device_and_port_are_reported(tmp_path: Path) -> None:
-    there = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=free_port()))
-    assert await failure(there) == "no connection"
-    assert await failure(ModbusProducer(source(profile="victron-gx", port=str(tmp_path / "none")))) == (
+    absent = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=free_port()))
+    assert await failure_reason(absent) == "no connection"
+    assert await failure_reason(ModbusProducer(source(profile="victron-gx", port=str(tmp_path / "none")))) == (
         "the port cannot be opened"
     )
 
@@ -116,10 +119,10 @@ async def test_missing_device_and_port_are_reported(tmp_path: Path) -> None:
     [
         b"\xff" * 40,
         b"HTTP/1.1 400 Bad Request\r\n\r\n",
-        b"\0\1\0\0\0\3\5\3\x08",  # as long as its header says, but without its registers
-        b"\0\1\0\0\0\5\5\3\2\0\1",  # one register in place of four
-        b"\0\1\0\0\0\4\5\1\1\0",  # coils
-        b"\0\1\0\0\0\3\5\x83\x2a",  # an exception that nobody knows
+        b"\0\1\0\0\0\3\5\3\x08",  # without registers, although it announces eight bytes of them
+        b"\0\1\0\0\0\5\5\3\2\0\1",  # one register instead of four
+        b"\0\1\0\0\0\4\5\1\1\0",  # coils instead of registers
+        b"\0\1\0\0\0\3\5\x83\x2a",  # an undefined exception code
         b"",
     ],
     ids=["noise", "web", "short", "few", "coils", "exception", "closed"],
@@ -131,7 +134,7 @@ async def test_invalid_response_gives_no_sample(answer: bytes) -> None:
         await reader.read(100)
         writer.write(answer)
         if answer:
-            await reader.read()  # until the other end has had enough
+            await reader.read()  # until the client closes the connection
         writer.close()
         await writer.wait_closed()
         served.set()
@@ -139,62 +142,64 @@ async def test_invalid_response_gives_no_sample(answer: bytes) -> None:
     server = await asyncio.start_server(serve, "127.0.0.1")
     async with server, asyncio.timeout(LONG_S):
         port = server.sockets[0].getsockname()[1]
-        given = source(profile="victron-gx", host="127.0.0.1", tcp_port=port, timeout_s=0.1)
-        assert await failure(ModbusProducer(given))
+        source_settings = source(profile="victron-gx", host="127.0.0.1", tcp_port=port, timeout_s=0.1)
+        assert await failure_reason(ModbusProducer(source_settings))
         await served.wait()
 
 
-async def until(brought: AsyncGenerator[bytes, None], condition: Callable[[], bool]) -> None:
-    """Take what comes until it is so."""
+async def read_until(lines: AsyncGenerator[bytes, None], condition: Callable[[], bool]) -> None:
+    """Read lines until the condition is true."""
     async with asyncio.timeout(LONG_S):
         while not condition():
-            await anext(brought)
+            await anext(lines)
 
 
 async def test_device_is_reconnected() -> None:
     registers, port = victron(), free_port()
     producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
-    async with aclosing(producer.iter_lines()) as brought:
+    async with aclosing(producer.iter_lines()) as lines:
         async with tcp_device(registers, UNIT, port):
-            await until(brought, lambda: len(registers.asked) > 2)
+            await read_until(lines, lambda: len(registers.requests) > 2)
         with pytest.raises(SourceUnavailableError):
-            await until(brought, lambda: False)
-    assert await failure(producer) == "no connection"
+            await read_until(lines, lambda: False)
+    assert await failure_reason(producer) == "no connection"
     async with tcp_device(registers, UNIT, port):
-        assert (await lines(producer, 1))[0]["voltage_v"] == 52.34
+        assert (await read_lines(producer, 1))[0]["voltage_v"] == 52.34
 
 
 async def test_requests_to_a_busy_device_are_not_split() -> None:
     registers, port = victron(), free_port()
     registers.refusal = ExcCodes.DEVICE_BUSY
     async with tcp_device(registers, UNIT, port):
-        said = await failure(ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port)))
-    assert said.endswith("server device busy")
-    assert len(registers.asked) == 1
+        reason = await failure_reason(ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port)))
+    assert reason.endswith("server device busy")
+    assert len(registers.requests) == 1
 
 
 async def test_nan_registers_give_no_sample() -> None:
     port = free_port()
     registers = Registers(dict(enumerate((*float_words(13.25), *float_words(float("nan"))))))
     current = {"address": 2, "type": "float32"}
-    given = source(voltage={"address": 0, "type": "float32"}, current=current, host="127.0.0.1", tcp_port=port)
-    producer = ModbusProducer(given)
-    async with tcp_device(registers, UNIT, port), aclosing(producer.iter_lines()) as brought, asyncio.timeout(LONG_S):
-        assert await anext(brought) == CONNECTED
-        coming = asyncio.ensure_future(anext(brought))
-        await registers.was_asked(4)
+    source_settings = source(
+        voltage={"address": 0, "type": "float32"}, current=current, host="127.0.0.1", tcp_port=port
+    )
+    producer = ModbusProducer(source_settings)
+    async with tcp_device(registers, UNIT, port), aclosing(producer.iter_lines()) as lines, asyncio.timeout(LONG_S):
+        assert await anext(lines) == CONNECTED
+        next_line = asyncio.ensure_future(anext(lines))
+        await registers.wait_for_requests(4)
         assert producer.counters["not_measured"] >= 2
-        assert not coming.done()
+        assert not next_line.done()
         assert producer.fault is not None
         registers.holding |= dict(zip((2, 3), float_words(-2.5), strict=True))
-        assert json.loads(await coming) == {"voltage_v": 13.25, "current_a": -2.5}
+        assert json.loads(await next_line) == {"voltage_v": 13.25, "current_a": -2.5}
         assert producer.fault is None
 
 
-async def test_samples_are_positive_on_discharge_and_come_again_after_the_device_was_away() -> None:
+async def test_current_is_positive_on_discharge_and_samples_continue_after_a_reconnection() -> None:
     registers, port = victron(), free_port()
-    told = {"kind": "modbus", "profile": "victron-gx", "host": "127.0.0.1", "tcp_port": port, "unit": UNIT}
-    settings = Settings.model_validate({"source": told | {"poll_s": 0.02, "timeout_s": 1.0}})
+    table = {"kind": "modbus", "profile": "victron-gx", "host": "127.0.0.1", "tcp_port": port, "unit": UNIT}
+    settings = Settings.model_validate({"source": table | {"poll_s": 0.02, "timeout_s": 1.0}})
     assert settings.sensor.voltage_resolution_v == 0.01
     source = open_line_source(settings)
     assert source is not None

@@ -1,4 +1,4 @@
-"""Registers to readings, and the requests that bring them."""
+"""Modbus registers: planning of the requests, and decoding of the registers to readings."""
 
 import itertools
 import math
@@ -30,8 +30,8 @@ RANGES = {
 }
 
 
-def source(**told: object) -> ModbusSource:
-    return ModbusSource.model_validate({"kind": "modbus", "host": "127.0.0.1"} | told)
+def source(**options: object) -> ModbusSource:
+    return ModbusSource.model_validate({"kind": "modbus", "host": "127.0.0.1"} | options)
 
 
 def words(raw: float, kind: str, *, low_word_first: bool = False, address: int = 0) -> dict[tuple[str, int], int]:
@@ -61,12 +61,13 @@ def test_requests_cover_every_register_once_within_the_maximum_length(wanted: li
             assert value.register.table == request.table
             assert request.address <= value.register.address
             assert value.register.address + value.register.words <= request.address + request.words
-    for one, next_ in itertools.pairwise(requests):
-        near = next_.table == one.table and next_.address <= one.address + one.words + GAP_WORDS
-        assert not near or next_.address + 2 - one.address > MAX_WORDS - 1
+    for request, following in itertools.pairwise(requests):
+        is_near = following.table == request.table and following.address <= request.address + request.words + GAP_WORDS
+        # Near requests remain separate only if a value of two words would exceed the maximum length.
+        assert not is_near or following.address + 2 - request.address > MAX_WORDS - 1
 
 
-def test_a_known_device_is_asked_in_as_few_requests_as_possible() -> None:
+def test_device_with_a_profile_is_read_in_as_few_requests_as_possible() -> None:
     (request,) = plan(list_values(source(profile="victron-gx")))
     assert (request.table, request.address, request.words) == ("holding", 259, 4)
     assert request.described == "source.voltage, source.current, source.temperature (holding registers 259 to 262)"
@@ -74,37 +75,45 @@ def test_a_known_device_is_asked_in_as_few_requests_as_possible() -> None:
     assert [(r.table, r.address, r.words) for r in seplos] == [("input", 0x1000, 10), ("input", 0x1100, 16)]
 
 
-def test_a_refused_request_is_split_by_quantity_and_without_gaps() -> None:
+def test_rejected_request_is_split_by_quantity_and_without_gaps() -> None:
     (request,) = plan(list_values(source(profile="victron-gx")))
     assert [(r.address, r.words) for r in split(request)] == [(259, 1), (261, 1), (262, 1)]
-    (alone,) = split(split(request)[0])
-    assert split(alone) == (alone,)
+    (single_value_request,) = split(split(request)[0])
+    assert split(single_value_request) == (single_value_request,)
 
 
-def test_readings_of_known_devices() -> None:
+def test_readings_of_devices_with_profiles() -> None:
     victron = source(profile="victron-gx")
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
     assert victron.sensor == {"current_sign": "charge_positive", **steps}
-    told = words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
-    assert decode_reading(list_values(victron), told) == (52.34, -12.3, -2.5, (), pytest.approx(math.nan, nan_ok=True))
+    words_read = (
+        words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
+    )
+    assert decode_reading(list_values(victron), words_read) == (
+        52.34,
+        -12.3,
+        -2.5,
+        (),
+        pytest.approx(math.nan, nan_ok=True),
+    )
     seplos = source(profile="seplos-v3")
-    held = {0x1000: 5320, 0x1001: 0xFF38, 0x1009: 2961} | {0x1100 + i: 3325 + i for i in range(16)}
-    reading = decode_reading(list_values(seplos), {("input", address): word for address, word in held.items()})
+    words_read = {0x1000: 5320, 0x1001: 0xFF38, 0x1009: 2961} | {0x1100 + i: 3325 + i for i in range(16)}
+    reading = decode_reading(list_values(seplos), {("input", address): word for address, word in words_read.items()})
     assert reading is not None
     assert reading[:3] == (53.2, -2.0, 22.95)
     assert reading.cells_v == tuple(round(3.325 + i / 1000, 3) for i in range(16))
 
 
 @pytest.mark.parametrize("raw", [math.nan, math.inf, -math.inf])
-def test_a_float_that_is_no_number_is_not_measured(raw: float) -> None:
+def test_nan_and_infinity_count_as_not_measured(raw: float) -> None:
     register = {"address": 0, "type": "float32"}
-    given = source(voltage=register, current=register | {"address": 2}, temperature=register | {"address": 4})
-    held = words(13.0, "float32") | words(1.5, "float32", address=2) | words(raw, "float32", address=4)
-    reading = decode_reading(list_values(given), held)
+    source_settings = source(voltage=register, current=register | {"address": 2}, temperature=register | {"address": 4})
+    words_read = words(13.0, "float32") | words(1.5, "float32", address=2) | words(raw, "float32", address=4)
+    reading = decode_reading(list_values(source_settings), words_read)
     assert reading is not None
     assert math.isnan(reading.temperature_c)
-    assert decode_reading(list_values(given), held | words(raw, "float32")) is None
-    assert decode_reading(list_values(given), held | words(raw, "float32", address=2)) is None
+    assert decode_reading(list_values(source_settings), words_read | words(raw, "float32")) is None
+    assert decode_reading(list_values(source_settings), words_read | words(raw, "float32", address=2)) is None
 
 
 def test_infinite_value_is_not_measured() -> None:
@@ -113,19 +122,19 @@ def test_infinite_value_is_not_measured() -> None:
 
 
 def test_absent_value_is_not_measured() -> None:
-    given = source(
+    source_settings = source(
         voltage={"address": 0, "scale": 0.01},
         current={"address": 1, "type": "int16"},
         temperature={"address": 2, "type": "int16", "absent": 32767},
         cells={"address": 3, "count": 2, "absent": 0, "scale": 0.001},
     )
-    held = {("holding", i): word for i, word in enumerate([1300, 0xFFFF, 32767, 3300, 0])}
-    reading = decode_reading(list_values(given), held)
+    words_read = {("holding", i): word for i, word in enumerate([1300, 0xFFFF, 32767, 3300, 0])}
+    reading = decode_reading(list_values(source_settings), words_read)
     assert reading is not None
     assert (reading.current_a, reading.cells_v[0]) == (-1.0, 3.3)
     assert math.isnan(reading.temperature_c)
     assert math.isnan(reading.cells_v[1])
-    none = decode_reading(list_values(given), held | {("holding", 3): 0})
+    none = decode_reading(list_values(source_settings), words_read | {("holding", 3): 0})
     assert none is not None
     assert none.cells_v == ()
 
@@ -139,7 +148,7 @@ V, I = {"address": 0}, {"address": 1}  # noqa: E741
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("options", "reason"),
     [
         ({"profile": "victron"}, "profile: 'victron' is none of victron-gx, seplos-v3"),
         ({"voltage": V, "current": I, "port": "/dev/ttyUSB0"}, "and not both"),
@@ -151,17 +160,17 @@ V, I = {"address": 0}, {"address": 1}  # noqa: E741
         ({"voltage": V, "current": I, "cells": {"address": 65530, "count": 16}}, "beyond the last register"),
     ],
 )
-def test_invalid_settings_are_rejected_with_a_reason(told: dict[str, object], said: str) -> None:
-    with pytest.raises(ValidationError, match=said):
-        source(**told)
+def test_invalid_settings_are_rejected_with_a_reason(options: dict[str, object], reason: str) -> None:
+    with pytest.raises(ValidationError, match=reason):
+        source(**options)
 
 
 def test_settings_override_the_profile() -> None:
-    given = source(profile="victron-gx", unit=3, temperature={"address": 61, "type": "int16", "scale": 0.1})
-    assert given.unit == 3
-    assert given.temperature is not None
-    assert given.temperature.address == 61
-    assert given.voltage.address == 259
+    source_settings = source(profile="victron-gx", unit=3, temperature={"address": 61, "type": "int16", "scale": 0.1})
+    assert source_settings.unit == 3
+    assert source_settings.temperature is not None
+    assert source_settings.temperature.address == 61
+    assert source_settings.voltage.address == 259
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -173,7 +182,7 @@ def test_profile_is_complete(profile: str) -> None:
     ("registers", "measured"),
     [((2659, -25, 210), (26.59, -2.5, 21.0)), ((2659, 0, 0), (26.59, 0.0, None)), ((0, 0, 0), None)],
 )
-def test_what_a_gx_device_does_not_measure_reads_0_and_is_no_reading(
+def test_zero_in_a_register_of_a_gx_device_counts_as_not_measured(
     registers: tuple[int, int, int], measured: tuple[float, float, float | None] | None
 ) -> None:
     voltage, current, temperature = registers
@@ -181,5 +190,5 @@ def test_what_a_gx_device_does_not_measure_reads_0_and_is_no_reading(
     reading = decode_reading(list_values(source(profile="victron-gx")), read | words(temperature, "int16", address=262))
     assert (reading is None) is (measured is None)
     if reading is not None and measured is not None:
-        warm_c = None if math.isnan(reading.temperature_c) else reading.temperature_c
-        assert (reading.voltage_v, reading.current_a, warm_c) == measured
+        temperature_c = None if math.isnan(reading.temperature_c) else reading.temperature_c
+        assert (reading.voltage_v, reading.current_a, temperature_c) == measured

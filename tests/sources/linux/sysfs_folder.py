@@ -1,4 +1,4 @@
-"""A folder that looks like /sys, for chips whose driver is in the kernel."""
+"""Simulated /sys with the files of hwmon and iio drivers."""
 
 from pathlib import Path
 
@@ -6,13 +6,13 @@ I2C = "devices/platform/soc/fe804000.i2c/i2c-1"
 
 
 def hwmon(root: Path, name: str = "ina226", place: str = "1-0040", number: int = 3, **files: object) -> Path:
-    """A chip of hwmon, as Documentation/hwmon/ina2xx.rst of the kernel names its files. Returns its folder."""
+    """Create an hwmon chip with file names of Documentation/hwmon/ina2xx.rst of the kernel. Return its folder."""
     folder = root / I2C / place / "hwmon" / f"hwmon{number}"
     return _chip(root / "class" / "hwmon" / folder.name, folder, name, files)
 
 
 def iio(root: Path, name: str = "ads1115", place: str = "1-0048", number: int = 0, **files: object) -> Path:
-    """A chip of iio, as Documentation/ABI/testing/sysfs-bus-iio of the kernel names its files. Returns its folder."""
+    """Create an iio chip with file names of Documentation/ABI/testing/sysfs-bus-iio of the kernel. Return its folder."""
     folder = root / I2C / place / f"iio:device{number}"
     return _chip(root / "bus" / "iio" / "devices" / folder.name, folder, name, files)
 

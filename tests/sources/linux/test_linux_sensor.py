@@ -18,7 +18,7 @@ from tests.sources.linux.sysfs_folder import hwmon, iio
 
 INA226 = {"in0_input": 25, "in1_input": 13280, "curr1_input": -2510, "shunt_resistor": 10000, "update_interval": 2}
 EIO = Path("/proc/self/mem")
-"""Reading its beginning is an input/output error."""
+"""File whose beginning gives an input/output error when it is read."""
 
 
 def sensor(root: Path, **settings: Any) -> LinuxSensor:
@@ -27,8 +27,8 @@ def sensor(root: Path, **settings: Any) -> LinuxSensor:
     )
 
 
-async def first(lines: AsyncGenerator[bytes, None]) -> Reading:
-    """The first sample of a sensor that was just begun."""
+async def read_first(lines: AsyncGenerator[bytes, None]) -> Reading:
+    """Return the first sample after the line ``CONNECTED``."""
     async with aclosing(lines):
         assert await anext(lines) == CONNECTED
         return _reading(await anext(lines))
@@ -49,7 +49,7 @@ def _reading(line: bytes) -> Reading:
 async def test_ina226_is_found_by_name_or_bus_address(chip: str, tmp_path: Path):
     hwmon(tmp_path, "cpu_thermal", "thermal", number=0, temp1_input=48312)
     hwmon(tmp_path, **INA226)
-    reading = await first(sensor(tmp_path, chip=chip).iter_lines())
+    reading = await read_first(sensor(tmp_path, chip=chip).iter_lines())
     assert (reading.voltage_v, reading.current_a) == (13.28, -2.51)
 
 
@@ -57,22 +57,24 @@ async def test_ina226_is_found_by_name_or_bus_address(chip: str, tmp_path: Path)
     ("settings", "voltage_v", "current_a"),
     [
         ({"voltage_scale": 4.0, "voltage_offset_v": 0.1}, 53.22, -2.51),
-        ({"shunt_ohm": 0.0005}, 13.28, -50.2),  # the driver takes it for 10 mohm
+        ({"shunt_ohm": 0.0005}, 13.28, -50.2),  # the driver assumes 10 mohm
         ({"current": "in0_input", "shunt_ohm": 0.0005}, 13.28, 50.0),
         ({"current_scale": 1.02, "current_offset_a": 0.01}, 13.28, -2.5502),
     ],
 )
-async def test_divider_and_shunt(settings: dict[str, Any], voltage_v: float, current_a: float, tmp_path: Path):
+async def test_configured_scales_and_shunt_are_applied(
+    settings: dict[str, Any], voltage_v: float, current_a: float, tmp_path: Path
+):
     hwmon(tmp_path, **INA226)
-    reading = await first(sensor(tmp_path, **settings).iter_lines())
+    reading = await read_first(sensor(tmp_path, **settings).iter_lines())
     assert (reading.voltage_v, reading.current_a) == (voltage_v, current_a)
 
 
-async def test_an_ads1115_over_a_divider_and_a_shunt_and_another_chip_for_the_temperature(tmp_path: Path):
+async def test_voltage_and_current_of_an_ads1115_and_temperature_of_another_chip(tmp_path: Path):
     scales = {"in_voltage0-voltage1_scale": 0.0078125, "in_voltage_scale": 0.125}
     iio(tmp_path, in_voltage2_raw=26560, **{"in_voltage0-voltage1_raw": -640}, **scales)
     hwmon(tmp_path, "lm75", "1-0049", number=5, temp1_input=21500)
-    reading = await first(
+    reading = await read_first(
         sensor(
             tmp_path,
             chip="ads1115",
@@ -87,7 +89,7 @@ async def test_an_ads1115_over_a_divider_and_a_shunt_and_another_chip_for_the_te
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "reason"),
     [
         ({"chip": "ina228"}, "ina228: no such chip in hwmon or iio; present: ina219, ina226. Is its driver loaded?"),
         ({"chip": "ina219"}, "ina219: 2 chips have this name (1-0041, 1-0042); set the bus address of one of them"),
@@ -100,20 +102,20 @@ async def test_an_ads1115_over_a_divider_and_a_shunt_and_another_chip_for_the_te
         ),
     ],
 )
-async def test_missing_chip_or_file_is_reported_with_a_remedy(settings: dict[str, Any], said: str, tmp_path: Path):
+async def test_missing_chip_or_file_is_reported_with_a_remedy(settings: dict[str, Any], reason: str, tmp_path: Path):
     hwmon(tmp_path, **INA226)
     for number, place in ((4, "1-0041"), (5, "1-0042")):
         hwmon(tmp_path, "ina219", place, number, in1_input=1, curr1_input=1)
     with pytest.raises(SourceUnavailableError) as caught:
-        await first(sensor(tmp_path, **settings).iter_lines())
-    assert str(caught.value).endswith(said)
+        await read_first(sensor(tmp_path, **settings).iter_lines())
+    assert str(caught.value).endswith(reason)
 
 
 async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
     folder = hwmon(tmp_path, **INA226)
     ina = sensor(tmp_path)
     voltage, current = folder / "in1_input", folder / "curr1_input"
-    spoilt = {
+    faults = {
         "no number: b'busy'": lambda: current.write_text("busy"),
         "no number: b''": lambda: current.write_text(""),
         "no number: b'\\xff\\x00": lambda: current.write_bytes(b"\xff\x00" * 4000),
@@ -123,10 +125,10 @@ async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
     async with aclosing(ina.iter_lines()) as lines:
         assert await anext(lines) == CONNECTED
         await anext(lines)
-        for said, spoil in spoilt.items():
-            spoil()
+        for reason, make_fault in faults.items():
+            make_fault()
             assert ina._sample(await ina._read(ina._find_channels)) == b""
-            assert said in (ina.fault or "")
+            assert reason in (ina.fault or "")
         current.rmdir()
         current.write_text("1500\n")
         voltage.write_text("12000\n")
@@ -136,7 +138,7 @@ async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
         assert ina.fault is None
         assert ina.counters["value_errors"] >= 3
         assert ina.counters["read_errors"] >= 2
-        voltage.unlink()  # the driver was taken away
+        voltage.unlink()  # as after the removal of the driver
         with pytest.raises(FileNotFoundError):
             await _drain(lines)
 
@@ -144,25 +146,25 @@ async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
 async def test_hung_bus_blocks_nothing_and_is_not_read_again_until_it_answers(tmp_path: Path):
     folder = hwmon(tmp_path, **INA226)
     (folder / "curr1_input").unlink()
-    os.mkfifo(folder / "curr1_input")  # opening it waits for somebody who writes
+    os.mkfifo(folder / "curr1_input")  # opening a FIFO blocks until another process opens it for writing
     ina = sensor(tmp_path)
     before = set(threading.enumerate())
     for _ in range(3):
         with pytest.raises(SourceUnavailableError, match=r"the bus has not answered for 0.05 s"):
-            await first(ina.iter_lines())
+            await read_first(ina.iter_lines())
     assert len(set(threading.enumerate()) - before) == 1
     writer = os.open(folder / "curr1_input", os.O_RDWR | os.O_NONBLOCK)
     (folder / "curr1_input").unlink()
     (folder / "curr1_input").write_text("1500\n")
-    os.close(writer)  # lets go who waits
+    os.close(writer)  # the blocked reader returns
     ina._read_timeout_s = LONG_S
-    assert (await first(ina.iter_lines())).current_a == 1.5
+    assert (await read_first(ina.iter_lines())).current_a == 1.5
 
 
 async def test_unreadable_temperature_loses_no_sample(tmp_path: Path):
     hwmon(tmp_path, **INA226, temp1_input="nonsense")
     ina = sensor(tmp_path, temperature="temp1_input")
-    reading = await first(ina.iter_lines())
+    reading = await read_first(ina.iter_lines())
     assert reading.temperature_c != reading.temperature_c
     assert ina.counters == {"read_errors": 0, "value_errors": 1}
 
@@ -176,5 +178,5 @@ def test_poll_interval_is_that_of_the_chip_within_limits(update_interval: str, i
 async def test_chip_slower_than_expected_is_reported_with_the_setting(tmp_path: Path):
     hwmon(tmp_path, **INA226 | {"update_interval": "17000"})
     with pytest.raises(SourceUnavailableError, match=r"measures only every 17 s; .*source\.interval_s = 17$"):
-        await first(sensor(tmp_path, interval_s=None).iter_lines())
-    assert await first(sensor(tmp_path, interval_s=17.0).iter_lines())
+        await read_first(sensor(tmp_path, interval_s=None).iter_lines())
+    assert await read_first(sensor(tmp_path, interval_s=17.0).iter_lines())

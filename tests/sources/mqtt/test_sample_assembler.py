@@ -1,6 +1,6 @@
-"""What other projects publish of a battery, each in its own form: one sample of it, and what is wrong with it said.
+"""Samples from the MQTT messages of other projects, reasons for missing samples, and detection of a second publisher.
 
-The payloads are those of the projects named in ``settings/mqtt_profiles.py``, with numbers of ours.
+The payloads have the formats of the projects in ``settings/mqtt_profiles.py``, with invented values.
 """
 
 import json
@@ -24,15 +24,15 @@ def source(**settings: Any) -> MqttSource:
     return MqttSource.model_validate({"kind": "mqtt"} | settings)
 
 
-def own(**settings: Any) -> MqttSource:
-    """By hand, one payload for all."""
+def json_source(**settings: Any) -> MqttSource:
+    """Return settings without a profile, for one JSON payload with all values."""
     return source(**{"topic": "home/pack", "voltage": "u", "current": "i"} | settings)
 
 
-def told(
+def feed(
     assembly: SampleAssembler, messages: Messages, at_s: float = 0.0, *, retained: bool = False
 ) -> list[dict[str, Any]]:
-    """The samples that messages make, and what follows of them after the time to settle."""
+    """Feed messages that arrive together. Return the samples, including the one that is complete 0.5 s later."""
     lines = []
     for topic, payload in messages:
         assembly.take(topic, payload.encode(), at_s, retained=retained)
@@ -42,13 +42,14 @@ def told(
 
 
 def esphome(node: str, voltage: str, current: str, temperature: str, cell: str) -> Messages:
-    """As a node publishes its sensors, one after the other."""
+    """Return the messages of an ESPHome node, which publishes its sensors one after the other."""
     cells = [(cell.format(n), f"3.3{n:02}") for n in range(1, 17)]
     values = [*cells, (temperature, "21.5"), (voltage, "52.98"), (current, "-12.34"), ("balancing_current", "0.000")]
     return [(f"{node}/sensor/{node}_{name}/state", value) for name, value in values]
 
 
-SIXTEEN = [round(3.3 + n / 1000, 3) for n in range(1, 17)]
+SIXTEEN_CELLS_V = [round(3.3 + n / 1000, 3) for n in range(1, 17)]
+# Settings, messages, their sample, and the sign of the current, by project
 PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
     "batmon-ha": (
         {"profile": "batmon-ha", "prefix": "jk_bms"},
@@ -68,13 +69,13 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
     "esphome-jk": (
         {"profile": "esphome-jk", "prefix": "jk-bms"},
         esphome("jk-bms", "total_voltage", "current", "temperature_sensor_1", "cell_voltage_{}"),
-        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN},
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN_CELLS_V},
         "charge_positive",
     ),
     "esphome-jbd": (
         {"profile": "esphome-jbd", "prefix": "jbd-bms-ble"},
         esphome("jbd-bms-ble", "total_voltage", "current", "temperature_1", "cell_voltage_{}"),
-        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN},
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN_CELLS_V},
         "charge_positive",
     ),
     "esphome-daly": (
@@ -153,9 +154,8 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
 def test_messages_of_a_project_give_one_sample(project: str) -> None:
     table, messages, sample, sign = PROJECTS[project]
     assembly = SampleAssembler(source(**table))
-    first = told(assembly, messages)
-    assert first == [sample]
-    assert told(assembly, messages, 10.0)[0]["current_a"] == sample["current_a"]
+    assert feed(assembly, messages) == [sample]
+    assert feed(assembly, messages, 10.0)[0]["current_a"] == sample["current_a"]
     assert assembly.fault is None
     assert set(assembly.counters.values()) == {0}
     settings = Settings.model_validate({"source": {"kind": "mqtt"} | table})
@@ -165,12 +165,12 @@ def test_messages_of_a_project_give_one_sample(project: str) -> None:
 def test_cells_at_the_end_of_a_batch_belong_to_the_next_sample() -> None:
     table, messages, _, _ = PROJECTS["batmon-ha"]
     assembly = SampleAssembler(source(**table))
-    told(assembly, messages)
-    assert told(assembly, messages, 5.0)[0]["cells_v"] == [3.301, 3.302]
+    feed(assembly, messages)
+    assert feed(assembly, messages, 5.0)[0]["cells_v"] == [3.301, 3.302]
 
 
 @pytest.mark.parametrize(
-    ("where", "payload", "sample"),
+    ("settings", "payload", "sample"),
     [
         ({}, '{"u": 52.1, "i": "-3.25"}', {"voltage_v": 52.1, "current_a": -3.25}),
         (
@@ -200,12 +200,12 @@ def test_cells_at_the_end_of_a_batch_belong_to_the_next_sample() -> None:
         ),
     ],
 )
-def test_paths_units_scales_and_times(where: dict[str, Any], payload: str, sample: dict[str, Any]) -> None:
-    assert told(SampleAssembler(own(**where)), [("home/pack", payload)]) == [sample]
+def test_paths_units_scales_and_times(settings: dict[str, Any], payload: str, sample: dict[str, Any]) -> None:
+    assert feed(SampleAssembler(json_source(**settings)), [("home/pack", payload)]) == [sample]
 
 
 def test_pack_with_the_maximum_number_of_cells_is_decoded() -> None:
-    assembly, decoder = SampleAssembler(own(cells="c")), TextProtocol()
+    assembly, decoder = SampleAssembler(json_source(cells="c")), TextProtocol()
     payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELL_NUMBER})
     assembly.take("home/pack", payload.encode(), 0.0, retained=False)
     assert decoder.feed(0.0, assembly.line(0.0)).size == 1
@@ -214,43 +214,43 @@ def test_pack_with_the_maximum_number_of_cells_is_decoded() -> None:
 
 def test_unchanged_topic_keeps_its_value_up_to_the_maximum_age() -> None:
     assembly = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
-    assert told(assembly, [("v", "52")]) == []
+    assert feed(assembly, [("v", "52")]) == []
     assert assembly.fault == "current: no message on i"
-    assert told(assembly, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
+    assert feed(assembly, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
     assembly.take("i", b"2", 20.0, retained=False)
     assert assembly.line(20.4) == b""
     assert assembly.wait_s(20.4) == pytest.approx(0.1)
     assert json.loads(assembly.line(20.5)) == {"voltage_v": 51.0, "current_a": 2.0}
     assert assembly.wait_s(20.5) is None
-    assert told(assembly, [("i", "3")], 40.0) == []
+    assert feed(assembly, [("i", "3")], 40.0) == []
     assert assembly.counters["stale"] == 2
     assert assembly.fault == "voltage: no message on v for 30 s"
-    assert told(assembly, [("v", "50")], 41.0) == [{"voltage_v": 50.0, "current_a": 3.0}]
+    assert feed(assembly, [("v", "50")], 41.0) == [{"voltage_v": 50.0, "current_a": 3.0}]
     assert assembly.fault is None
 
 
 def test_temperature_and_cells_may_be_older() -> None:
     assembly = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature={"topic": "t"}))
     both = [("v", "52"), ("i", "1")]
-    told(assembly, [("t", "21.5")])
-    assert told(assembly, both, 299.0)[0]["temperature_c"] == 21.5
-    assert "temperature_c" not in told(assembly, both, 301.0)[0]
+    feed(assembly, [("t", "21.5")])
+    assert feed(assembly, both, 299.0)[0]["temperature_c"] == 21.5
+    assert "temperature_c" not in feed(assembly, both, 301.0)[0]
 
 
 def test_retained_messages_are_ignored() -> None:
-    assembly = SampleAssembler(own(availability_topic="home/status"))
-    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
+    assembly = SampleAssembler(json_source(availability_topic="home/status"))
+    assert feed(assembly, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
     assert assembly.counters["retained"] == 1
     assert assembly.fault == "no message on home/pack but retained messages"
-    told(assembly, [("home/status", "offline")], retained=True)
+    feed(assembly, [("home/status", "offline")], retained=True)
     assert assembly.fault == "the publisher reports offline on home/status"
-    told(assembly, [("home/status", '{"state":"online"}')])
-    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    feed(assembly, [("home/status", '{"state":"online"}')])
+    assert feed(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
     assert assembly.fault is None
 
 
 @pytest.mark.parametrize(
-    ("payload", "kind", "said"),
+    ("payload", "kind", "reason"),
     [
         ('{"i": 1}', "missing", "voltage: home/pack: u: not in {'i': 1}"),
         ('{"u": "unavailable", "i": 1}', "no_number", "no number: 'unavailable'"),
@@ -267,46 +267,47 @@ def test_retained_messages_are_ignored() -> None:
         (5000 * "[", "no_number", "no JSON: '[[["),
     ],
 )
-def test_invalid_payload_is_counted_and_reported(payload: str, kind: str, said: str) -> None:
-    assembly = SampleAssembler(own())
-    assert told(assembly, [("home/pack", payload)]) == []
+def test_invalid_payload_is_counted_and_reported(payload: str, kind: str, reason: str) -> None:
+    assembly = SampleAssembler(json_source())
+    assert feed(assembly, [("home/pack", payload)]) == []
     assert assembly.counters[kind] >= 1
-    assert said in (assembly.fault or "")
-    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    assert reason in (assembly.fault or "")
+    assert feed(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
 
 
 @given(st.binary() | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode))
 def test_no_payload_raises(payload: bytes) -> None:
-    settings = own(cells="c.{cell}", temperature={"path": "0.1"}, time={"path": "t", "unit": "iso"})
+    settings = json_source(cells="c.{cell}", temperature={"path": "0.1"}, time={"path": "t", "unit": "iso"})
     assembly = SampleAssembler(settings)
     assembly.take("home/pack", payload, 0.0, retained=False)
     assembly.line(1.0)
     for name, place in settings.places():
-        for way in (read_value, read_cells):
+        for read in (read_value, read_cells):
             try:
-                way(payload, place, name)
+                read(payload, place, name)
             except InvalidValueError:
                 continue
 
 
 @pytest.mark.parametrize(
-    ("prefix", "instance", "begin"), [("jk-bms", "", "jk-bms_"), ("jk-bms", "", ""), ("home/bms", "jk-bms", "jk-bms_")]
+    ("prefix", "instance", "name_prefix"),
+    [("jk-bms", "", "jk-bms_"), ("jk-bms", "", ""), ("home/bms", "jk-bms", "jk-bms_")],
 )
-def test_node_with_another_prefix_or_without_name(prefix: str, instance: str, begin: str) -> None:
+def test_node_with_another_prefix_or_without_name(prefix: str, instance: str, name_prefix: str) -> None:
     assembly = SampleAssembler(source(profile="esphome-jk", prefix=prefix, instance=instance))
     values = [("total_voltage", "52.98"), ("current", "-12.34"), ("balancing_current", "1")]
-    sample = told(assembly, [(f"{prefix}/sensor/{begin}{name}/state", value) for name, value in values])
+    sample = feed(assembly, [(f"{prefix}/sensor/{name_prefix}{name}/state", value) for name, value in values])
     assert sample == [{"voltage_v": 52.98, "current_a": -12.34}]
 
 
 def test_no_topic_is_subscribed_twice() -> None:
     jk = source(profile="esphome-jk", prefix="jk-bms")
     assert SampleAssembler(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
-    assert SampleAssembler(own()).topics == ["home/pack"]
+    assert SampleAssembler(json_source()).topics == ["home/pack"]
 
 
 @pytest.mark.parametrize(
-    ("table", "said"),
+    ("table", "reason"),
     [
         ({}, "voltage: missing; give its path, or a profile: batmon-ha"),
         ({"profile": "venus"}, "profile venus: prefix: missing (VRM portal ID"),
@@ -320,22 +321,22 @@ def test_no_topic_is_subscribed_twice() -> None:
         ({"topic": "t", "voltage": "u", "current": "i", "username": "me"}, "are for a broker at url"),
     ],
 )
-def test_invalid_settings_are_rejected_with_a_reason(table: dict[str, Any], said: str) -> None:
+def test_invalid_settings_are_rejected_with_a_reason(table: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match="mqtt") as caught:
         Settings.model_validate({"source": {"kind": "mqtt"} | table})
-    assert said in str(caught.value)
+    assert reason in str(caught.value)
 
 
 def test_settings_override_the_profile() -> None:
-    told_too = source(profile="battery-emulator", current={"scale": -1}, temperature="temperature_min", interval_s=2)
-    assert told_too.current.topics == ("{prefix}/info{instance}",)
-    assert (told_too.current.path, told_too.current.scale) == ("battery_current", -1.0)
-    assert told_too.temperature.path == "temperature_min"
-    assert (told_too.prefix, told_too.period_s) == ("BE", 2.0)
+    merged = source(profile="battery-emulator", current={"scale": -1}, temperature="temperature_min", interval_s=2)
+    assert merged.current.topics == ("{prefix}/info{instance}",)
+    assert (merged.current.path, merged.current.scale) == ("battery_current", -1.0)
+    assert merged.temperature.path == "temperature_min"
+    assert (merged.prefix, merged.period_s) == ("BE", 2.0)
 
 
-def _merged(*publishers: tuple[float, float, float, float]) -> list[tuple[float, float]]:
-    """Times and currents of publishers, each given by period, first and last time, and current."""
+def _merge_publishers(*publishers: tuple[float, float, float, float]) -> list[tuple[float, float]]:
+    """Return times and currents of messages. Each publisher has a period, a first and a last time, and a current."""
     messages = [
         (first_s + period_s * i, current_a)
         for period_s, first_s, last_s, current_a in publishers
@@ -344,50 +345,50 @@ def _merged(*publishers: tuple[float, float, float, float]) -> list[tuple[float,
     return sorted(messages)
 
 
-def _errors(messages: list[tuple[float, float]]) -> tuple[SampleAssembler, list[float]]:
-    """Times at which a message was counted as one of two publishers [s]."""
-    assembly, found = SampleAssembler(own()), list[float]()
+def _conflict_times(messages: list[tuple[float, float]]) -> tuple[SampleAssembler, list[float]]:
+    """Return the assembler and the times of the messages that were counted as those of two publishers [s]."""
+    assembly, times_s = SampleAssembler(json_source()), list[float]()
     for at_s, current_a in messages:
         before = assembly.counters["publisher_errors"]
         assembly.take("home/pack", json.dumps({"u": 52.0, "i": current_a}).encode(), at_s, retained=False)
-        found += [at_s] * (assembly.counters["publisher_errors"] - before)
-    return assembly, found
+        times_s += [at_s] * (assembly.counters["publisher_errors"] - before)
+    return assembly, times_s
 
 
 @pytest.mark.parametrize("period_s", [0.2, 1.0, 2.7])
 def test_second_publisher_of_a_topic_is_reported_until_it_stops(period_s: float) -> None:
-    rival = (period_s, 100.3, 160.0, -80.0)
-    assembly, found = _errors(_merged((1.0, 0.0, 160.0, 5.0), rival))
-    assert 100.3 < found[0] < 115.0
-    assert found[-1] > 158.0
+    second_publisher = (period_s, 100.3, 160.0, -80.0)
+    assembly, times_s = _conflict_times(_merge_publishers((1.0, 0.0, 160.0, 5.0), second_publisher))
+    assert 100.3 < times_s[0] < 115.0
+    assert times_s[-1] > 158.0
     assert set(assembly.conflict.removeprefix("home/pack: current ").split(" and ")) == {"5", "-80"}
-    assembly, found = _errors(_merged((1.0, 0.0, 400.0, 5.0), rival))
+    assembly, times_s = _conflict_times(_merge_publishers((1.0, 0.0, 400.0, 5.0), second_publisher))
     assert assembly.conflict == ""
-    assert found[-1] < 160.0 + 64.0
+    assert times_s[-1] < 160.0 + 64.0
 
 
 @pytest.mark.parametrize("on_s", [1, 2, 3, 10])
 def test_switching_load_is_no_second_publisher(on_s: int) -> None:
     messages = [(float(second), 80.0 if second // on_s % 2 else -5.0) for second in range(1000)]
-    assembly, found = _errors(messages)
-    assert (assembly.conflict, found) == ("", [])
+    assembly, times_s = _conflict_times(messages)
+    assert (assembly.conflict, times_s) == ("", [])
 
 
 @pytest.mark.parametrize(("on_s", "off_s", "spread"), [(3, 60, 0.0), (600, 1800, 0.1), (5, 15, 0.9)])
 def test_load_published_on_change_is_no_second_publisher(on_s: int, off_s: int, spread: float) -> None:
-    """A short pulse in each minute, a refrigerator, a load that somebody switches."""
-    chance, messages, at_s = random.Random(1), list[tuple[float, float]](), 0.0
+    """The loads are a short pulse each minute, a refrigerator, and a load that is switched by hand."""
+    rng, messages, at_s = random.Random(1), list[tuple[float, float]](), 0.0
     for _ in range(200):
         for pause_s, current_a in ((off_s, 80.0), (on_s, 5.0)):
-            at_s += pause_s * chance.uniform(1.0 - spread, 1.0 + spread)
+            at_s += pause_s * rng.uniform(1.0 - spread, 1.0 + spread)
             messages.append((at_s, current_a))
-    assembly, found = _errors(messages)
-    assert (assembly.conflict, found) == ("", [])
+    assembly, times_s = _conflict_times(messages)
+    assert (assembly.conflict, times_s) == ("", [])
 
 
 @pytest.mark.parametrize("restarts", [False, True])
 def test_publisher_of_changes_and_regular_messages_is_no_second_publisher(*, restarts: bool) -> None:
-    """A message each 10 s, counted from the last change or not, and a load that is on for 3 s of 61 s."""
+    """The load is on for 3 s of every 61 s. A message every 10 s is counted from the last change (``restarts``) or not."""
     messages: list[tuple[float, float]] = []
     for cycle in range(30):
         on_s = 61.0 * cycle
@@ -396,33 +397,33 @@ def test_publisher_of_changes_and_regular_messages_is_no_second_publisher(*, res
             messages += [(on_s + 3.0 + 10.0 * i, 5.0) for i in range(1, 6)]
     if not restarts:
         messages += [(10.0 * i + 0.5, 80.0 if (10.0 * i + 0.5) % 61.0 < 3.0 else 5.0) for i in range(183)]
-    assembly, found = _errors(sorted(messages))
-    assert (assembly.conflict, found) == ("", [])
+    assembly, times_s = _conflict_times(sorted(messages))
+    assert (assembly.conflict, times_s) == ("", [])
 
 
 def test_slower_second_publisher_is_detected() -> None:
-    _, found = _errors(_merged((1.0, 0.0, 400.0, 5.0), (10.0, 100.3, 400.0, -80.0)))
-    assert found
-    assert found[0] < 160.0
+    _, times_s = _conflict_times(_merge_publishers((1.0, 0.0, 400.0, 5.0), (10.0, 100.3, 400.0, -80.0)))
+    assert times_s
+    assert times_s[0] < 160.0
 
 
 def test_second_publisher_at_random_times_is_detected() -> None:
-    chance, rival, at_s = random.Random(1), list[tuple[float, float]](), 100.0
+    rng, second_publisher, at_s = random.Random(1), list[tuple[float, float]](), 100.0
     while at_s < 160.0:
-        at_s += chance.expovariate(1.0)
-        rival.append((at_s, -80.0))
-    _, found = _errors(sorted(_merged((1.0, 0.0, 160.0, 5.0)) + rival))
-    assert 100.0 < found[0] < 115.0
+        at_s += rng.expovariate(1.0)
+        second_publisher.append((at_s, -80.0))
+    _, times_s = _conflict_times(sorted(_merge_publishers((1.0, 0.0, 160.0, 5.0)) + second_publisher))
+    assert 100.0 < times_s[0] < 115.0
 
 
 def test_cells_no_longer_measured_are_removed() -> None:
-    together = SampleAssembler(own(cells="cells"))
+    one_topic = SampleAssembler(json_source(cells="cells"))
     payloads = ('{"u": 52.0, "i": 1.0, "cells": [3.3, 3.4]}', '{"u": 52.0, "i": 1.0, "cells": null}')
-    first, lost = told(together, [("home/pack", payload) for payload in payloads])
+    first, lost = feed(one_topic, [("home/pack", payload) for payload in payloads])
     assert (first["cells_v"], "cells_v" in lost) == ([3.3, 3.4], False)
-    each = SampleAssembler(own(cells={"topic": "home/cell/{cell}"}))
+    topic_per_cell = SampleAssembler(json_source(cells={"topic": "home/cell/{cell}"}))
     pack = ("home/pack", '{"u": 52.0, "i": 1.0}')
-    before, after = told(
-        each, [("home/cell/1", "3.3"), ("home/cell/2", "3.4"), pack, ("home/cell/1", "unavailable"), pack]
+    before, after = feed(
+        topic_per_cell, [("home/cell/1", "3.3"), ("home/cell/2", "3.4"), pack, ("home/cell/1", "unavailable"), pack]
     )
     assert (before["cells_v"], after["cells_v"]) == ([3.3, 3.4], [None, 3.4])

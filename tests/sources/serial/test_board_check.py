@@ -1,4 +1,7 @@
-"""What is on the port need not be the board: nothing is sent to a stranger, and under ``auto`` one board is kept to; ``test_pinned_board`` has the rest."""
+"""Check of the board: nothing is sent to other devices, and ``port = "auto"`` stays with one board.
+
+More tests of the check are in ``test_pinned_board``.
+"""
 
 import asyncio
 import contextlib
@@ -20,7 +23,7 @@ from tests.patience import LONG_S
 from tests.serial_line import Line, usb_port
 
 ASH_RESET = b"\x1a\xc1\x02\x0b\x0a\x52\x7e"
-"""What a Zigbee stick says after its reset."""
+"""Bytes that a Zigbee stick sends after its reset."""
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -30,15 +33,15 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 @contextlib.asynccontextmanager
-async def taken(source: SerialSource, blocks: list[SampleBlock]):
-    """The source at work, its blocks kept."""
+async def run_source(source: SerialSource, blocks: list[SampleBlock]):
+    """Run the source. Append its blocks to ``blocks``."""
 
-    async def keep() -> None:
+    async def store_blocks() -> None:
         async for block in source:
             blocks.append(block.copy())  # noqa: PERF401 - others read the list meanwhile
 
     async with source:
-        task = asyncio.create_task(keep())
+        task = asyncio.create_task(store_blocks())
         try:
             yield
         finally:
@@ -49,7 +52,7 @@ async def taken(source: SerialSource, blocks: list[SampleBlock]):
 async def test_nothing_is_sent_to_a_device_with_another_protocol(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
-    async with taken(source, []):
+    async with run_source(source, []):
         await until(lambda: source.message and "silent" in source.message)
         assert line.received() == b""
         line.write(100 * ASH_RESET)
@@ -60,22 +63,22 @@ async def test_nothing_is_sent_to_a_device_with_another_protocol(line: Line) -> 
 async def test_hello_is_requested_after_the_first_frame(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
-    async with taken(source, []):
+    async with run_source(source, []):
         await until(lambda: source.message and "no frame yet" in source.message)
-        line.write(b"\0" + hello_command())  # any frame with a right CRC
-        heard = b""
+        line.write(b"\0" + hello_command())  # any frame with a valid CRC
+        received = b""
 
-        def asked() -> bool:
-            nonlocal heard
-            heard += line.received()
-            return heard.startswith(hello_command())
+        def is_requested() -> bool:
+            nonlocal received
+            received += line.received()
+            return received.startswith(hello_command())
 
-        await until(asked)
+        await until(is_requested)
 
 
 @pytest.fixture
 def auto(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
-    """Where the only port is, if one is plugged in."""
+    """Return the path of the only port. It exists while a board is plugged in."""
     path = tmp_path / "ttyUSB0"
     monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path))] if path.is_symlink() else [])
     monkeypatch.setattr(port_list, "BY_ID", tmp_path / "by-id")
@@ -83,7 +86,7 @@ def auto(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def linked(path: Path, target: str):
+def symlink(path: Path, target: str):
     path.symlink_to(target)
     try:
         yield
@@ -93,8 +96,8 @@ def linked(path: Path, target: str):
 
 @contextlib.asynccontextmanager
 async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
-    """A board on ``path`` that runs."""
-    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial) as board, linked(path, board.path):
+    """Run a board that is plugged in at ``path``."""
+    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial) as board, symlink(path, board.path):
         task = asyncio.create_task(board.run())
         try:
             yield
@@ -106,28 +109,28 @@ async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
 async def test_auto_rejects_another_board_and_reopens_its_own(auto: Path) -> None:
     blocks = list[SampleBlock]()
     source = SerialSource(SensorSettings(port="auto", sample_rate_hz=50), first_retry_s=0.05)
-    async with taken(source, blocks):
+    async with run_source(source, blocks):
         async with plugged_in(auto, serial=1):
             await until(lambda: source._board_check.serial)
         await until(lambda: source.message)
         async with plugged_in(auto, serial=2, voltage_v=11.1):
             await until(lambda: source.message and "refused" in source.message)
             assert "board 00000002 is not the pack's, 00000001" in (source.message or "")
-            await until(lambda: source.counters["reconnects"] >= 2)  # it was looked at once more
-        taken_before = len(blocks)
+            await until(lambda: source.counters["reconnects"] >= 2)  # the board is checked a second time
+        blocks_before = len(blocks)
         async with plugged_in(auto, serial=1):
-            await until(lambda: len(blocks) > taken_before)
+            await until(lambda: len(blocks) > blocks_before)
         assert source.board["serial"] == "00000001"
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(22.2, abs=0.1)
 
 
 async def test_auto_reports_what_replaced_its_board(auto: Path) -> None:
     source = SerialSource(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
-    async with taken(source, []):
+    async with run_source(source, []):
         async with plugged_in(auto, serial=1):
             await until(lambda: source._board_check.serial)
         await until(lambda: source.message)
-        with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, linked(auto, other.path):
+        with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, symlink(auto, other.path):
             task = asyncio.create_task(other.run())
             await until(lambda: source.message and "prints text" in source.message)
             task.cancel()

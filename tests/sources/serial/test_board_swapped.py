@@ -1,4 +1,4 @@
-"""Exchange of the board on the open port for a running one with another scaling, without a reset."""
+"""Replacement of the board on the open port by a running board with another scaling, without a reset."""
 
 import asyncio
 
@@ -23,8 +23,8 @@ PERIOD_S = 0.01
 BEGIN_S = 1_700_000_000.0
 
 
-class Running:
-    """A board that has run for ``age_s`` and counted ``sequence`` samples."""
+class RunningBoard:
+    """Board that has run for ``age_s`` and sent ``sequence`` samples."""
 
     def __init__(self, serial: int, divider: float, sequence: int = 0, age_s: float = 0.0) -> None:
         self._board = VirtualBoard(
@@ -37,23 +37,24 @@ class Running:
         return hello.encode()
 
     def frames(self, count: int) -> list[bytes]:
-        taken = []
+        """Return the next ``count`` samples."""
+        frames = []
         for _ in range(count):
             self._board._line.clear()
             self._board._take_sample()
-            taken.append(bytes(self._board._line))
-        return taken
+            frames.append(bytes(self._board._line))
+        return frames
 
 
-def fed(decoder: FrameDecoder, begin_s: float, frames: list[bytes]) -> SampleBlock:
+def feed_frames(decoder: FrameDecoder, begin_s: float, frames: list[bytes]) -> SampleBlock:
     return np.concatenate([decoder.feed(begin_s + PERIOD_S * i, frame) for i, frame in enumerate(frames)])
 
 
-def ours() -> FrameDecoder:
-    """A decoder that has heard our board for a second."""
-    decoder, board = FrameDecoder(), Running(1, 6.1)
+def decoder_of_our_board() -> FrameDecoder:
+    """Return a decoder that has received samples of our board for a second."""
+    decoder, board = FrameDecoder(), RunningBoard(1, 6.1)
     decoder.feed(BEGIN_S, board.hello())
-    assert fed(decoder, BEGIN_S + PERIOD_S, board.frames(100))["voltage_v"] == pytest.approx(PACK_V, abs=0.1)
+    assert feed_frames(decoder, BEGIN_S + PERIOD_S, board.frames(100))["voltage_v"] == pytest.approx(PACK_V, abs=0.1)
     return decoder
 
 
@@ -63,64 +64,64 @@ def ours() -> FrameDecoder:
     ids=["ahead", "by its clock alone", "by its sequence alone", "after an hour", "begun within that hour"],
 )
 def test_inconsistent_samples_wait_for_a_hello(sequence: int, age_s: float, away_s: float) -> None:
-    decoder, other = ours(), Running(2, 9.0, sequence, age_s)
+    decoder, other = decoder_of_our_board(), RunningBoard(2, 9.0, sequence, age_s)
     begin_s = BEGIN_S + 1.0 + away_s
-    assert fed(decoder, begin_s, other.frames(100)).size == 0
+    assert feed_frames(decoder, begin_s, other.frames(100)).size == 0
     assert decoder.hello is None
     decoder.feed(begin_s + 1.0, other.hello())
-    taken = fed(decoder, begin_s + 1.0 + PERIOD_S, other.frames(100))
-    assert taken.size == 100
-    assert taken["voltage_v"] == pytest.approx(PACK_V, abs=0.1)
+    block = feed_frames(decoder, begin_s + 1.0 + PERIOD_S, other.frames(100))
+    assert block.size == 100
+    assert block["voltage_v"] == pytest.approx(PACK_V, abs=0.1)
     assert decoder.board["serial"] == "00000002"
 
 
 def test_lost_samples_do_not_require_a_hello() -> None:
-    decoder, board = ours(), Running(1, 6.1, 100, 1.0)
+    decoder, board = decoder_of_our_board(), RunningBoard(1, 6.1, 100, 1.0)
     board.frames(12_345)
-    taken = fed(decoder, BEGIN_S + 1.0 + 123.46, board.frames(10))
-    assert taken.size == 10
+    block = feed_frames(decoder, BEGIN_S + 1.0 + 123.46, board.frames(10))
+    assert block.size == 10
     assert decoder.hello
     assert decoder.counters.frames_lost == 12_345
 
 
 def test_board_without_hello_is_accepted_after_a_timeout() -> None:
-    """Its line may have no way back: it cannot be asked."""
-    decoder, board = ours(), Running(1, 6.1, 100, 900.0)
-    taken = fed(decoder, BEGIN_S + 2.0, board.frames(1000))
-    assert taken.size == decoder.counters.frames_received - 100 == 1000 - MAX_DOUBT_S / PERIOD_S
+    """The line may have no direction to the board, so that a hello cannot be requested."""
+    decoder, board = decoder_of_our_board(), RunningBoard(1, 6.1, 100, 900.0)
+    block = feed_frames(decoder, BEGIN_S + 2.0, board.frames(1000))
+    assert block.size == decoder.counters.frames_received - 100 == 1000 - MAX_DOUBT_S / PERIOD_S
     assert decoder.counters.before_hello == MAX_DOUBT_S / PERIOD_S
     assert decoder.hello is None
-    lost = ours()
-    taken = fed(lost, BEGIN_S + 2.0, Running(1, 6.1, 50_000, 900.0).frames(1000))
-    assert taken["status"][0] & SampleStatus.GAP
-    assert not taken["status"][1:].any()
+    lost = decoder_of_our_board()
+    block = feed_frames(lost, BEGIN_S + 2.0, RunningBoard(1, 6.1, 50_000, 900.0).frames(1000))
+    assert block["status"][0] & SampleStatus.GAP
+    assert not block["status"][1:].any()
 
 
 async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
     blocks: list[SampleBlock] = []
-    ours, other = Running(1, 6.1), Running(2, 9.0, 50_000, 900.0)
+    ours, other = RunningBoard(1, 6.1), RunningBoard(2, 9.0, 50_000, 900.0)
 
-    async def keep() -> None:
+    async def store_blocks() -> None:
         async for block in source:
             blocks.append(block)  # noqa: PERF401 - the test reads the list meanwhile
 
     async with source:
-        task = asyncio.create_task(keep())
+        task = asyncio.create_task(store_blocks())
         try:
             await until(lambda: source.message and "no frame yet" in source.message)
             line.write(ours.hello() + b"".join(ours.frames(10)))
             await until(lambda: source._board_check.serial)
-            heard = line.received()
+            received = line.received()
             line.write(b"".join(other.frames(10)))
 
-            def asked() -> bool:
-                nonlocal heard
-                heard += line.received()
-                return hello_command() in heard
+            def is_requested() -> bool:
+                nonlocal received
+                received += line.received()
+                return hello_command() in received
 
-            await until(asked)
+            await until(is_requested)
             line.write(other.hello() + b"".join(other.frames(10)))
             await until(lambda: source.message and "board 00000002 is not the pack's, 00000001" in source.message)
         finally:
@@ -129,37 +130,37 @@ async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Li
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(np.full(10, PACK_V), abs=0.1)
 
 
-def door_of_ours() -> tuple[BoardCheck, BoardProtocol]:
-    """It knows our board."""
-    dialect, door = BoardProtocol(), BoardCheck(BoardProtocol)
-    dialect.feed(BEGIN_S, Running(1, 6.1).hello())
-    door.remember_board(dialect.board, 0.0)
-    return door, dialect
+def check_of_our_board() -> tuple[BoardCheck, BoardProtocol]:
+    """Return a check that accepts our board only, and a protocol that has received its hello."""
+    protocol, check = BoardProtocol(), BoardCheck(BoardProtocol)
+    protocol.feed(BEGIN_S, RunningBoard(1, 6.1).hello())
+    check.remember_board(protocol.board, 0.0)
+    return check, protocol
 
 
 def test_rejected_board_is_blocked_until_the_port_is_reopened() -> None:
-    """Reads that wait behind the one with its hello have none."""
-    own, other = Running(1, 6.1), Running(2, 9.0)
-    door, dialect = door_of_ours()
+    """The reads after the hello of the rejected board contain no hello, and are rejected, too."""
+    own, other = RunningBoard(1, 6.1), RunningBoard(2, 9.0)
+    check, protocol = check_of_our_board()
     with pytest.raises(OtherBoardError):
-        door.accept((BEGIN_S, other.hello()), dialect)
+        check.accept((BEGIN_S, other.hello()), protocol)
     frame = other.frames(1)[0]
-    assert door.accept((BEGIN_S, frame), dialect) == ()
-    assert door.rejected_bytes == len(other.hello() + frame)
-    door.on_port_opened()
-    assert len(door.accept((BEGIN_S, own.hello()), dialect)) == 1
+    assert check.accept((BEGIN_S, frame), protocol) == ()
+    assert check.rejected_bytes == len(other.hello() + frame)
+    check.on_port_opened()
+    assert len(check.accept((BEGIN_S, own.hello()), protocol)) == 1
 
 
 def test_each_pending_byte_is_passed_once_or_counted() -> None:
-    board = Running(1, 6.1)
-    door, dialect = door_of_ours()
+    board = RunningBoard(1, 6.1)
+    check, protocol = check_of_our_board()
     reads = [(BEGIN_S, frame) for frame in board.frames(MAX_PENDING_READS + 5)]
-    door.on_port_opened()
-    assert not any(door.accept(read, dialect) for read in reads[:7])
-    door.on_port_opened()  # the port was lost
-    assert door.rejected_bytes == sum(len(data) for _, data in reads[:7])
-    assert not any(door.accept(read, dialect) for read in reads)
+    check.on_port_opened()
+    assert not any(check.accept(read, protocol) for read in reads[:7])
+    check.on_port_opened()  # the port was lost
+    assert check.rejected_bytes == sum(len(data) for _, data in reads[:7])
+    assert not any(check.accept(read, protocol) for read in reads)
     hello = BEGIN_S, board.hello()
-    assert door.accept(hello, dialect) == [*reads[6:], hello]
-    door.on_port_opened()
-    assert door.rejected_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])
+    assert check.accept(hello, protocol) == [*reads[6:], hello]
+    check.on_port_opened()
+    assert check.rejected_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])

@@ -19,7 +19,7 @@ from tests.patience import LONG_S
 
 
 @pytest.fixture(autouse=True)
-def quick_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_query_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_detection, "QUERY_INTERVAL_S", 0.05)
 
 
@@ -32,32 +32,32 @@ def bms(name: str) -> SimulatedBms:
 
 
 @pytest.mark.parametrize("name", [name for name in BMS_ANSWERS if name != "jk-pb"])
-def test_a_bms_is_named_with_its_cells(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bms_is_detected_with_its_number_of_cells(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
     with running_device(bms(name)) as path:
-        found = device_detection.probe(path, 115_200)
-    assert isinstance(found, DetectedDevice)
-    assert (found.protocol, found.baud, found.cells) == (name, 115_200, 8)
-    assert "8 cells" in str(found)
-    assert str(found).endswith(f"; protocol {name}, 115200 baud")
+        detected = device_detection.probe(path, 115_200)
+    assert isinstance(detected, DetectedDevice)
+    assert (detected.protocol, detected.baud, detected.cells) == (name, 115_200, 8)
+    assert "8 cells" in str(detected)
+    assert str(detected).endswith(f"; protocol {name}, 115200 baud")
 
 
 @pytest.mark.parametrize("name", METERS)
-def test_a_meter_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_meter_is_detected(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
     with running_device(METERS[name](steady, 1.0)) as path:
-        found = device_detection.probe(path, 115_200)
-    assert isinstance(found, DetectedDevice)
-    assert found.protocol == name
+        detected = device_detection.probe(path, 115_200)
+    assert isinstance(detected, DetectedDevice)
+    assert detected.protocol == name
 
 
-def test_it_is_found_at_its_own_baud_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)  # for a board, which is not there
+def test_bms_is_detected_without_a_given_baud_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)  # the probe waits for a board first
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
     with running_device(bms("jk")) as path:
-        found = device_detection.probe(path)
-    assert isinstance(found, DetectedDevice)
-    assert (found.protocol, found.baud) == ("jk", 115_200)
+        detected = device_detection.probe(path)
+    assert isinstance(detected, DetectedDevice)
+    assert (detected.protocol, detected.baud) == ("jk", 115_200)
 
 
 def test_newer_jk_is_not_detected_because_its_request_is_a_modbus_write(
@@ -81,15 +81,15 @@ def test_silent_device_receives_only_read_requests(monkeypatch: pytest.MonkeyPat
         os.close(slave)
         os.close(master)
     assert jk.OLD_REQUEST in sent
-    questions = [
+    read_requests = [
         jk.OLD_REQUEST,
         junctek.QUERY,
         PylontechProtocol().next_output(0.0),
         *(jbd.request(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
         *(daly.request(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
     ]
-    for question in questions:
-        sent = sent.replace(question, b"")
+    for request in read_requests:
+        sent = sent.replace(request, b"")
     assert sent == b""
 
 

@@ -1,4 +1,4 @@
-"""Each pack has one board, which is recognized by its serial number on any port. Other boards are rejected."""
+"""Pack with one board, which is recognized by its serial number on any port. Other boards are rejected."""
 
 import asyncio
 import contextlib
@@ -44,13 +44,13 @@ async def until(condition: Callable[[], object]) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Where ports are: each link in it is a USB port with a board's chip."""
-    there = tmp_path / "dev"
-    there.mkdir()
-    monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path)) for path in there.iterdir()])
+    """Return the folder of the ports. Each link in the folder is a USB port with the chip of a board."""
+    ports = tmp_path / "dev"
+    ports.mkdir()
+    monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path)) for path in ports.iterdir()])
     monkeypatch.setattr(port_list, "BY_ID", tmp_path / "by-id")
     monkeypatch.setattr(serial_source, "SEND_INTERVAL_S", 0.02)
-    return there
+    return ports
 
 
 @pytest.fixture
@@ -58,30 +58,34 @@ def memory(tmp_path: Path) -> KnownBoardFile:
     return KnownBoardFile(tmp_path, "house")
 
 
-class Taken(SerialSource):
-    """A source at work."""
+class RecordingSource(SerialSource):
+    """Serial source that stores its blocks."""
 
     blocks: list[SampleBlock]
 
     @property
     def voltage_v(self) -> float:
-        """Of the last sample."""
+        """Voltage of the last sample [V]; NaN before the first one."""
         return float(self.blocks[-1]["voltage_v"][-1]) if self.blocks else float("nan")
 
 
 @contextlib.asynccontextmanager
-async def source(port: Path | str, memory: KnownBoardFile | None = None, **settings: Any) -> AsyncIterator[Taken]:
-    taken = Taken(SensorSettings(port=str(port), **settings), memory=memory, first_retry_s=0.05, silent_s=0.3)
-    taken.blocks = []
+async def source(
+    port: Path | str, memory: KnownBoardFile | None = None, **settings: Any
+) -> AsyncIterator[RecordingSource]:
+    reader = RecordingSource(
+        SensorSettings(port=str(port), **settings), memory=memory, first_retry_s=0.05, silent_s=0.3
+    )
+    reader.blocks = []
 
-    async def keep() -> None:
-        async for block in taken:
-            taken.blocks.append(block.copy())
+    async def store_blocks() -> None:
+        async for block in reader:
+            reader.blocks.append(block.copy())
 
-    async with taken:
-        task = asyncio.create_task(keep())
+    async with reader:
+        task = asyncio.create_task(store_blocks())
         try:
-            yield taken
+            yield reader
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
@@ -89,7 +93,7 @@ async def source(port: Path | str, memory: KnownBoardFile | None = None, **setti
 
 @contextlib.asynccontextmanager
 async def board(path: Path, serial: int = 1, voltage_v: float = OURS_V, **options: Any) -> AsyncIterator[VirtualBoard]:
-    """A board that runs, plugged in at ``path``."""
+    """Run a board that is plugged in at ``path``."""
     with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial, **options) as virtual:
         path.symlink_to(virtual.path)  # noqa: ASYNC240 - at once
         task = asyncio.create_task(virtual.run())
@@ -101,103 +105,105 @@ async def board(path: Path, serial: int = 1, voltage_v: float = OURS_V, **option
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def remembered(memory: KnownBoardFile, serial: str) -> None:
+async def wait_until_stored(memory: KnownBoardFile, serial: str) -> None:
     await until(lambda: memory.load().get("serial") == serial)
 
 
-async def test_another_board_on_the_named_port_is_refused_after_a_restart(folder: Path, memory: KnownBoardFile) -> None:
+async def test_other_board_on_the_configured_port_is_rejected_after_a_restart(
+    folder: Path, memory: KnownBoardFile
+) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory), board(port):
-        await remembered(memory, "00000001")
-    async with source(port, memory) as taken, board(port, serial=2, voltage_v=OTHERS_V):
-        await until(lambda: taken.message and "refused" in taken.message)
-        said = f"{port}: refused: board 00000002 is not the pack's, 00000001: connect that one, or, to use this board instead, run"
-        assert said in (taken.message or "")
-        assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (taken.message or "")
-        await until(lambda: taken.counters["reconnects"] >= 1)
-        assert taken.blocks == []
+        await wait_until_stored(memory, "00000001")
+    async with source(port, memory) as reader, board(port, serial=2, voltage_v=OTHERS_V):
+        await until(lambda: reader.message and "refused" in reader.message)
+        message = f"{port}: refused: board 00000002 is not the pack's, 00000001: connect that one, or, to use this board instead, run"
+        assert message in (reader.message or "")
+        assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (reader.message or "")
+        await until(lambda: reader.counters["reconnects"] >= 1)
+        assert reader.blocks == []
 
 
-async def test_another_board_on_the_named_port_is_refused_within_a_run(folder: Path) -> None:
+async def test_other_board_on_the_configured_port_is_rejected_within_a_run(folder: Path) -> None:
     port = folder / "ttyUSB0"
-    async with source(port) as taken:
+    async with source(port) as reader:
         async with board(port):
-            await until(lambda: taken._board_check.serial)
-        await until(lambda: taken.message)
+            await until(lambda: reader._board_check.serial)
+        await until(lambda: reader.message)
         async with board(port, serial=2, voltage_v=OTHERS_V):
-            await until(lambda: taken.message and "refused" in taken.message)
-        seen = len(taken.blocks)
+            await until(lambda: reader.message and "refused" in reader.message)
+        blocks_before = len(reader.blocks)
         async with board(port):
-            await until(lambda: len(taken.blocks) > seen)
-    assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
+            await until(lambda: len(reader.blocks) > blocks_before)
+    assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
 async def test_first_board_is_rejected_if_another_is_configured(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
-    async with source(port, memory, serial="0000002a") as taken:
+    async with source(port, memory, serial="0000002a") as reader:
         async with board(port, voltage_v=OTHERS_V):
-            await until(lambda: taken.message and "refused" in taken.message)
-            assert "board 00000001 is not the pack's, 0000002a" in (taken.message or "")
-            assert "set sensor.serial" in (taken.message or "")
+            await until(lambda: reader.message and "refused" in reader.message)
+            assert "board 00000001 is not the pack's, 0000002a" in (reader.message or "")
+            assert "set sensor.serial" in (reader.message or "")
         async with board(port, serial=42):
-            await until(lambda: taken.blocks)
-        assert taken.voltage_v == pytest.approx(OURS_V, abs=0.1)
+            await until(lambda: reader.blocks)
+        assert reader.voltage_v == pytest.approx(OURS_V, abs=0.1)
 
 
 async def test_board_without_serial_number_is_rejected(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     with capture_logs() as logs:
-        async with source(port, memory) as taken, board(port, serial=0):
+        async with source(port, memory) as reader, board(port, serial=0):
             await until(lambda: [line for line in logs if "no serial number" in line["event"]])
-            assert taken.board["serial"] == ""
+            assert reader.board["serial"] == ""
     assert memory.load() == {}
-    async with source(port, memory, serial="00000001") as taken, board(port, serial=0):
-        await until(lambda: "board without a serial number is not the pack's" in (taken.message or ""))
+    async with source(port, memory, serial="00000001") as reader, board(port, serial=0):
+        await until(lambda: "board without a serial number is not the pack's" in (reader.message or ""))
 
 
 async def test_other_board_behind_the_open_adapter_is_rejected(folder: Path) -> None:
-    """The port stays: nothing but the hello tells."""
+    """The port remains open. Only the hello shows that the board was replaced."""
     port = folder / "ttyUSB0"
-    async with source(port) as taken, board(port) as virtual:
-        await until(lambda: taken._board_check.serial)
+    async with source(port) as reader, board(port) as virtual:
+        await until(lambda: reader._board_check.serial)
         virtual._stored[20] = 2
         virtual._converter = VirtualBoard(lambda _: Reading(0.5, 1.0), parts=BoardParts(divider=9.0))._converter
         virtual.reset()
-        await until(lambda: taken.message and "board 00000002 is not the pack's, 00000001" in taken.message)
-    assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
+        await until(lambda: reader.message and "board 00000002 is not the pack's, 00000001" in reader.message)
+    assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
 async def test_board_is_found_on_another_port(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
-    async with source(port, memory) as taken:
+    async with source(port, memory) as reader:
         async with board(port):
-            await until(lambda: taken._board_check.serial)
-        await until(lambda: taken.message)
-        seen = len(taken.blocks)
+            await until(lambda: reader._board_check.serial)
+        await until(lambda: reader.message)
+        blocks_before = len(reader.blocks)
         async with board(folder / "ttyUSB1", serial=2, voltage_v=OTHERS_V), board(folder / "ttyUSB2"):
-            await until(lambda: len(taken.blocks) > seen)
-        seen = len(taken.blocks)
-        async with board(port):  # and again where it was
-            await until(lambda: len(taken.blocks) > seen)
-    assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
+            await until(lambda: len(reader.blocks) > blocks_before)
+        blocks_before = len(reader.blocks)
+        async with board(port):  # back on the first port
+            await until(lambda: len(reader.blocks) > blocks_before)
+    assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
 async def test_swapped_boards_are_found_by_their_packs(folder: Path, tmp_path: Path) -> None:
-    one, two = folder / "ttyUSB0", folder / "ttyUSB1"
+    first_port, second_port = folder / "ttyUSB0", folder / "ttyUSB1"
     memories = [KnownBoardFile(tmp_path, name) for name in ("house", "shed")]
     async with (
-        source(one, memories[0]),
-        source(two, memories[1]),
-        board(one, serial=1),
-        board(two, serial=2, voltage_v=OTHERS_V),
+        source(first_port, memories[0]),
+        source(second_port, memories[1]),
+        board(first_port, serial=1),
+        board(second_port, serial=2, voltage_v=OTHERS_V),
     ):
-        await remembered(memories[0], "00000001")
-        await remembered(memories[1], "00000002")
+        await wait_until_stored(memories[0], "00000001")
+        await wait_until_stored(memories[1], "00000002")
     async with (
-        source(one, memories[0]) as house,
-        source(two, memories[1]) as shed,
-        board(two, serial=1),
-        board(one, serial=2, voltage_v=OTHERS_V),
+        source(first_port, memories[0]) as house,
+        source(second_port, memories[1]) as shed,
+        board(second_port, serial=1),
+        board(first_port, serial=2, voltage_v=OTHERS_V),
     ):
         await until(lambda: house.blocks and shed.blocks)
     assert np.concatenate(house.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
@@ -222,10 +228,10 @@ async def test_search_sends_nothing_to_a_silent_device(folder: Path) -> None:
     (folder / "ttyUSB0").symlink_to(os.ttyname(slave))
     os.set_blocking(master, False)
     try:
-        async with source(folder / "gone", serial="00000001") as taken:
-            await until(lambda: taken._discovery._skipped)
+        async with source(folder / "gone", serial="00000001") as reader:
+            await until(lambda: reader._discovery._skipped)
             async with board(folder / "ttyUSB1"):
-                await until(lambda: taken.blocks)
+                await until(lambda: reader.blocks)
         with pytest.raises(BlockingIOError):
             os.read(master, 1)
     finally:
@@ -236,14 +242,14 @@ async def test_search_sends_nothing_to_a_silent_device(folder: Path) -> None:
 async def test_changed_calibration_is_stored_and_logged(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory), board(port):
-        await remembered(memory, "00000001")
+        await wait_until_stored(memory, "00000001")
     with capture_logs() as logs:
-        async with source(port, memory) as taken, board(port, parts=BoardParts(divider=5.4)):
+        async with source(port, memory) as reader, board(port, parts=BoardParts(divider=5.4)):
             await until(lambda: memory.load().get("divider") == "5.4")
-            assert taken.blocks
-    said = [line for line in logs if line["event"] == "the board is calibrated differently"]
-    assert [line["divider"] for line in said] == ["6.1 to 5.4"]
-    assert "serial" not in said[0]
+            assert reader.blocks
+    message = [line for line in logs if line["event"] == "the board is calibrated differently"]
+    assert [line["divider"] for line in message] == ["6.1 to 5.4"]
+    assert "serial" not in message[0]
 
 
 async def test_running_service_uses_a_newly_accepted_board(
@@ -252,29 +258,29 @@ async def test_running_service_uses_a_newly_accepted_board(
     memory, port = KnownBoardFile(tmp_path, "house"), folder / "ttyUSB0"
     pack = tmp_path / "pack.toml"
     pack.write_text(f'[pack]\nname = "house"\n[state]\nfolder = "{tmp_path}"\n')
-    async with source(port, memory) as taken:
+    async with source(port, memory) as reader:
         async with board(port):
-            await remembered(memory, "00000001")
+            await wait_until_stored(memory, "00000001")
         async with board(port, serial=2, voltage_v=OTHERS_V):
-            await until(lambda: taken.message and "refused" in taken.message)
+            await until(lambda: reader.message and "refused" in reader.message)
             code, text, _ = run(capsys, "board", "--accept", pack)
             assert code == 0
             assert f"{memory.path}: board 00000001 removed; the service accepts the next board that connects\n" in text
-            await remembered(memory, "00000002")
-            assert taken.voltage_v == pytest.approx(OTHERS_V, abs=0.1)
+            await wait_until_stored(memory, "00000002")
+            assert reader.voltage_v == pytest.approx(OTHERS_V, abs=0.1)
 
 
 async def test_deleted_board_file_accepts_no_other_board(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
-    async with source(port, memory) as taken:
+    async with source(port, memory) as reader:
         async with board(port):
-            await remembered(memory, "00000001")
+            await wait_until_stored(memory, "00000001")
         memory.path.unlink()
         async with board(port, serial=2):
-            await until(lambda: taken.message and "refused" in taken.message)
-            refused = taken.counters["reconnects"]
-            await until(lambda: taken.counters["reconnects"] > refused)
-            assert "refused" in (taken.message or "")
+            await until(lambda: reader.message and "refused" in reader.message)
+            refused = reader.counters["reconnects"]
+            await until(lambda: reader.counters["reconnects"] > refused)
+            assert "refused" in (reader.message or "")
 
 
 async def test_other_board_after_a_restart_is_reported_in_health(
@@ -285,45 +291,45 @@ async def test_other_board_after_a_restart_is_reported_in_health(
         pack=PackSettings(name="house", cell="ncr18650", series=6), sensor=SensorSettings(port=str(port))
     )
 
-    async def served(until_told: Callable[[Snapshot], bool]) -> Snapshot:
+    async def serve_until(condition: Callable[[Snapshot], bool]) -> Snapshot:
         stop, sink = asyncio.Event(), Collector()
         cell = load_cell("ncr18650").pack(6, 1)
         running = asyncio.create_task(run_pack_service(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
         try:
-            return await sink.until(until_told)
+            return await sink.until(condition)
         finally:
             stop.set()
             await running
 
     async with board(port):
-        await served(lambda s: s.health.samples["samples"] > 0 and bool(memory.load()))
+        await serve_until(lambda s: s.health.samples["samples"] > 0 and bool(memory.load()))
     async with board(port, serial=2, voltage_v=OTHERS_V):
-        told = await served(lambda s: "refused" in (s.health.sensor_message or ""))
-    assert "board 00000002 is not the pack's, 00000001" in (told.health.sensor_message or "")
-    assert told.health.samples["samples"] <= 1  # that of the checkpoint
+        snapshot = await serve_until(lambda s: "refused" in (s.health.sensor_message or ""))
+    assert "board 00000002 is not the pack's, 00000001" in (snapshot.health.sensor_message or "")
+    assert snapshot.health.samples["samples"] <= 1  # the sample of the checkpoint
 
 
 async def test_text_board_is_accepted_regardless_of_the_stored_board(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     memory.save({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
-    async with source(port, memory, protocol="text") as taken, board(port, mode="text"):
-        await until(lambda: taken.blocks)
+    async with source(port, memory, protocol="text") as reader, board(port, mode="text"):
+        await until(lambda: reader.blocks)
 
 
 async def test_storing_the_board_is_retried_after_a_disk_error(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05, raising=False)
-    memory, said = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be stored"
+    memory, message = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be stored"
     memory.path.parent.touch()  # a file where the folder should be
     with capture_logs() as logs:
-        async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
-            await until(lambda: [line for line in logs if said in line["event"]])
-            seen = len(taken.blocks)
-            await until(lambda: len(taken.blocks) > seen + 3)
+        async with source(folder / "ttyUSB0", memory) as reader, board(folder / "ttyUSB0"):
+            await until(lambda: [line for line in logs if message in line["event"]])
+            blocks_before = len(reader.blocks)
+            await until(lambda: len(reader.blocks) > blocks_before + 3)
             memory.path.parent.unlink()
-            await remembered(memory, "00000001")
-    assert len([line for line in logs if said in line["event"]]) == 1
+            await wait_until_stored(memory, "00000001")
+    assert len([line for line in logs if message in line["event"]]) == 1
     assert stat.S_IMODE(memory.path.parent.stat().st_mode) == 0o700
 
 
@@ -331,35 +337,35 @@ async def test_deleted_state_folder_is_recreated(folder: Path, tmp_path: Path, m
     monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05)
     memory = KnownBoardFile(tmp_path / "state", "house")
     async with source(folder / "ttyUSB0", memory), board(folder / "ttyUSB0"):
-        await remembered(memory, "00000001")
+        await wait_until_stored(memory, "00000001")
         shutil.rmtree(memory.path.parent)
-        await remembered(memory, "00000001")
+        await wait_until_stored(memory, "00000001")
 
 
 async def test_reset_board_file_is_not_overwritten(
     folder: Path, memory: KnownBoardFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.0)
-    async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
-        await remembered(memory, "00000001")
+    async with source(folder / "ttyUSB0", memory) as reader, board(folder / "ttyUSB0"):
+        await wait_until_stored(memory, "00000001")
         memory.save(NO_BOARD)
-        seen = len(taken.blocks)
-        await until(lambda: len(taken.blocks) > seen + 30)
+        blocks_before = len(reader.blocks)
+        await until(lambda: len(reader.blocks) > blocks_before + 30)
         assert memory.load() == NO_BOARD
 
 
 def test_board_file_is_private_and_follows_no_link(memory: KnownBoardFile) -> None:
-    kept = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
-    stranger = memory.path.with_name("stranger")
-    stranger.write_text("theirs")
-    memory.path.with_suffix(".new").symlink_to(stranger)
-    memory.save(kept)
-    assert memory.load() == kept
+    board_fields = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
+    other_file = memory.path.with_name("other_file")
+    other_file.write_text("theirs")
+    memory.path.with_suffix(".new").symlink_to(other_file)
+    memory.save(board_fields)
+    assert memory.load() == board_fields
     assert stat.S_IMODE(memory.path.stat().st_mode) == 0o600
-    assert stranger.read_text() == "theirs"
-    linked = KnownBoardFile(memory.path.parent, "linked")
-    linked.path.symlink_to(memory.path)
-    assert linked.load() == {}
+    assert other_file.read_text() == "theirs"
+    link_file = KnownBoardFile(memory.path.parent, "link_file")
+    link_file.path.symlink_to(memory.path)
+    assert link_file.load() == {}
 
 
 def test_pipe_in_place_of_the_board_file_is_ignored(memory: KnownBoardFile) -> None:
@@ -381,7 +387,7 @@ def test_damaged_board_file_is_ignored_and_logged(memory: KnownBoardFile, text: 
     assert [line["file"] for line in logs] == [str(memory.path)]
 
 
-def test_the_settings_name_a_board_as_the_board_command_shows_it() -> None:
+def test_configured_serial_number_must_have_the_format_of_the_board_command() -> None:
     assert SensorSettings(serial="0000002a").serial == "0000002a"
     for wrong in ("42", "0000002A", 42):
         with pytest.raises(ValidationError):
@@ -390,7 +396,9 @@ def test_the_settings_name_a_board_as_the_board_command_shows_it() -> None:
         SensorSettings(serial="0000002a", protocol="text")
 
 
-def test_a_board_that_the_settings_name_is_accepted_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_accept_is_rejected_if_the_settings_contain_the_serial_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text('[sensor]\nserial = "0000002a"\n')
     code, _, err = run(capsys, "board", "--accept", pack)
@@ -398,7 +406,7 @@ def test_a_board_that_the_settings_name_is_accepted_there(tmp_path: Path, capsys
     assert "sensor.serial = 0000002a: the settings name the board; change it there" in err
 
 
-def test_a_board_is_accepted_in_the_folder_that_is_named_and_only_where_one_is_known(
+def test_accept_uses_the_given_folder_and_requires_a_stored_board(
     tmp_path: Path, memory: KnownBoardFile, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "mine"))
@@ -422,5 +430,5 @@ def test_file_written_by_root_belongs_to_the_owner_of_the_folder(tmp_path: Path)
     os.chown(theirs, 65534, 65533)
     memory = KnownBoardFile(theirs, "house")
     memory.save(NO_BOARD)
-    found = memory.path.stat()
-    assert (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == (65534, 65533, 0o600)
+    file_status = memory.path.stat()
+    assert (file_status.st_uid, file_status.st_gid, stat.S_IMODE(file_status.st_mode)) == (65534, 65533, 0o600)

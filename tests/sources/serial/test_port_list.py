@@ -1,4 +1,4 @@
-"""``port = "auto"``: choice of the board's port."""
+"""Selection of the board's port with ``port = "auto"``."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from tests.serial_line import usb_port
 
 
 @pytest.fixture
-def there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[ListPortInfo]:
-    """Ports that are there."""
-    found: list[ListPortInfo] = []
-    monkeypatch.setattr(list_ports, "comports", lambda: found)
+def ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[ListPortInfo]:
+    """Return the list of the connected ports, to which a test adds ports."""
+    ports: list[ListPortInfo] = []
+    monkeypatch.setattr(list_ports, "comports", lambda: ports)
     monkeypatch.setattr(port_list, "BY_ID", tmp_path)
-    return found
+    return ports
 
 
 @pytest.mark.parametrize(
@@ -32,8 +32,8 @@ def there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[ListPortInfo]
         (0x2A03, 0x0043, "Arduino Uno"),
     ],
 )
-def test_auto_selects_usb_chips_of_boards(there: list[ListPortInfo], vid: int, pid: int, product: str) -> None:
-    there.append(usb_port("/dev/ttyUSB7", vid, pid, product))
+def test_auto_selects_usb_chips_of_boards(ports: list[ListPortInfo], vid: int, pid: int, product: str) -> None:
+    ports.append(usb_port("/dev/ttyUSB7", vid, pid, product))
     assert resolve_port("auto") == "/dev/ttyUSB7"
 
 
@@ -51,16 +51,16 @@ def test_auto_selects_usb_chips_of_boards(there: list[ListPortInfo], vid: int, p
     ],
 )
 def test_auto_ignores_radio_sticks_and_unknown_chips(
-    there: list[ListPortInfo], vid: int, pid: int, product: str
+    ports: list[ListPortInfo], vid: int, pid: int, product: str
 ) -> None:
-    there.append(usb_port("/dev/ttyUSB0", vid, pid, product))
-    with pytest.raises(NoPortError, match="no port of a known board is connected") as refused:
+    ports.append(usb_port("/dev/ttyUSB0", vid, pid, product))
+    with pytest.raises(NoPortError, match="no port of a known board is connected") as raised:
         resolve_port("auto")
-    assert f"/dev/ttyUSB0 ({product})" in str(refused.value)
+    assert f"/dev/ttyUSB0 ({product})" in str(raised.value)
 
 
-def test_auto_selects_the_board_next_to_a_radio_stick(there: list[ListPortInfo], tmp_path: Path) -> None:
-    there += [usb_port("/dev/ttyUSB0", 0x10C4, 0xEA60, "SkyConnect v1.0"), usb_port("/dev/ttyUSB1")]
-    stable = tmp_path / "usb-1a86_USB_Serial-if00-port0"
-    stable.symlink_to("/dev/ttyUSB1")
-    assert resolve_port("auto") == str(stable)
+def test_auto_selects_the_board_next_to_a_radio_stick(ports: list[ListPortInfo], tmp_path: Path) -> None:
+    ports += [usb_port("/dev/ttyUSB0", 0x10C4, 0xEA60, "SkyConnect v1.0"), usb_port("/dev/ttyUSB1")]
+    stable_link = tmp_path / "usb-1a86_USB_Serial-if00-port0"
+    stable_link.symlink_to("/dev/ttyUSB1")
+    assert resolve_port("auto") == str(stable_link)

@@ -1,3 +1,5 @@
+"""Serial source: missing, lost and failing ports, messages, commands, and the rate of a virtual board."""
+
 import asyncio
 import contextlib
 import errno
@@ -57,8 +59,8 @@ async def drain(source: SerialSource) -> None:
 
 
 @contextlib.asynccontextmanager
-async def at_work(*tasks: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-    """All of them go on beside the test."""
+async def run_tasks(*tasks: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    """Run the coroutines during the test."""
     running = [asyncio.create_task(task) for task in tasks]
     try:
         yield
@@ -108,10 +110,10 @@ async def test_unplugged_board_is_reopened(line: Line) -> None:
 
 async def test_process_that_holds_the_port_is_found_in_a_thread(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     def holder(port: str) -> str | None:
-        looked_in.add(threading.current_thread())
-        return look(port)
+        threads.add(threading.current_thread())
+        return find_holder(port)
 
-    looked_in, look = set[threading.Thread](), port_list.holder
+    threads, find_holder = set[threading.Thread](), port_list.holder
     monkeypatch.setattr(port_list, "holder", holder)
     line.plug()
     script = (
@@ -125,8 +127,8 @@ async def test_process_that_holds_the_port_is_found_in_a_thread(line: Line, monk
         await asyncio.to_thread(other.stdout.readline)
         async with board(line) as source:
             await until(lambda: source.message and f"(pid {other.pid})" in source.message)
-            assert looked_in
-            assert threading.current_thread() not in looked_in
+            assert threads
+            assert threading.current_thread() not in threads
             other.communicate()
             await until(lambda: source.message and "no frame yet" in source.message)
     finally:
@@ -144,25 +146,25 @@ async def test_process_that_holds_the_port_is_found_in_a_thread(line: Line, monk
     ],
 )
 async def test_port_that_fails_while_opened_is_retried(line: Line, part: object, name: str, error: Exception) -> None:
-    def die(*_: object, **__: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise error
 
     line.plug()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(part, name, die)
+        patch.setattr(part, name, fail)
         async with board(line) as source:
             await until(lambda: source.message and f"{line.path}: cannot be opened" in source.message)
-            said, probed = source.message, probe(str(line.path))
+            message, probed = source.message, probe(str(line.path))
             patch.undo()
             await until(lambda: source.message and "no frame yet" in source.message)
-    assert str(error.args[-1]) in (said or "")
+    assert str(error.args[-1]) in (message or "")
     assert probed.startswith("cannot be opened")
 
 
 async def test_ports_that_vanish_while_listed_are_retried(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(port_list, "BY_ID", tmp_path / "by-id")
-        patch.setattr(Path, "is_dir", lambda _: True)  # it was there a moment ago
+        patch.setattr(Path, "is_dir", lambda _: True)  # as if the folder vanished after this check
         patch.setattr(list_ports, "comports", list)
         async with SerialSource(SensorSettings(port="auto")) as source:
             await until(lambda: source.message == "waiting for auto: no USB serial port is connected")
@@ -171,7 +173,7 @@ async def test_ports_that_vanish_while_listed_are_retried(tmp_path: Path) -> Non
 async def test_silent_board_and_wrong_baud_rate_have_different_messages(line: Line) -> None:
     line.plug()
     async with board(line) as source:
-        taking = asyncio.create_task(drain(source))
+        drain_task = asyncio.create_task(drain(source))
         await until(lambda: source.message and "silent" in source.message)
         async with asyncio.timeout(LONG_S):
             while "baud" not in (source.message or ""):
@@ -181,7 +183,7 @@ async def test_silent_board_and_wrong_baud_rate_have_different_messages(line: Li
         assert "wrong baud rate" in (source.message or "")
         line.write(b"\n3.80,0.10\n")
         await until(lambda: source.message is None)
-    await taking
+    await drain_task
 
 
 async def test_current_sign_is_applied_once(line: Line) -> None:
@@ -193,7 +195,7 @@ async def test_current_sign_is_applied_once(line: Line) -> None:
     assert samples["current_a"].tolist() == [0.25]
 
 
-async def test_the_tap_gets_what_the_decoder_is_fed(line: Line) -> None:
+async def test_tap_receives_the_bytes_of_the_decoder(line: Line) -> None:
     class Tap(list[tuple[float, bytes]]):
         def write(self, arrival_s: float, data: bytes) -> None:
             self.append((arrival_s, data))
@@ -208,7 +210,7 @@ async def test_the_tap_gets_what_the_decoder_is_fed(line: Line) -> None:
     assert {arrival_s for arrival_s, _ in tap} == {1e9}
 
 
-async def test_a_text_board_takes_no_commands(line: Line) -> None:
+async def test_command_to_a_text_board_is_rejected(line: Line) -> None:
     async with board(line) as source:
         with pytest.raises(UserError, match="takes no commands"):
             await source.current_zero()
@@ -219,7 +221,7 @@ async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> Non
     with VirtualBoard(lambda _: STEADY) as virtual:
         async with (
             SerialSource(SensorSettings(port=virtual.path)) as source,
-            at_work(virtual.run(), keep(source, blocks)),
+            run_tasks(virtual.run(), keep(source, blocks)),
         ):
             await until(lambda: count(blocks) >= 20)
             assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.5, abs=0.03)
@@ -229,11 +231,11 @@ async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> Non
             assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.0, abs=0.03)
 
 
-async def test_the_rate_is_set_again_after_a_reset_whose_hello_was_damaged() -> None:
+async def test_rate_is_set_again_after_a_reset_with_a_damaged_hello() -> None:
     blocks: list[SampleBlock] = []
     with VirtualBoard(lambda _: STEADY) as virtual:
         source = SerialSource(SensorSettings(port=virtual.path, sample_rate_hz=250))
-        async with source, at_work(virtual.run(), keep(source, blocks)):
+        async with source, run_tasks(virtual.run(), keep(source, blocks)):
             await until(lambda: source.board.get("sample_rate_hz") == "250" and count(blocks) >= 200)
             virtual.send(b"half a frame, which runs into the hello")
             virtual.reset(ResetCause.BROWN_OUT)
@@ -248,12 +250,12 @@ async def test_the_rate_is_set_again_after_a_reset_whose_hello_was_damaged() -> 
 async def test_running_board_is_requested_to_send_its_hello_and_set_its_rate(tmp_path: Path) -> None:
     path, blocks = tmp_path / "board", list[SampleBlock]()
     source = SerialSource(SensorSettings(port=str(path), sample_rate_hz=50), first_retry_s=0.05)
-    async with source, at_work(keep(source, blocks)):
+    async with source, run_tasks(keep(source, blocks)):
         for _ in range(2):
             with VirtualBoard(lambda _: STEADY) as virtual:
-                async with at_work(virtual.run()):
-                    await asyncio.sleep(0.1)  # its first hello is gone by the time at which the port is opened
+                async with run_tasks(virtual.run()):
+                    await asyncio.sleep(0.1)  # the board sends its first hello before the port is opened
                     path.symlink_to(virtual.path)
-                    said = {"serial": "00000001", "sample_rate_hz": "50"}
-                    await until(lambda said=said: source.board.items() >= said.items())
+                    message = {"serial": "00000001", "sample_rate_hz": "50"}
+                    await until(lambda message=message: source.board.items() >= message.items())
                 path.unlink()
