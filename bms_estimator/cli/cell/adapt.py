@@ -40,9 +40,9 @@ def adapt_command(
 ) -> None:
     """Estimate a1..a15 by the thesis's adaptive observer and write a cell file.
 
-    Algorithm 1 runs over the capture with the smallest mean current; its averages (3.19) are a1..a12. (4.2) over all
-    captures gives R_s. Run `ocv` first for the OCV. The file is written only if replays started in mid-load get at most
-    5 % worse.
+    Algorithm 1 of the thesis runs over the capture with the smallest mean current. The averages (3.19) of its parameters
+    are a1..a12. Equation (4.2) over all captures gives R_s. Run `ocv` first for the OCV. The file is written only if
+    replays started in mid-load get at most 5 % worse.
     """
     check_out(out, captures, force=force)
     check_once(captures)
