@@ -58,8 +58,9 @@ MAX_CELL_V = 4.5
 MAX_CELLS = 300
 """Maximum plausible number of cells in series."""
 MIN_VOLTAGE_RATIO = 0.55
+"""Minimum voltage of a valid sample as a fraction of the OCV at SOC 0.5."""
 MAX_VOLTAGE_RATIO = 1.06
-"""Limits of a valid sample as fractions of the OCV at SOC 0.5 (minimum) and at SOC 1 (maximum)."""
+"""Maximum voltage of a valid sample as a fraction of the OCV at SOC 1."""
 MIN_EMPTY_RATIO = 0.25
 """Minimum plausible ratio of the OCV at SOC 0 to that at SOC 0.5."""
 MEASURED_CAPACITY_STD = 0.03
