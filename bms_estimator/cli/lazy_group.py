@@ -28,7 +28,7 @@ class LazyGroup(TyperGroup):
         return list(self.entries)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Return a placeholder of a command, for listing."""
+        """Return a placeholder of a command for the list of commands."""
         entry = self.entries.get(cmd_name)
         return TyperCommand(cmd_name, help=entry.help) if entry else None
 

@@ -71,7 +71,8 @@ EXTRAS = {
 }
 """Extras of ``bms_estimator`` by optional package."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""Errors of a full or broken disk. Their exit code makes systemd restart a service, because space may be freed."""
+"""Error numbers of a full or broken disk. Their exit code makes systemd restart a service, because disk space may be
+freed."""
 
 
 class _Commands(LazyGroup):
@@ -108,19 +109,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _run(arguments)
     except UserError as error:
-        _exit_with_error(str(error), 1 if _is_of_a_disk(error) else 2)
+        _exit_with_error(str(error), 1 if _is_disk_fault(error) else 2)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package not in EXTRAS:
             raise
         _exit_with_error(f"this needs {package}: pip install 'bms_estimator[{EXTRAS[package]}]'")
     except BrokenPipeError:
-        _leave_stdout()
+        _redirect_stdout_to_null()
         sys.exit(1)
     except OSError as error:
-        if not _is_of_a_disk(error):
+        if not _is_disk_fault(error):
             raise
-        _leave_stdout()
+        _redirect_stdout_to_null()
         _exit_with_error(f"cannot write{f' {error.filename}' if error.filename else ''}: {error.strerror}", 1)
     except KeyboardInterrupt:  # during the import of a command; typer handles later ones
         sys.exit(130)
@@ -136,14 +137,14 @@ def _run(arguments: Sequence[str] | None) -> None:
         raise
 
 
-def _is_of_a_disk(error: BaseException | None) -> bool:
+def _is_disk_fault(error: BaseException | None) -> bool:
     """Return True if an error, or its cause, is a full or broken disk."""
     if error is None or isinstance(error, OSError):
         return error is not None and error.errno in DISK_FAULTS
-    return _is_of_a_disk(error.__cause__ or error.__context__)
+    return _is_disk_fault(error.__cause__ or error.__context__)
 
 
-def _leave_stdout() -> None:
+def _redirect_stdout_to_null() -> None:
     """Redirect stdout to the null device, because the interpreter's flush at exit would fail again."""
     if not sys.stdout:
         return

@@ -15,15 +15,17 @@ class Heartbeat(BaseModel):
 
     id: str
     started_s: float
-    """Wall clock at its start [s since 1970]."""
+    """Wall clock at the worker's start [s since 1970]."""
     leaving: bool = False
-    """True while it releases its partitions before it ends."""
+    """True while the worker releases its partitions before it ends."""
     partitions: tuple[int, ...] = ()
-    """Claimed partitions."""
+    """Numbers of the claimed partitions."""
     packs: int = 0
-    """Number of packs in those partitions."""
+    """Number of packs in the claimed partitions."""
     blocks: int = 0
+    """Number of processed blocks since the worker's start."""
     samples: int = 0
+    """Number of processed samples since the worker's start."""
     faults: int = 0
     """Blocks skipped because of an internal error since the worker's start; the log has the tracebacks."""
     lag_s: float | None = None
@@ -36,14 +38,14 @@ class Heartbeat(BaseModel):
     unknown: tuple[str, ...] = ()
     """Names of some unknown packs."""
     waiting: int = 0
-    """Messages received from the server and not processed yet."""
+    """Number of messages that were received from the server and not processed yet."""
     hours_waiting: int = 0
-    """Summaries that the server has not acknowledged yet."""
+    """Number of summaries that the server has not acknowledged yet."""
     checkpoint_age_s: float | None = None
-    """Largest age of the last checkpoints of its partitions [s]; None without one."""
+    """Largest age of the last checkpoints of the partitions [s]; None without a checkpoint."""
     cpu_s: float = 0.0
     """CPU time of the process since its start [s]."""
     rss_mib: float = 0.0
     """Memory of the process [MiB]."""
     trouble: str = ""
-    """Present error in words; empty without one."""
+    """Description of the present error; empty without an error."""

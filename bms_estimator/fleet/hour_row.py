@@ -7,6 +7,7 @@ from pydantic import ConfigDict, Field
 from bms_estimator.model.payloads import Payload
 
 HOUR_S = 3600
+"""Length of an hour [s]."""
 Correlation = Annotated[float, Field(ge=-1.001, le=1.001)]
 
 

@@ -31,7 +31,7 @@ from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.telemetry.alarms import Change
 
 STEP_S = 1.0
-"""Maximum length of a block, so that alarms are evaluated at this interval of the capture's clock [s]."""
+"""Maximum duration of a block [s]. Alarms are evaluated after each block, by the capture's clock."""
 
 
 @dataclass
@@ -53,7 +53,7 @@ class RaisedAlarm:
 
 @dataclass
 class AlarmResult:
-    """Alarms raised by a capture, not raised, and not monitored for lack of data."""
+    """Alarms of a capture: raised, not raised, and not monitored because of missing quantities."""
 
     raised: list[RaisedAlarm]
     quiet: Sequence[str]
@@ -131,7 +131,7 @@ async def _evaluate(settings: Settings, cell: PackModel, source: Replay) -> Alar
 
 
 def _pair_changes(changes: list[Change]) -> list[RaisedAlarm]:
-    """Combine the changes of alarms to raised alarms with their ends."""
+    """Combine the changes of alarms to raised alarms, each with the time of its end."""
     raised: list[RaisedAlarm] = []
     for at_s, alarm, kind in changes:
         if kind == "watched":

@@ -45,7 +45,7 @@ from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 
 MAX_GLITCHES = 0.01
-"""Fraction of dropped samples above which a systematic cause is reported."""
+"""Fraction of dropped samples above which a likely cause is reported."""
 
 
 def replay(

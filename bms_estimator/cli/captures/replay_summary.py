@@ -58,8 +58,9 @@ class Result:
     parameters: dict[str, LearnedParameter]
     """Parameters of a fuel cell by the keys of its file; empty for a battery, whose parameters depend on SOC."""
     samples_per_s: float | None
-    """Number of all samples, accepted or not, per second."""
+    """Number of processed samples per second, including dropped samples."""
     wall_s: float
+    """Duration of the replay [s]."""
 
 
 class Summary:

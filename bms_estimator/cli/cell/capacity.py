@@ -21,12 +21,12 @@ from bms_estimator.sources.captures.replay import load_capture
 SHOWN_ANCHORS = 30
 """Maximum number of printed anchors; ``--json`` prints all."""
 MAX_RATIO = 30.0
-"""Maximum ratio of declared and measured capacity; a larger one comes from wrong units."""
+"""Maximum ratio of declared and measured capacity. A larger ratio results from wrong units."""
 
 
 @dataclass(frozen=True)
 class AnchorResult:
-    """Anchor (a rest with its SOC) in the output of ``--json``."""
+    """Anchor, a rest with its SOC, in the output of ``--json``."""
 
     capture: str
     time_s: float
@@ -38,7 +38,7 @@ class AnchorResult:
     soc_std: float
     counted_ah: float
     off: float
-    """SOC by the voltage minus SOC by the charge."""
+    """SOC by the rest's voltage minus SOC by the counted charge."""
 
 
 @dataclass(frozen=True)

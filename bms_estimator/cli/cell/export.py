@@ -22,6 +22,7 @@ from bms_estimator.process.state_folder import state_folder
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Cell file from a service's learned state.")
 
 TENTHS = np.linspace(0.0, 1.0, 11)
+"""SOC at which corrections and errors of the OCV are printed."""
 
 
 @dataclass(frozen=True)
@@ -33,16 +34,16 @@ class Exported:
     capacity_ah: float
     capacity_std_ah: float
     r_s_factor: float
-    """Ratio of the learned R_s to that of the configured cell."""
+    """Learned R_s divided by R_s of the configured cell."""
     ocv_correction_mv: list[float]
     """Correction of the OCV of one object of the cell file, at SOC 0, 0.1 ... 1."""
     ocv_error_mv: list[float]
-    """Standard deviation of the corrected OCV at these SOC."""
+    """Standard deviation of the corrected OCV of one object of the cell file, at SOC 0, 0.1 ... 1."""
 
 
 @app.callback()
 def _group() -> None:
-    """Make typer keep ``export`` as a subcommand, although it is the only one."""
+    """Make ``export`` a subcommand. Without this callback, typer would omit the name of an only command."""
 
 
 @app.command()

@@ -51,10 +51,16 @@ from bms_estimator.sources.captures.replay import load_capture
 
 CELL_VOLTAGE_V = 3.7
 """Voltage of one Li-ion cell at half charge [V], from which the number of cells in series is estimated."""
-MIN_CELL_V, MAX_CELL_V, MAX_CELLS = 1.5, 4.5, 300
-"""Plausible range of the voltage of one cell at half charge [V], and maximum number of cells in series."""
-MIN_VOLTAGE_RATIO, MAX_VOLTAGE_RATIO = 0.55, 1.06
-"""Limits of a valid sample as fractions of the OCV at SOC 0.5 (minimum) and at SOC 1 (maximum)."""
+MIN_CELL_V = 1.5
+"""Minimum plausible voltage of one cell at half charge [V]."""
+MAX_CELL_V = 4.5
+"""Maximum plausible voltage of one cell at half charge [V]."""
+MAX_CELLS = 300
+"""Maximum plausible number of cells in series."""
+MIN_VOLTAGE_RATIO = 0.55
+"""Minimum voltage of a valid sample as a fraction of the OCV at SOC 0.5."""
+MAX_VOLTAGE_RATIO = 1.06
+"""Maximum voltage of a valid sample as a fraction of the OCV at SOC 1."""
 MIN_EMPTY_RATIO = 0.25
 """Minimum plausible ratio of the OCV at SOC 0 to that at SOC 0.5."""
 MEASURED_CAPACITY_STD = 0.03
@@ -69,10 +75,12 @@ TENTHS = np.linspace(0.0, 1.0, 11)
 
 
 class Form(StrEnum):
-    """Form in which the open-circuit voltage is written."""
+    """Form of the open-circuit voltage in the cell file."""
 
     CHEN_MORA = "chen-mora"
+    """Function (2.10) of the thesis, after Chen and Mora."""
     TABLE = "table"
+    """Smooth table over SOC."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +92,7 @@ class SourceResult:
     points: int
     temperature_c: float | None
     off_mv: float | None
-    """RMS difference of the whole source from the curve; None for (2.10)."""
+    """RMS difference of the whole source from the curve; None for (2.10) of the thesis."""
     hysteresis_mv: float | None
     """Mean hysteresis over SOC."""
     notes: list[str]
@@ -119,7 +127,7 @@ class OcvResult:
     """Values and standard deviations (None at a bound) of a16..a21; empty for a table."""
     sources: list[SourceResult]
     captures: dict[str, dict[str, float]]
-    """Captures with rests."""
+    """Numbers of rests and glitches and the final SOC, by capture with rests."""
     remaining_v: list[float]
     """Remaining relaxation at the end of each rest."""
     rejected: list[str]

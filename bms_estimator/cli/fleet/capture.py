@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from bms_estimator.fleet.identification.block_capture import BlockCapture
 
 FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
+"""Formats of start and end time."""
 MAX_SHOWN_GAPS = 5
-"""Maximum number of gaps shown."""
+"""Maximum number of printed gaps."""
 MAX_START_DELAY_S = 120.0
-"""Maximum delay of the first block after the requested start that is not reported [s]; a block lasts about a minute."""
+"""Delay of the first block after the requested start above which a warning is printed [s]: two blocks of a minute."""
 
 Since = Annotated[
     datetime | None, typer.Option("--from", formats=FORMATS, help="start time, UTC; default: the oldest block")

@@ -30,4 +30,4 @@ app = typer.Typer(cls=_Commands, no_args_is_help=True, add_completion=False, hel
 
 @app.callback()
 def _group() -> None:
-    """Make typer keep this group, although its commands are added lazily."""
+    """Make this app a group. Without this callback, typer would reject an app whose commands are added lazily."""

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from bms_estimator.fleet.identification.reidentify import ReidentificationResult
 
 RESULTS = "results.csv"
+"""Name of the file with the results of all packs."""
 
 
 def identify(
@@ -169,7 +170,8 @@ def _write_results(path: Path, results: Sequence["ReidentificationResult"]) -> N
 def _table(results: Sequence["ReidentificationResult"]) -> Table:
     """Return a table of the values before and after."""
     table = Table(box=box.SIMPLE_HEAD)
-    for column in ("pack", "hours", "Ah", "R_s [mohm]", "RMS [mV]", "method", "reason"):
+    # the backslash keeps rich from reading a unit as markup
+    for column in ("pack", "hours", "Ah", "R_s \\[mohm]", "RMS \\[mV]", "method", "reason"):
         table.add_column(column, justify="left" if column in ("pack", "method", "reason") else "right")
     for one in results:
         table.add_row(

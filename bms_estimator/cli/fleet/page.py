@@ -15,6 +15,7 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.page import PageSettings
 
 DEFAULT_LISTEN = "127.0.0.1:8080"
+"""Default address of the page, host:port."""
 
 
 def page(

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 SERVER = "nats://127.0.0.1:4222"
+"""Default address of the server."""
 
 Server = Annotated[
     str, typer.Option(help="fleet server, nats://host:port or tls://host:port; separate several with commas")

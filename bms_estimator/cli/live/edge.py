@@ -1,6 +1,6 @@
 """``bms-estimator edge``: sender of a pack's raw samples to a fleet's server.
 
-It imports no kernels, unless decoding the board's frames needs them.
+The command imports kernels only if decoding the board's frames needs them.
 """
 
 import asyncio

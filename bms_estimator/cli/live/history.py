@@ -21,6 +21,7 @@ from bms_estimator.store.history_reader import HistoryFile, PastEvent
 from bms_estimator.store.minute import MINUTE_S, Minute
 
 FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
+"""Formats of start and end time."""
 
 
 def history(

@@ -1,4 +1,4 @@
-"""The key q of a terminal, which quits without Enter."""
+"""Reader of the key q of a terminal, which quits the program without Enter."""
 
 import asyncio
 import contextlib
@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterator
 
 QUIT_KEY = b"q"
 READ_BYTES = 1024
+"""Maximum number of bytes read at a time."""
 
 
 @contextlib.contextmanager
 def quit_key(quit_program: Callable[[], object]) -> Iterator[None]:
-    """Read key presses within the context. Does nothing if standard input is no terminal.
+    """Read key presses within the context, if standard input is a terminal.
 
     Args:
         quit_program: Called when q is pressed.

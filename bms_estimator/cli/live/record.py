@@ -93,7 +93,7 @@ async def _end(recording: CaptureRecorder) -> None:
 
 async def _time_over(recording: CaptureRecorder, seconds: float | None) -> None:
     """Wait until ``seconds`` after the first bytes; forever if None."""
-    while seconds is None or not recording.bytes:  # noqa: ASYNC110 - the tap has no event for it
+    while seconds is None or not recording.bytes:  # noqa: ASYNC110 - the recorder has no event for its first bytes
         await asyncio.sleep(REDRAW_S)
     await asyncio.sleep(seconds)
 

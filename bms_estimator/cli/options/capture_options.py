@@ -14,6 +14,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
+"""Option that prints the result as JSON."""
 CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
 OR_FUEL_CELL_HELP = f"{CELL_HELP}; pem_30w or a fuel cell's file"
 CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
@@ -69,7 +70,7 @@ def check_once(captures: Sequence[Path]) -> None:
 
 
 def unique_names(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
-    """Return the names, each replaced by its path if it occurs twice."""
+    """Return the names. A name that occurs twice is replaced by its path."""
     return [name if names.count(name) == 1 else str(path) for name, path in zip(names, paths, strict=True)]
 
 
@@ -79,5 +80,5 @@ def name_of(path: Path) -> str:
 
 
 def write_as_named(out: Path, cell: CellModel, remarks: list[str]) -> None:
-    """Write a cell file whose cell has the file's name, after ``remarks`` as comments."""
+    """Write a cell file whose cell has the file's name. The file begins with ``remarks`` as comments."""
     write_cell(out, cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})}), remarks)

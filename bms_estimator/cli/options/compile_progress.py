@@ -1,4 +1,7 @@
-"""Line on stderr while kernels compile: a first start takes a minute or two, later ones load them from the cache."""
+"""Progress line on stderr while kernels compile.
+
+A first start takes a minute or two. Later starts load the kernels from the cache.
+"""
 
 import signal
 import sys
@@ -10,17 +13,19 @@ from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 TEXT = "compiling the kernels, once, a minute or two"
+"""Text of the progress line."""
 
 
 @contextmanager
-def show_compile_progress(say: Callable[[str], object] | None = None) -> Iterator[None]:
-    """Show a line with the elapsed time as soon as a kernel compiles; nothing if the cache has them all.
+def show_compile_progress(report: Callable[[str], object] | None = None) -> Iterator[None]:
+    """Show a line with the elapsed time as soon as a kernel compiles. No line appears if all kernels are cached.
 
     Args:
-        say: Receives the line if stderr is not a terminal; default: stderr.
+        report: Receives the line if stderr is not a terminal; default: a function that writes to stderr.
 
     Raises:
-        KeyboardInterrupt: SIGINT arrived. It waits for the next kernel, because the compiler loses an exception.
+        KeyboardInterrupt: SIGINT arrived. The error is raised only at the next kernel, because an exception inside the
+            compiler is lost.
     """
     console = Console(stderr=True)
     with ExitStack() as stack:
@@ -30,7 +35,7 @@ def show_compile_progress(say: Callable[[str], object] | None = None) -> Iterato
                 clock = Progress(TextColumn(TEXT), TimeElapsedColumn(), console=console, transient=True)
                 stack.enter_context(clock).add_task("")
             else:
-                (say or _to_stderr)(TEXT)
+                (report or _to_stderr)(TEXT)
 
         listener = _Listener(show)
         stack.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, listener.interrupt))
@@ -40,7 +45,7 @@ def show_compile_progress(say: Callable[[str], object] | None = None) -> Iterato
 
 
 class _Listener(event.Listener):
-    """Listener for functions that numba compiles; it does not report cached ones."""
+    """Listener for functions that numba compiles. Cached functions cause no event."""
 
     def __init__(self, show: Callable[[], None]) -> None:
         self._show, self._shown, self._interrupted = show, False, False
@@ -55,7 +60,7 @@ class _Listener(event.Listener):
             raise KeyboardInterrupt
 
     def on_start(self, _: event.Event) -> None:
-        """Show the line at the first kernel; an inner function follows its caller."""
+        """Show the line at the first kernel. The functions that it calls are compiled after this event."""
         self.check()
         if not self._shown:
             self._shown = True

@@ -1,4 +1,4 @@
-"""Parsers of numeric options, as strict as those of the settings; Python would parse ``3_9`` as 39."""
+"""Parsers of numeric options, as strict as those of the settings. Python itself would parse ``3_9`` as 39."""
 
 import math
 import re
@@ -14,15 +14,15 @@ Number = TypeVar("Number", int, float)
 
 def decimal(minimum: float = -math.inf, maximum: float = math.inf) -> Callable[[str | float], float]:
     """Return a parser of a decimal number within limits."""
-    return _within(parse_decimal, minimum, maximum)
+    return _limited(parse_decimal, minimum, maximum)
 
 
 def whole(minimum: float = -math.inf, maximum: float = math.inf) -> Callable[[str | int], int]:
     """Return a parser of an integer within limits."""
-    return _within(_whole, minimum, maximum)
+    return _limited(_parse_integer, minimum, maximum)
 
 
-def _whole(text: str) -> int:
+def _parse_integer(text: str) -> int:
     """Parse an integer.
 
     Raises:
@@ -33,7 +33,9 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def _within(parse: Callable[[str], Number], minimum: float, maximum: float) -> Callable[[str | Number], Number]:
+def _limited(parse: Callable[[str], Number], minimum: float, maximum: float) -> Callable[[str | Number], Number]:
+    """Return a parser that also checks the limits of the number."""
+
     def parse_and_check(text: str | Number) -> Number:
         if not isinstance(text, str):  # a default value
             return text

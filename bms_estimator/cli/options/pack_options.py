@@ -34,7 +34,7 @@ def unpacked_cell(path: Path, settings: Settings) -> CellModel:
 
 
 def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None) -> tuple[Settings, PackModel]:
-    """Load the settings of ``pack``; ``cell`` and ``capacity_ah`` [Ah] replace those of the settings.
+    """Load the settings of ``pack``. ``cell`` and ``capacity_ah`` [Ah] take precedence over the settings.
 
     Raises:
         UserError: Neither ``pack`` nor ``cell`` is given, or ``load_pack`` fails.
@@ -51,7 +51,7 @@ def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None)
 
 
 def _locate_cell(pack: Path, cell: str) -> str:
-    """Return the cell file in the folder of a pack file if it exists, otherwise ``cell``, a name or another path."""
+    """Return the path of the cell file in the folder of a pack file, if it exists; otherwise return ``cell`` unchanged."""
     beside = pack.parent / cell
     return str(beside) if beside.is_file() else cell
 

@@ -37,6 +37,7 @@ from bms_estimator.sources.serial.port_list import board_ports
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 
 ONLY_IN_SERVICE = "not checked: a systemd credential exists only while the service runs"
+"""Text of the warning about a file that only the running service can read."""
 
 BrokerSettings = TypeVar("BrokerSettings", MqttSettings, EdgeSettings)
 
@@ -101,7 +102,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         *implausible_settings(settings, cell),
         *out_of_range(settings, cell),
         *hook_warnings(settings),
-        *_lemma(cell),
+        *_failed_conditions(cell),
     ]
     if settings.mqtt is not None:
         mqtt, unchecked = _without_credentials("mqtt", settings.mqtt)
@@ -161,8 +162,8 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
     if isinstance(cell, CellModel):
         a = {i: cell.bounds(i).limit for i in range(7, 13)}
         values["pack.capacity_ah"] = cell.cell.capacity_ah
-        values["observer.delta_1"] = delta(a[8], a[9], a[7])  # (2.11)
-        values["observer.delta_2"] = delta(a[11], a[12], a[10])  # (2.12)
+        values["observer.delta_1"] = delta(a[8], a[9], a[7])  # (2.11) of the thesis
+        values["observer.delta_2"] = delta(a[11], a[12], a[10])  # (2.12) of the thesis
     for alarm in watched(settings, cell):
         values[f"alarms.{alarm.name}.limit"], values[f"alarms.{alarm.name}.clear"] = alarm.limit, alarm.clear
     return values
@@ -185,8 +186,8 @@ def _unreadable(
     return set(unreadable), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unreadable.items()]
 
 
-def _lemma(cell: PackModel) -> list[str]:
-    """Return the conditions of Lemma 4.1.1 that the bounds fail; empty for a fuel cell."""
+def _failed_conditions(cell: PackModel) -> list[str]:
+    """Return the conditions of Lemma 4.1.1 of the thesis that the cell's bounds fail; empty for a fuel cell."""
     return (
         [f"{cell.cell.name}: {_violation(c)}" for c in failed_conditions(cell)] if isinstance(cell, CellModel) else []
     )

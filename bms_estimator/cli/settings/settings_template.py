@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": "ohm", "c": "°C"}
-"""Units by the last part of a key."""
+"""Units by the last part of a key's name."""
 WIDTH = 110
 """Maximum line length of comments."""
 HEAD = """\
@@ -30,7 +30,7 @@ def settings_file(model: type[BaseModel], given: Given = MappingProxyType({})) -
 
     Args:
         model: Model of the sections.
-        given: Settings with other values than their defaults.
+        given: Settings whose values differ from their defaults.
     """
     lines = [HEAD]
     for name, field in model.model_fields.items():
@@ -50,7 +50,7 @@ def _settings(section: type[BaseModel], given: Mapping[str, object]) -> Iterator
 
 
 def _value(field: FieldInfo) -> str:
-    """Return the default as TOML, or the constraint if there is no default; empty without either."""
+    """Return the default as TOML. A required literal gives its first choice; any other required field gives no text."""
     if get_origin(field.annotation) is Literal and field.is_required():
         return f'"{get_args(field.annotation)[0]}"'
     default = None if field.is_required() else field.get_default(call_default_factory=True)
@@ -61,7 +61,7 @@ def _value(field: FieldInfo) -> str:
 
 
 def _allowed(key: str, field: FieldInfo) -> str:
-    """Return unit and constraints, such as ``[V, at least 0]``; empty without either."""
+    """Return unit and constraints, such as ``[V, at least 0]``; empty without unit and constraints."""
     choices, limits = _constraints(field.annotation)
     limits += [_limit(item) for item in field.metadata if type(item) in _SIGNS]
     unit = [UNITS[key.rsplit("_", 1)[-1]]] if "_" in key and key.rsplit("_", 1)[-1] in UNITS else []

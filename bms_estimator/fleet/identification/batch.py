@@ -57,7 +57,7 @@ def reidentify_all(tasks: Sequence[Task], processes: int) -> Iterator[Reidentifi
 
 
 def reidentify_one(task: Task) -> ReidentificationResult:
-    """Fetch one pack's samples and identify its cell; an error becomes the result's reason."""
+    """Fetch one pack's samples and identify its cell. An error is returned as the result's ``reason``."""
     try:
         capture = asyncio.run(_fetch(task))
         if not capture.blocks:

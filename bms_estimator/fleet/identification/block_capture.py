@@ -1,4 +1,4 @@
-"""Blocks of a pack from the stream, put in order and without repetitions."""
+"""Capture of a pack's blocks from the stream, in order and without repetitions."""
 
 import math
 from collections.abc import Iterator
@@ -13,7 +13,8 @@ from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.model.sample import SampleBlock
 
 AHEAD_S = 3600.0
-"""Maximum lead of an edge's clock over the server's [s]: a block may be stored this long before its samples' time."""
+"""Maximum lead of an edge's clock over the server's clock [s]. A block may be stored this long before the time of its
+samples."""
 
 MIN_YIELDED_ROWS = 65_536
 """Minimum number of samples that are yielded at a time, except for the last ones."""
@@ -23,7 +24,7 @@ MIN_YIELDED_ROWS = 65_536
 class BlockCapture:
     """Blocks of one pack, to be added in the order of the stream.
 
-    Blocks of a store that the edge has replaced by a newer one are skipped, as workers do.
+    Blocks of a store that the edge has replaced by a newer store are skipped, as by the workers.
 
     Args:
         since_s: Beginning of the time span [s since 1970].
@@ -79,8 +80,8 @@ class BlockCapture:
     def samples(self) -> Iterator[SampleBlock]:
         """Yield all samples.
 
-        ``time_s`` counts from the creation of the first store. A later store continues by the edge's wall clock, or from the last
-        sample if that clock was set back.
+        ``time_s`` counts from the creation of the first store. Samples of a later store follow by the edge's wall clock,
+        or immediately after the last sample if that clock was set back.
         """
         parts, rows = list[SampleBlock](), 0
         for part in self._parts():

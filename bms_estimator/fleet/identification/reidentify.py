@@ -1,9 +1,10 @@
 """Re-identification of a pack from its stored samples, validated on later samples.
 
-The first two thirds of the time are the training samples of two methods. The first method takes the cell that the estimator's
-filter has learned at their end. The second one starts from this cell and fits the longest piece without a gap
-(``calibration.elements.identify``). The last third is the holdout: each cell predicts the voltage from the current in open loop
-for some hours at a time, and the prediction is compared with the measured voltage.
+The first two thirds of the time are the training samples of two methods. The first method uses the cell that the
+estimator's filter has learned at their end. The second method starts from this cell and fits the piece without a gap that
+has the largest charge throughput (``calibration.elements.identify``). The last third is the holdout: each cell predicts
+the voltage from the current in open loop for some hours at a time, and the prediction is compared with the measured
+voltage.
 """
 
 import math
@@ -30,21 +31,21 @@ TRAINING_FRACTION = 2.0 / 3.0
 """Fraction of the time used for training; the rest is the holdout."""
 MIN_DURATION_S = 6 * 3600.0
 """Minimum duration of the samples [s]."""
-MIN_MOVED = 1.0
-"""Minimum charge moved out and in [capacities]."""
+MIN_THROUGHPUT = 1.0
+"""Minimum charge throughput, out and in together, as a multiple of the capacity."""
 GAP_S = 60.0
-"""Interval between two samples above which they belong to different pieces [s]."""
+"""Maximum interval between two samples of one piece [s]."""
 MIN_PIECE_S = 900.0
 """Minimum duration of a used piece [s]."""
 WINDOW_S = 3 * 3600.0
-"""Maximum duration of an open-loop prediction [s]. Each one starts at the SOC of an estimator with the same cell, so that errors of
-the counted charge do not hide those of the resistances."""
+"""Maximum duration of an open-loop prediction [s]. Each prediction starts at the SOC of an estimator with the predicting
+cell, so that errors of the counted charge do not hide errors of the resistances."""
 MAX_SOC_STD = 0.05
 """Maximum standard deviation of the SOC at which a fit starts."""
 MIN_GAIN = 0.03
-"""Minimum relative reduction of the RMS error on the holdout for which a new cell replaces the old one."""
+"""Minimum relative reduction of the RMS error on the holdout for which a new cell replaces the old cell."""
 ROWS = 65_536
-"""Number of samples estimated at a time."""
+"""Maximum number of samples that are estimated at a time."""
 
 
 @dataclass(frozen=True)
@@ -133,10 +134,10 @@ class _Pack:
                 f"{seconds / 3600.0:.1f} h of samples: at least {MIN_DURATION_S / 3600.0:g} h are needed"
             )
         pieces = [piece for piece in _pieces(samples) if np.ptp(piece["time_s"]) >= MIN_PIECE_S]
-        moved = sum(map(_moved_ah, pieces)) / cell.cell.capacity_ah
-        if moved < MIN_MOVED:
+        throughput = sum(map(_throughput_ah, pieces)) / cell.cell.capacity_ah
+        if throughput < MIN_THROUGHPUT:
             raise _NotEnoughError(
-                f"{moved:.2f} capacities were charged and discharged in {seconds / 3600.0:.1f} h: at least {MIN_MOVED:g} is needed"
+                f"{throughput:.2f} capacities were charged and discharged in {seconds / 3600.0:.1f} h: at least {MIN_THROUGHPUT:g} is needed"
             )
         split_s = samples["time_s"][0] + TRAINING_FRACTION * seconds
         self._training = list(_clipped(pieces, -math.inf, split_s))
@@ -185,11 +186,13 @@ class _Pack:
         return identified_cell(estimator, self._cell, 1), soc, std
 
     def _fit(self, cell: CellModel, soc: Floats, std: Floats) -> CellModel:
-        """Fit resistances and OCV to the longest training piece. SOC is counted from the sample with the smallest uncertainty."""
-        moved = list(map(_moved_ah, self._training))
-        longest = int(np.argmax(moved))
-        piece = self._training[longest]
-        first = sum(part.size for part in self._training[:longest])
+        """Fit resistances and OCV to the training piece with the largest charge throughput.
+
+        The SOC is counted from the sample with the smallest standard deviation of the SOC.
+        """
+        selected = int(np.argmax(list(map(_throughput_ah, self._training))))
+        piece = self._training[selected]
+        first = sum(part.size for part in self._training[:selected])
         start_sample = first + int(np.argmin(std[first : first + piece.size]))
         if not std[start_sample] <= MAX_SOC_STD:
             raise _NotEnoughError(
@@ -280,7 +283,7 @@ def _windows(pieces: list[SampleBlock]) -> Iterator[SampleBlock]:
 
 
 def _estimate(estimator: Estimator, samples: SampleBlock) -> tuple[Floats, Floats]:
-    """Return SOC and its standard deviation at each sample; NaN and infinite before the first accepted one."""
+    """Return SOC and its standard deviation at each sample: NaN and infinity before the first accepted sample."""
     soc, std = np.empty(samples.size), np.empty(samples.size)
     for first in range(0, samples.size, ROWS):
         block = samples[first : first + ROWS]
@@ -298,8 +301,8 @@ def _drawn_ah(piece: SampleBlock) -> Floats:
     return drawn_as / 3600.0
 
 
-def _moved_ah(piece: SampleBlock) -> float:
-    """Return the charge moved out and in [Ah]."""
+def _throughput_ah(piece: SampleBlock) -> float:
+    """Return the charge throughput, out and in together [Ah]."""
     return float(np.abs(np.diff(_drawn_ah(piece))).sum())
 
 

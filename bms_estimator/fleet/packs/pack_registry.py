@@ -15,6 +15,7 @@ from bms_estimator.settings.pack import Settings
 
 MAX_KINDS = 1024
 """Maximum number of cached kinds of packs."""
+
 UNKNOWN_PACK = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
 
 
@@ -38,12 +39,12 @@ class PackRegistry:
         return pack in self._rows
 
     def __call__(self, pack: str) -> tuple[Settings, PackModel] | None:
-        """Return settings and model, one object for all packs of a kind; None if the pack is unknown (``reason``)."""
+        """Return settings and model; None if the pack is unknown. All packs of a kind share these objects."""
         found = self._look_up(pack)
         return None if isinstance(found, str) else found
 
     def reason(self, pack: str) -> str:
-        """Return why a pack is unknown; empty if it is known."""
+        """Return the reason for which a pack is unknown; empty if the pack is known."""
         found = self._look_up(pack)
         return found if isinstance(found, str) else ""
 
@@ -57,7 +58,7 @@ class PackRegistry:
         return None if name in known_cells() else self._cells.get(name)
 
     def set_row(self, pack: str, data: bytes | None) -> bool:
-        """Set or remove (None) a pack's row. Return True if this is a change."""
+        """Set or remove (None) a pack's row. Return True if the row has changed."""
         if data == self._rows.get(pack):
             return False
         if data is None:
@@ -67,7 +68,7 @@ class PackRegistry:
         return True
 
     def set_cell(self, name: str, file: bytes | None) -> bool:
-        """Set or remove (None) a cell file. Return True if this is a change."""
+        """Set or remove (None) a cell file. Return True if the file has changed."""
         text = None if file is None else file.decode(errors="replace")
         if text == self._cells.get(name):
             return False
@@ -78,7 +79,7 @@ class PackRegistry:
         return True
 
     def packs_using(self, cells: Collection[str]) -> set[str]:
-        """Return the packs that use one of ``cells``; searches all packs."""
+        """Return the packs that use one of ``cells``. The method searches all packs."""
         found = set[str]()
         for pack, data in self._rows.items() if cells else ():
             kind = self._kind(data)

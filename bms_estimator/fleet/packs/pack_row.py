@@ -25,7 +25,8 @@ from bms_estimator.settings.pack import DeviceName, PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
-"""Pattern of a cell's name; longer than a pack's name, because ``fleet identify`` names cell files after packs."""
+"""Pattern of a cell's name. It may be longer than a pack's name, because ``fleet identify`` names cell files after
+packs."""
 _COUNT = Field(ge=1, le=10_000)
 
 
@@ -72,7 +73,7 @@ COLUMNS = ("pack", *PackSpec.model_fields)
 
 
 def encode_row(kind: PackSpec) -> bytes:
-    """Encode a pack's row for the server; equal values give equal bytes."""
+    """Encode a pack's row for the server. Equal rows give equal bytes."""
     return kind.model_dump_json(exclude_defaults=True).encode()
 
 
@@ -127,7 +128,7 @@ def model_key(kind: PackSpec) -> tuple[object, ...]:
 
 
 def cell_of(kind: PackSpec, cell_file: str | None) -> PackModel:
-    """Return the model of one cell-file object of a pack; arguments and errors as in ``model_of``."""
+    """Return the model of one cell-file object of a pack. Arguments and errors are those of ``model_of``."""
     name = kind.cell
     if name in known_cells():
         return load_any(name, kind.capacity_ah)

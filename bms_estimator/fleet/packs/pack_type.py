@@ -1,4 +1,7 @@
-"""Type of packs, which share one estimator, because creating an estimator takes longer than estimating a day's samples."""
+"""Type of packs, whose packs share one estimator.
+
+Creating an estimator takes longer than estimating the samples of a day.
+"""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -16,7 +19,7 @@ from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
 MAX_TYPES = 256
-"""Maximum number of cached types, 40 kB each; creating another one takes 50 ms each time."""
+"""Maximum number of cached types of 40 kB each. Creating a type that is not cached takes 50 ms."""
 Digest = tuple[int, int]
 """First 128 bits of a SHA-256 digest as two words."""
 

@@ -22,9 +22,12 @@ STEP_S = 2.0
 """Interval between two overviews of the fleet [s]."""
 QUERY_S = 600.0
 """Interval between two runs of the queries [s]."""
-FLEET, ANSWERS = "fleet", "answers"
-"""Keys of the event stream."""
+FLEET_KEY = "fleet"
+"""Key of the overview in the event stream."""
+ANSWERS_KEY = "answers"
+"""Key of the query results in the event stream."""
 STATIC = Path(__file__).with_name("static")
+"""Folder of the page's own files."""
 FILES = {
     "/": File(STATIC / "fleet.html", "text/html"),
     "/fleet.css": File(STATIC / "fleet.css", "text/css"),
@@ -83,20 +86,23 @@ async def fleet_page(
 
 
 async def _send_overviews(view: FleetView, latest: LatestValues, step_s: float) -> None:
-    """Send an overview at intervals; without a connection to the server the last one stays."""
+    """Send an overview every ``step_s``. Without a connection to the server the last overview stays on the page."""
     while True:
         if view.listening:
-            latest.set_value(FLEET, view.text(time.monotonic(), time.time()))
+            latest.set_value(FLEET_KEY, view.text(time.monotonic(), time.time()))
         await asyncio.sleep(step_s)
 
 
 async def _send_query_results(hours: Path, latest: LatestValues) -> None:
-    """Run the queries at intervals. They take seconds for a large fleet; the process ends only after the current one."""
+    """Run the queries every ``QUERY_S``.
+
+    A query of a large fleet takes seconds. The process ends only after the running query.
+    """
     from bms_estimator.fleet.page.query_results import PAGE_QUERIES, answer  # noqa: PLC0415 - only queries need duckdb
 
     while True:
         found = {name: await asyncio.to_thread(answer, hours, name) for name in PAGE_QUERIES}
-        latest.set_value(ANSWERS, json.dumps(found, allow_nan=False, separators=(",", ":")))
+        latest.set_value(ANSWERS_KEY, json.dumps(found, allow_nan=False, separators=(",", ":")))
         await asyncio.sleep(QUERY_S)
 
 

@@ -25,7 +25,7 @@ from bms_estimator.process.tasks import end
 TABLE_S = 2.0
 """Poll interval for changes of the table of packs, and retry interval [s]."""
 HOURS_S = 3900.0
-"""Age up to which hourly summaries are read at the start [s]: an hour and a delay."""
+"""Maximum age of hourly summaries that are read at the start [s]: an hour, and five minutes of delay."""
 MAX_BYTES = 1 << 16
 """Maximum size of a processed message [bytes]."""
 MAX_REASON = 200
@@ -54,8 +54,9 @@ class FleetFeed:
 
     Args:
         server: Address of the fleet's server.
-        view: Updated.
-        on_link_change: Called with the reason when there is no connection, and with None when it is (re-)established.
+        view: View to update.
+        on_link_change: Called with the reason when there is no connection, and with None when the connection is
+            (re-)established.
 
     Raises:
         UserError: The credentials or the certificate cannot be read.
@@ -107,7 +108,7 @@ class FleetFeed:
         for subject, handler in self._handlers().items():
             await self._nc.subscribe(subject, cb=handler)
         self._set_link_state(None)
-        # Not a TaskGroup, which cancels its tasks only once: the library may swallow that.
+        # No TaskGroup: it cancels its tasks only once, and the library may swallow a cancellation.
         await asyncio.gather(self._follow_table(self._nc), self._read_recent_hours(self._nc))
 
     def _handlers(self) -> dict[str, Callable[[Msg], Coroutine[Any, Any, None]]]:

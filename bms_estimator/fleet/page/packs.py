@@ -1,4 +1,4 @@
-"""Packs of a fleet as its page shows them: which are alive, their distribution, which need attention. No I/O.
+"""Packs of a fleet for its page: live packs, distributions of SOC, and packs that need attention. No I/O.
 
 The newest state of each pack is stored as bytes and decoded on request. The ranked values are stored in columns.
 """
@@ -15,13 +15,17 @@ from pydantic_core import from_json
 from bms_estimator.model.input_faults import InputFault
 
 ALIVE_S = 180.0
-"""Time without a block after which a pack counts as silent [s]; a pack sends a block a minute."""
+"""Time without a state after which a pack counts as silent [s]. A pack sends a block a minute."""
 MAX_LISTED = 20
 """Maximum number of packs in a list."""
 MAX_TYPES = 8
-"""Maximum number of types that are shown; the others are combined."""
-OTHER, UNLISTED = "other types", "not in the table"
+"""Maximum number of types that are shown. All further types are combined."""
+OTHER = "other types"
+"""Name of the combination of all further types."""
+UNLISTED = "not in the table"
+"""Name of the type of packs that are not in the table of packs."""
 SOC_EDGES = np.linspace(0.0, 1.0, 21)
+"""Histogram edges of the SOC."""
 STD_EDGES = np.array([0.0, 0.01, 0.02, 0.04, 0.06, 0.08, 0.12, 0.16, 0.20, 0.30, 0.40, 0.60, math.inf]) / 2.0
 """Histogram edges of the standard deviation of SOC. The page shows twice these values."""
 
@@ -33,19 +37,19 @@ ROW = np.dtype(
         ("margin", "f8"),  # stability_margin
         ("suspects", "u2"),  # bits of InputFault in its last hour
         ("type", "u2"),  # index into the list of types
-        ("listed", "?"),  # whether it is in the table of packs
+        ("listed", "?"),  # True if the pack is in the table of packs
     ]
 )
 _NEW = np.array([(-math.inf, math.nan, math.nan, math.nan, 0, 0, False)], dtype=ROW)
 FIELDS = {"soc": "soc", "soc_std": "soc_std", "margin": "stability_margin"}
-"""Field of a state by column of a row."""
+"""Fields of a state, by column of ``ROW``."""
 
 Rows = NDArray[np.void]
 Mask = NDArray[np.bool_]
 
 
 class Concern(NamedTuple):
-    """Why a pack needs attention."""
+    """Criterion by which a pack needs attention."""
 
     column: str
     """Column of the ranking."""
@@ -60,7 +64,7 @@ CONCERNS = {
     "soc": Concern("soc", falls=True, limit=0.1),
     "uncertain": Concern("soc_std", falls=False, limit=0.05),
 }
-"""Concerns about live packs."""
+"""Criteria of live packs, by name."""
 
 
 class FleetPacks:

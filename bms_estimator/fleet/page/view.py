@@ -12,7 +12,7 @@ from bms_estimator.fleet.page.workers import RATE_S, FleetWorkers
 from bms_estimator.model.clock import iso_utc
 
 MAX_UNKNOWN = 1000
-"""Maximum number of stored reasons of unknown packs."""
+"""Maximum number of unknown packs whose reasons are stored."""
 
 
 class FleetView:

@@ -1,4 +1,4 @@
-"""Workers of a fleet as its page shows them: which are alive, their partitions, their lag. No I/O."""
+"""Workers of a fleet for its page: live workers, their partitions and their lag. No I/O."""
 
 from collections import deque
 from typing import Any, NamedTuple
@@ -6,14 +6,16 @@ from typing import Any, NamedTuple
 from bms_estimator.fleet.heartbeat import Heartbeat
 
 ALIVE_S = 5.0
-"""Time without a heartbeat after which the page shows a worker as lost [s]: longer than the 3 s after which others take over."""
+"""Time without a heartbeat after which the page shows a worker as lost [s]. It exceeds the 3 s after which other workers
+take over."""
 LISTED_S = 300.0
 """Time for which a lost worker stays listed [s]."""
 RATE_S = 10.0
 """Averaging time of rates [s]."""
 MAX_WORKERS = 256
-UNHELD = -1
-"""Index of the worker of a partition that no worker owns."""
+"""Maximum number of workers. Heartbeats of further workers are ignored."""
+NO_WORKER = -1
+"""Index that stands for the worker of a partition that no worker owns."""
 
 
 class _Received(NamedTuple):
@@ -65,12 +67,12 @@ class FleetWorkers:
         for name in [name for name, received in self._by_worker.items() if received[-1].at_s < now_s - LISTED_S]:
             del self._by_worker[name]
         alive = self._alive(now_s)
-        holders, twice = [UNHELD] * self.partitions, set()
+        holders, twice = [NO_WORKER] * self.partitions, set()
         for index, name in enumerate(sorted(self._by_worker)):
             for partition in self._by_worker[name][-1].heartbeat.partitions if name in alive else ():
                 if partition >= self.partitions:
                     continue
-                if holders[partition] != UNHELD:
+                if holders[partition] != NO_WORKER:
                     twice.add(partition)
                 holders[partition] = index
         lags = [_lag(received) for received in alive.values()]
@@ -79,7 +81,7 @@ class FleetWorkers:
                 _worker_overview(self._by_worker[name], now_s, name in alive) for name in sorted(self._by_worker)
             ],
             "holders": holders,
-            "unheld": [n for n, index in enumerate(holders) if index == UNHELD],
+            "unheld": [n for n, index in enumerate(holders) if index == NO_WORKER],
             "twice": sorted(twice),
             "lag_s": max((lag for lag in lags if lag is not None), default=None),
         }

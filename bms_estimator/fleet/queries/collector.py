@@ -1,4 +1,7 @@
-"""Collector that writes the stream ``HOURS`` to Parquet. A row is acknowledged once its file is on disk, and redelivered until then."""
+"""Collector that writes the stream ``HOURS`` to Parquet files.
+
+A row is acknowledged as soon as its file is on disk. The server redelivers it until then.
+"""
 
 import asyncio
 import contextlib
@@ -27,9 +30,9 @@ from bms_estimator.model.errors import UserError
 DURABLE = "collector"
 """Name of the durable consumer, with which a collector continues where the previous one ended."""
 PERIOD_S = 300.0
-"""Maximum time that a row waits for its file [s]; more files of a day slow down queries."""
+"""Maximum time that a row waits for its file [s]. A shorter time gives more files a day, which slow down queries."""
 MAX_ROWS = 10_000
-"""Maximum number of rows of a file; they wait in memory, 5 kB each."""
+"""Maximum number of rows of a file. The rows wait in memory and take 5 kB each."""
 FETCH_ROWS = 1000
 """Maximum number of rows in one request."""
 FETCH_S = 0.5
@@ -119,7 +122,7 @@ class Collector:
                 self._waiting.append((message, row))
 
     async def _unreadable(self, message: Msg, error: ValidationError) -> None:
-        """Log a message that cannot be decoded, and end its delivery; it stays in the stream."""
+        """Log a message that cannot be decoded, and end its delivery. The message stays in the stream."""
         self.counters["unreadable"] += 1
         detail = error.errors()[0]
         reason = f"{'.'.join(map(str, detail['loc'])) or 'message'}: {detail['msg']}"
@@ -128,7 +131,7 @@ class Collector:
             await message.term()
 
     async def _save(self, stop: asyncio.Event) -> None:
-        """Write the waiting rows and acknowledge them; rows that cannot be written are delivered again."""
+        """Write the waiting rows and acknowledge them. The server delivers rows that cannot be written again."""
         waiting, self._waiting = self._waiting, []
         try:
             files = await asyncio.to_thread(write, self._folder, [row for _, row in waiting])
@@ -153,7 +156,7 @@ class Collector:
 
 
 def compact_days(folder: Path, now_s: float) -> None:
-    """Merge the files of each day that needs it. Disk errors are logged and retried later.
+    """Merge the files of the days of ``to_compact``. Disk errors are logged; the next call retries.
 
     Args:
         folder: Folder of the Parquet files.

@@ -1,4 +1,4 @@
-"""Queries on the hours of all packs: SQL on Parquet files by DuckDB, also while a collector writes.
+"""Queries on the hourly rows of all packs: SQL on Parquet files by DuckDB. A collector may write meanwhile.
 
 Meaning, method and limits of each query are in docs/fleet/questions.md.
 """
@@ -17,19 +17,22 @@ from typing import Any, NamedTuple
 import duckdb
 
 from bms_estimator.fleet.hour_row import HOUR_S
-from bms_estimator.fleet.queries.parquet_files import DAY, FOLDER, SCHEMA, day_folder, is_complete
+from bms_estimator.fleet.queries.parquet_files import DAY_FOLDER_PREFIX, MERGED_PREFIX, SCHEMA, day_folder, is_complete
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
 
 SQL = resources.files("bms_estimator.fleet.queries") / "sql"
-AGED_SOC, CHARGE_ERROR = 1000.0, 0.002
-"""Process noise of the filter: charge after which the capacity is forgotten [capacities], and standard deviation of the counted
-charge [sqrt(capacities)]. As in ``kernels.kalman_filter.records.Noise``."""
+AGED_SOC = 1000.0
+"""Charge after which the filter forgets the capacity [capacities], as in ``kernels.kalman_filter.records.Noise``."""
+CHARGE_ERROR = 0.002
+"""Standard deviation of the counted charge in the filter [sqrt(capacities)], as in
+``kernels.kalman_filter.records.Noise``."""
 READ_ONLY_STATEMENTS = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
+"""Kinds of statements that a user's SQL query may contain."""
 BY_CHANCE = 0.1
 """Expected number of packs of the fleet that are reported by chance, for each quantity."""
 MIN_STDS = 3.0
-"""Minimum deviation of a reported pack [standard deviations], also in a small fleet."""
+"""Minimum deviation of a reported pack, which applies in a small fleet [standard deviations]."""
 
 
 class Query(NamedTuple):
@@ -56,27 +59,27 @@ class Limits:
     within_days: float = 90.0
     """Query failing: maximum time until a limit is reached [days]."""
     capacity_limit: float = 0.8
-    """Query failing: lower limit of the capacity, as a fraction of the rated one."""
+    """Query failing: lower limit of the capacity as a fraction of the rated capacity."""
     r_s_limit: float = 2.0
-    """Query failing: upper limit of R_s, as a multiple of the cell file's."""
+    """Query failing: upper limit of R_s as a multiple of that of the cell file."""
     r_s_fresh_s: float = 86_400.0
     """Maximum time since R_s was last identified [s]; older values are not used."""
     least_days: int = 7
     """Queries soh, failing: minimum number of days in a trend."""
     least_packs: int = 5
-    """Query outliers: minimum number of packs with a certain value that define the reference of their type."""
+    """Query outliers: minimum number of packs with a valid value that define the reference of their type."""
     least_spread: float = 0.01
-    """Query outliers: minimum relative std between packs of a type."""
+    """Query outliers: lower bound of the relative standard deviation between packs of a type."""
     recent_days: int = 3
-    """Query failing: number of last days, most of which must have a new input fault."""
+    """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault."""
     silent_hours: int = 2
-    """Query silent: maximum age of the last summary [h]. The newest one of a live pack is of the previous hour."""
+    """Query silent: maximum age of the last summary [h]. The newest summary of a live pack is of the previous hour."""
     most_packs: int = 10_000
-    """Query honest: maximum number of packs, chosen by a hash of their name."""
+    """Query honest: maximum number of packs, selected by a hash of their name."""
     least_seen_s: float = 3590.0
-    """Query honest: minimum measured part of each hour in between [s]."""
+    """Query honest: minimum measured part of each hour between an estimate and its reference [s]."""
     surer: float = 0.5
-    """Query honest: a later estimate is the reference only if its variance is below this fraction."""
+    """Query honest: maximum variance of the reference, a later estimate, as a fraction of the variance of the estimate."""
 
 
 LIMITS = Limits()
@@ -172,10 +175,10 @@ def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
     """
     if not folder.is_dir():
         raise UserError(f"--folder {folder}: no such folder; `bms-estimator fleet collect --folder {folder}` fills it")
-    by_day = {day: sorted(day.glob("*.parquet")) for day in sorted(folder.glob(f"{FOLDER}*"))}
+    by_day = {day: sorted(day.glob("*.parquet")) for day in sorted(folder.glob(f"{DAY_FOLDER_PREFIX}*"))}
     by_day = {day: files for day, files in by_day.items() if files}
     if days is not None and by_day:
-        last = datetime.fromisoformat(max(by_day).name.removeprefix(FOLDER)).replace(tzinfo=UTC)
+        last = datetime.fromisoformat(max(by_day).name.removeprefix(DAY_FOLDER_PREFIX)).replace(tzinfo=UTC)
         first = day_folder(folder, datetime.fromtimestamp(last.timestamp() - (days - 1) * 24 * HOUR_S, UTC).date())
         by_day = {day: files for day, files in by_day.items() if day >= first}
     if not by_day:
@@ -187,16 +190,16 @@ def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
 
 
 def _view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
-    """Create the view ``hours``. The only, merged file of a day has no duplicate rows and needs no deduplication.
+    """Create the view ``hours``. A day with a single, merged file has no duplicate rows and needs no deduplication.
 
     Raises:
         UserError: The files have other columns.
     """
     unique, with_duplicates = list[str](), list[str]()
     for day_files in files.values():
-        is_merged = len(day_files) == 1 and day_files[0].name.startswith(DAY)
+        is_merged = len(day_files) == 1 and day_files[0].name.startswith(MERGED_PREFIX)
         (unique if is_merged else with_duplicates).extend(str(file) for file in day_files)
-    database.register("all_columns", SCHEMA.empty_table())  # files of other versions may lack some columns
+    database.register("all_columns", SCHEMA.empty_table())  # because files of other versions may lack some columns
     for name, paths in (("once", unique), ("maybe_twice", with_duplicates)):
         read = database.read_parquet(paths, union_by_name=True, hive_partitioning=False) if paths else None
         if read is not None and not {"pack", "hour"} <= set(read.columns):

@@ -1,7 +1,7 @@
-"""Hours of packs in Parquet files ``date=YYYY-MM-DD/*.parquet``, written atomically and merged by day.
+"""Hourly rows of packs in Parquet files ``date=YYYY-MM-DD/*.parquet``, written atomically and merged by day.
 
-A file is written under a name that no query reads, synced to the disk, and renamed. A row may be in two files; queries drop the
-duplicate. Needs pyarrow and duckdb.
+A file is written under a name that no query reads, synced to the disk, and renamed. A row may be in two files; queries
+drop the duplicate. The module needs pyarrow and duckdb.
 """
 
 import os
@@ -17,22 +17,28 @@ import pyarrow.parquet as pq
 
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
 
-FOLDER = "date="
-BATCH, DAY, UNFINISHED = "batch-", "day-", ".part"
-"""Prefix of a single file, prefix of a merged file, suffix of an unfinished file."""
+DAY_FOLDER_PREFIX = "date="
+"""Prefix of the name of a day's folder."""
+BATCH_PREFIX = "batch-"
+"""Prefix of the name of a file that was not merged."""
+MERGED_PREFIX = "day-"
+"""Prefix of the name of a file into which the files of a day were merged."""
+UNFINISHED_SUFFIX = ".part"
+"""Suffix of the name of an unfinished file."""
 MAX_FILES_PER_DAY = 48
-"""Number of files at which the files of a day are merged, even before its end or again."""
+"""Number of files at which the files of a day are merged, although the day has not ended or was merged before."""
 ROW_GROUP = 100_000
 """Size of a row group [rows], the smallest unit that a query reads."""
 CLOSED_S = 2 * HOUR_S
-"""Time after the end of a day at which its files are merged [s]: most late blocks have arrived by then."""
+"""Time after the end of a day at which its files are merged [s], because most late blocks have arrived by then."""
 MEMORY = "500MB"
-"""Memory limit of a merge. A day of 100,000 packs is larger; DuckDB then sorts it in parts on the disk."""
+"""Memory limit of a merge. A day of 100,000 packs is larger. DuckDB then sorts it in parts on the disk."""
 _MAGIC = b"PAR1"
+"""First and last bytes of a Parquet file."""
 
 
 def _column(annotation: object) -> pa.DataType:
-    """Return the column type. Single precision is better than the accuracy of any value, and halves the files."""
+    """Return the column type. Single precision exceeds the accuracy of any value, and halves the size of the files."""
     return pa.string() if annotation is str else pa.int32() if annotation is int else pa.float32()
 
 
@@ -56,14 +62,14 @@ def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
 
 
 def write_table(folder: Path, table: pa.Table) -> list[Path]:
-    """Write a table with the columns of ``SCHEMA``; result and errors as of ``write``."""
+    """Write a table with the columns of ``SCHEMA``. Result and errors are those of ``write``."""
     days = pc.divide(table["hour"], 24)
     return [_write_day(folder, int(day.as_py()), table.filter(pc.equal(days, day))) for day in pc.unique(days)]
 
 
 def day_folder(folder: Path, day: date) -> Path:
     """Return the folder of a day's hours."""
-    return folder / f"{FOLDER}{day.isoformat()}"
+    return folder / f"{DAY_FOLDER_PREFIX}{day.isoformat()}"
 
 
 def _write_day(folder: Path, day: int, rows: pa.Table) -> Path:
@@ -72,8 +78,8 @@ def _write_day(folder: Path, day: int, rows: pa.Table) -> Path:
     if not path_of_day.is_dir():
         path_of_day.mkdir(parents=True, exist_ok=True)
         _sync(folder)
-    path = path_of_day / f"{BATCH}{uuid.uuid4().hex}.parquet"
-    unfinished = path.with_name(f".{path.name}{UNFINISHED}")
+    path = path_of_day / f"{BATCH_PREFIX}{uuid.uuid4().hex}.parquet"
+    unfinished = path.with_name(f".{path.name}{UNFINISHED_SUFFIX}")
     pq.write_table(rows, unfinished, compression="zstd")
     _finish(unfinished, path)
     return path
@@ -95,7 +101,9 @@ def _sync(path: Path) -> None:
 
 
 def to_compact(folder: Path, now_s: float) -> list[Path]:
-    """Return the folders of days whose files should be merged: days that have ended, and days with ``MAX_FILES_PER_DAY`` files.
+    """Return the folders of days whose files should be merged.
+
+    These are the unmerged days that have ended, and the days with at least ``MAX_FILES_PER_DAY`` files.
 
     Args:
         folder: Folder of the Parquet files.
@@ -103,9 +111,11 @@ def to_compact(folder: Path, now_s: float) -> list[Path]:
     """
     ended_before = datetime.fromtimestamp(now_s - CLOSED_S, UTC).date().isoformat()
     days = []
-    for day in sorted(folder.glob(f"{FOLDER}*")):
+    for day in sorted(folder.glob(f"{DAY_FOLDER_PREFIX}*")):
         files = complete_files(day)
-        is_unmerged = day.name.removeprefix(FOLDER) < ended_before and not any(f.name.startswith(DAY) for f in files)
+        is_unmerged = day.name.removeprefix(DAY_FOLDER_PREFIX) < ended_before and not any(
+            f.name.startswith(MERGED_PREFIX) for f in files
+        )
         if len(files) >= MAX_FILES_PER_DAY or (is_unmerged and files):
             days.append(day)
     return days
@@ -123,8 +133,8 @@ def compact(day: Path) -> Path:
         OSError: The file cannot be written.
     """
     files = complete_files(day)
-    path = day / f"{DAY}{uuid.uuid4().hex}.parquet"
-    unfinished = path.with_name(f".{path.name}{UNFINISHED}")
+    path = day / f"{MERGED_PREFIX}{uuid.uuid4().hex}.parquet"
+    unfinished = path.with_name(f".{path.name}{UNFINISHED_SUFFIX}")
     names = [str(file) for file in files]
     with duckdb.connect(config={"memory_limit": MEMORY, "temp_directory": str(day / ".sorting")}) as base:
         base.read_parquet(names, union_by_name=True, hive_partitioning=False).create_view("rows")
@@ -137,8 +147,8 @@ def compact(day: Path) -> Path:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove files that a killed process left unfinished; no other process may write to ``folder`` now."""
-    for file in folder.glob(f"{FOLDER}*/.*{UNFINISHED}"):
+    """Remove unfinished files of a killed process. No other process may write to ``folder`` meanwhile."""
+    for file in folder.glob(f"{DAY_FOLDER_PREFIX}*/.*{UNFINISHED_SUFFIX}"):
         file.unlink(missing_ok=True)
 
 

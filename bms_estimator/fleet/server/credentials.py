@@ -25,8 +25,11 @@ from bms_estimator.process.private_file import UnsafeFileError, read_private, wr
 from bms_estimator.settings.fleet import TenantSettings
 
 CLAIMS = "claims.json"
-_MAX_KEY_BYTES, _MAX_CLAIMS_BYTES = 200, 64 << 20
-"""Maximum size of a key file and of ``claims.json`` [bytes]."""
+"""Name of the file with the claims."""
+_MAX_KEY_BYTES = 200
+"""Maximum size of a key file [bytes]."""
+_MAX_CLAIMS_BYTES = 64 << 20
+"""Maximum size of ``claims.json`` [bytes]."""
 GB = 1_000_000_000
 """Gigabyte [bytes]."""
 

@@ -19,9 +19,14 @@ import nkeys
 
 from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES
 
-ACCOUNT, OPERATOR, USER = nkeys.PREFIX_BYTE_ACCOUNT, nkeys.PREFIX_BYTE_OPERATOR, nkeys.PREFIX_BYTE_USER
-"""Kinds of keys."""
+ACCOUNT = nkeys.PREFIX_BYTE_ACCOUNT
+"""Kind of the key of an account."""
+OPERATOR = nkeys.PREFIX_BYTE_OPERATOR
+"""Kind of the key of the operator."""
+USER = nkeys.PREFIX_BYTE_USER
+"""Kind of the key of a user."""
 _VERSION = 2
+"""Version of the claims' format."""
 _UNLIMITED = -1
 """Value of a limit that means unlimited."""
 
@@ -90,7 +95,7 @@ _DENIED: dict[Role, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Key:
-    """A key pair.
+    """Key pair.
 
     Attributes:
         seed: Private half; not part of ``repr``.
@@ -154,7 +159,7 @@ class Tenant:
         public: Public key of the account.
         signers: Public key that signs the users of each role.
         disk_bytes: Maximum size of its streams with all replicas [bytes]; None: unlimited.
-        revoked: Time by public key of a user [s since 1970]; tokens issued before it are rejected.
+        revoked: Times by public key of a user [s since 1970]. Tokens of the user that were issued before are rejected.
     """
 
     name: str

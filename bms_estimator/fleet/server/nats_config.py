@@ -10,13 +10,20 @@ from pathlib import Path
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.connection import AUTH_TIMEOUT_S
 
-NATS_PORT, MQTT_PORT, MONITOR_PORT, CLUSTER_PORT = 4222, 1883, 8222, 6222
-"""Default ports of NATS. The monitor has no authentication and listens on the loopback only."""
-MAX_BLOCK_BYTES = 1 << 20
-"""Maximum size of a message [bytes]. A block of 60 samples has 700 bytes, one of a whole day at 1 Hz less than this limit."""
+NATS_PORT = 4222
+"""Default TCP port for workers."""
+MQTT_PORT = 1883
+"""Default TCP port for edges."""
+MONITOR_PORT = 8222
+"""Default TCP port of the monitor, which has no authentication and listens on the loopback only."""
+CLUSTER_PORT = 6222
+"""Default TCP port for the other nodes of a cluster."""
+MAX_PAYLOAD_BYTES = 1 << 20
+"""Maximum size of a message [bytes]. A block of 60 samples has 700 bytes. A block of a whole day at 1 Hz is smaller than
+this limit."""
 MAX_CONNECTIONS = 200_000
-"""Maximum number of connections of a node. If two of three nodes are down, all edges connect to the third. The server's default is
-65,536."""
+"""Maximum number of connections of a node. If two of three nodes are down, all edges connect to the third node. The
+server's default is 65,536."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,7 @@ def configuration(node: Node) -> str:
         f"server_name: {_text(node.name)}",
         f"listen: {_text(node.nats)}",
         f"http: {_text(node.monitor)}",
-        f"max_payload: {MAX_BLOCK_BYTES}",
+        f"max_payload: {MAX_PAYLOAD_BYTES}",
         f"max_connections: {MAX_CONNECTIONS}",
         *([tls] if tls else []),
         authorization,

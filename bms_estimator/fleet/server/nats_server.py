@@ -1,6 +1,6 @@
-"""A nats-server as a child process: start it, wait for it, create its streams, forward signals.
+"""Supervisor of a nats-server as a child process: start, creation of streams, reload of settings, forwarding of signals.
 
-The child ends with this process, even if this process is killed. After a failure systemd restarts both.
+The child ends with this process, even if this process is killed. After a failure, systemd restarts both.
 """
 
 import asyncio
@@ -39,7 +39,8 @@ MONITOR_TIMEOUT_S = 5.0
 RELOAD_TIMEOUT_S = 60.0
 """Timeout of a reload of the server's settings [s]."""
 FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
-"""SIGUSR2 is the server's lame duck mode: it moves its clients to other nodes gradually, then ends."""
+"""Signals that are forwarded to the server. SIGUSR2 starts its lame duck mode, in which it disconnects its clients
+gradually, so that they move to other nodes, and then ends."""
 CONFIGURATION = "nats-server.conf"
 
 
@@ -140,7 +141,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
     if node.tls:
         _check(node.tls)
     _write(place.folder / CONFIGURATION, configuration(node))
-    async with _running(binary, place.folder / CONFIGURATION) as (process, asked_to_end):
+    async with _running(binary, place.folder / CONFIGURATION) as (process, end_requested):
         ended = asyncio.create_task(process.wait())
         streams_ready = asyncio.create_task(_make_ready(place, spec, process.pid, report))
         reloading = asyncio.create_task(_reload_on_signal(place, read, process, streams_ready, report))
@@ -153,7 +154,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
             streams_ready.cancel()
             reloading.cancel()
             await asyncio.gather(streams_ready, reloading, return_exceptions=True)
-        return 0 if asked_to_end.is_set() else code
+        return 0 if end_requested.is_set() else code
 
 
 async def _reload_on_signal(
@@ -189,9 +190,9 @@ async def _reload_on_signal(
 
 @contextlib.asynccontextmanager
 async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subprocess.Process, asyncio.Event]]:
-    """Run the server as a child that ends with this process. Yield it and a flag that a signal sets."""
-    for left in file.parent.glob("*.ports"):  # of a killed server
-        left.unlink()
+    """Run the server as a child that ends with this process. Yield the child, and an event that a forwarded signal sets."""
+    for old_file in file.parent.glob("*.ports"):  # of a killed server
+        old_file.unlink()
     process = await asyncio.create_subprocess_exec(
         binary, "-c", file, "--ports_file_dir", file.parent, preexec_fn=ends_with_us()
     )
@@ -217,7 +218,8 @@ async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subp
 async def _make_ready(place: NodeLocation, spec: ServerSpec, pid: int, report: Callable[[str], None]) -> None:
     """Wait for the server, report its addresses, wait for a quorum, and create the streams of all tenants.
 
-    A response on the port could come from another server. Therefore the file that this server writes once it listens is awaited.
+    A response on the port could come from another server. Therefore the function waits for the file that this server
+    writes as soon as it listens.
     """
     node = node_of(place, spec)
     while not list(place.folder.glob(f"*_{pid}.ports")):  # noqa: ASYNC110 - the server has no other signal
@@ -235,7 +237,7 @@ async def _make_ready(place: NodeLocation, spec: ServerSpec, pid: int, report: C
 
 
 async def _make_all_streams(place: NodeLocation, spec: ServerSpec, report: Callable[[str], None]) -> None:
-    """Create the streams of all tenants, if this is the node with the keys or, without accounts, the first node."""
+    """Create the streams of all tenants. Only the node with the keys does this; without accounts, the first node."""
     node = node_of(place, spec)
     if place.number != 1 if node.accounts is None else not credentials.has_keys(place.keys):
         report("ready; streams are made by the node that has the keys, the first")
@@ -329,7 +331,11 @@ def _scheme(node: Node) -> str:
 
 
 def _listen_address(own: str) -> str:
-    """Return the listen address of a node: all interfaces, because ``own`` may resolve to any of them, or the loopback."""
+    """Return the address on which a node listens for the other nodes.
+
+    A loopback address is used unchanged. For any other address the node listens on all interfaces, because a host name
+    may resolve to any of them.
+    """
     listen = reachable(own)
     return own if listen.loopback else f"0.0.0.0:{listen.port}"
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from bms_estimator.model.errors import UserError
 
 MIN_VERSION = (2, 11)
-"""Oldest supported version, the first one with pinned consumers."""
-VERSION_S = 60.0
+"""Minimum supported version, which introduced pinned consumers."""
+VERSION_TIMEOUT_S = 60.0
 """Timeout of ``nats-server -v`` [s]."""
 
 
@@ -21,7 +21,7 @@ def find_server(extra: str = "fleet") -> Path:
         extra: Extra of this package that installs it; named in errors.
 
     Raises:
-        UserError: It is missing or too old.
+        UserError: The program is missing or too old.
     """
     install = f"pip install 'bms_estimator[{extra}]' brings one"
     beside = Path(sys.executable).with_name("nats-server")
@@ -29,7 +29,9 @@ def find_server(extra: str = "fleet") -> Path:
     if not found:
         raise UserError(f"nats-server: neither in {beside.parent} nor in PATH; {install}")
     try:
-        output = subprocess.run([found, "-v"], capture_output=True, text=True, check=True, timeout=VERSION_S).stdout  # noqa: S603 - found above
+        output = subprocess.run(  # noqa: S603 - found above
+            [found, "-v"], capture_output=True, text=True, check=True, timeout=VERSION_TIMEOUT_S
+        ).stdout
     except (OSError, subprocess.SubprocessError) as error:
         raise UserError(f"{found}: does not report its version: {error}; {install}") from None
     version = re.search(r"v(\d+)\.(\d+)", output)

@@ -31,8 +31,11 @@ QUIET_S = 3.0
 PROGRESS_S = 5.0
 """Interval between two progress lines [s]."""
 KEEPALIVE_S = 20
-MIN_WAIT_S, MAX_WAIT_S = 1, 4
-"""Minimum and maximum delay before a reconnect [s]."""
+"""MQTT keepalive interval [s]."""
+MIN_RECONNECT_DELAY_S = 1
+"""Minimum delay before a reconnect [s]."""
+MAX_RECONNECT_DELAY_S = 4
+"""Maximum delay before a reconnect [s]."""
 _REPLIES = awaits("+").replace(".", "/")
 
 
@@ -76,7 +79,7 @@ class _Connection:
         if any(broker.tls for broker in brokers(settings)):
             self._client.tls_set_context(tls_context(settings))
         self._client.max_inflight_messages_set(MAX_IN_FLIGHT)
-        self._client.reconnect_delay_set(MIN_WAIT_S, MAX_WAIT_S)
+        self._client.reconnect_delay_set(MIN_RECONNECT_DELAY_S, MAX_RECONNECT_DELAY_S)
         self._client.on_connect = self._on_connect
         self._client.on_publish = self._on_publish
         self._client.on_message = self._on_message
@@ -135,7 +138,7 @@ async def run_edges(
         connections: Number of connections for all edges.
         stop: Ends the run when set.
         report: Receives progress lines.
-        quiet_s: Time after the last block in which workers may request others [s].
+        quiet_s: Time after the last block in which workers may request missing blocks [s].
 
     Raises:
         UserError: An address, password or certificate cannot be used.
@@ -180,7 +183,9 @@ def _send(fleet: SimulatedFleet, edges: SimulatedEdges, open_connections: list[_
     """Send due blocks within the limit of messages in flight; return their size [bytes]."""
     free = min(MAX_IN_FLIGHT - connection.in_flight for connection in open_connections)
     due = edges.due(time.time(), max(0, free))
-    blocks = list(fleet.blocks(*due))  # first, because the connections' threads would slow down this one
+    blocks = list(
+        fleet.blocks(*due)
+    )  # before any publish, because the connections' threads would slow down this thread
     for pack, block in zip(due.packs.tolist(), blocks, strict=True):
         open_connections[pack % len(open_connections)].publish(topics[pack], block)
     return sum(map(len, blocks))

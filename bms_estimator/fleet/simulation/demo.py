@@ -1,6 +1,6 @@
 """Demo of a fleet: server, simulated edges, two workers and the page as processes. One worker is killed.
 
-It reports the workers' heartbeats, and compares the estimates of some packs with their true SOC.
+The demo reports the workers' heartbeats, and compares the estimates of some packs with their true SOC.
 """
 
 import asyncio
@@ -30,11 +30,13 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us
 
 LOOPBACK = "127.0.0.1"
+"""Address on which all processes listen."""
 SPEED = 10.0
-"""Simulated seconds per second: an edge sends its block of a minute every 6 s."""
+"""Simulated seconds per second: an edge sends a block of a simulated minute every 6 s."""
 SEED = 7
+"""Seed of the simulated packs."""
 OBSERVED_PACKS = 100
-"""Number of packs whose estimates are compared with the truth."""
+"""Number of packs whose estimates are compared with the true SOC."""
 PROGRESS_S = 5.0
 """Interval between two progress lines [s]."""
 KILL_AFTER = 0.4
@@ -44,8 +46,8 @@ TIMEOUT_S = 120.0
 _WORKERS = ("ada", "bob")
 _KILLED = _WORKERS[0]
 _PORTS = range(20_000, 32_768)
-"""Ports below the range that the kernel gives to outgoing connections, which could occupy one before a server
-listens."""
+"""Range of ports for the servers. It lies below the ports of outgoing connections, which could occupy a port before a
+server listens on it."""
 _port_offsets = itertools.count(random.randrange(len(_PORTS)))
 
 
@@ -80,8 +82,8 @@ class DemoObserver:
         }
 
     @property
-    def held(self) -> set[int]:
-        """Partitions of the live workers."""
+    def owned_partitions(self) -> set[int]:
+        """Partitions that live workers own."""
         return {number for heartbeat in self.alive.values() for number in heartbeat.partitions}
 
     @property
@@ -159,9 +161,8 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
             f"{demo.packs:,} edges, {SPEED:g} times as fast as real ones: each sends a block, a minute of samples, every "
             f"{BLOCK_S / SPEED:g} s"
         )
-        await processes.until(
-            lambda: observer.held >= observer.partitions, stop
-        )  # workers also claim partitions without packs
+        # a superset of the partitions with packs, because workers also claim partitions without packs
+        await processes.until(lambda: observer.owned_partitions >= observer.partitions, stop)
         await _report_progress(demo, observer, processes, stop)
         if not stop.is_set():
             await processes.stop("edges")
@@ -182,7 +183,7 @@ async def _report_progress(demo: Demo, observer: DemoObserver, processes: "Proce
             observer.dead.add(_KILLED)
             demo.report(f"{now_s:4.0f} s  {_KILLED} is killed (SIGKILL), and its states of {held} partitions are lost")
             kill_s, killed_s = math.inf, now_s
-        if killed_s < now_s and observer.held >= observer.partitions:
+        if killed_s < now_s and observer.owned_partitions >= observer.partitions:
             demo.report(
                 f"{now_s:4.0f} s  {_WORKERS[1]} has all partitions, {now_s - killed_s:.1f} s after the kill: it continues from "
                 f"{_KILLED}'s last checkpoints and reads the later blocks from the stream"

@@ -1,4 +1,4 @@
-"""Block order of many simulated edges: which blocks each one sends and resends. No I/O."""
+"""Schedule of the blocks that many simulated edges send and resend. No I/O."""
 
 from typing import NamedTuple
 
@@ -28,13 +28,13 @@ class SimulatedEdges:
     Args:
         fleet: Simulated packs.
         start_s: Wall clock at which the first block began [s since 1970].
-        speed: The packs' seconds per second.
-        last: Initial value of the attribute.
+        speed: Simulated seconds per second.
+        last: Initial value of the attribute ``last``.
 
     Attributes:
         last: Number of the last block of each edge; None without end.
         next: Number of the block that each edge sends next, shape (packs,).
-        safe: Number before which all blocks are safe, as workers reported.
+        safe: Number of each edge below which workers have confirmed all blocks, shape (packs,).
         resends: Number of requests to resend.
         sent: Number of blocks sent, with repetitions.
         again: Number of repetitions.
@@ -65,7 +65,7 @@ class SimulatedEdges:
         return Due(packs, numbers, ready_s[packs])
 
     def receive_reply(self, pack: str, reply: BlockRequest, now_s: float) -> bool:
-        """Process a worker's reply; return False if it is for another fleet's pack or store."""
+        """Process a worker's reply. Return False if the reply is for another fleet's pack or store."""
         i = self._index.get(pack)
         if i is None or reply.store != self._fleet.store[i]:
             return False

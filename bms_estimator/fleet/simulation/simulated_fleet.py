@@ -28,27 +28,47 @@ Bits = NDArray[np.uint64]
 
 BLOCK_S = 60
 """Duration of a block [s], with one sample a second."""
-MEAN_SOC, SOC_AMPLITUDE = 0.52, 0.36
-"""Mean and amplitude of SOC: it stays within 0.16 to 0.88."""
-SLOW_PART, FAST_PART, FREQUENCY_RATIO = 0.75, 0.25, 3.3
-"""Relative amplitudes of the two oscillations of SOC, and the ratio of their frequencies."""
-MIN_PERIOD_S, MAX_PERIOD_S = 8 * 3600.0, 24 * 3600.0
-"""Range of the period of the slow oscillation [s]; the current reaches 0.43 C."""
-PULSE_S, PULSE_C = 15, 0.6
-"""Duration [s] and maximum current [C-rate] of the pulse in each minute. A third of the current in the other direction follows, so
-that the mean is zero."""
+MEAN_SOC = 0.52
+"""Mean SOC."""
+SOC_AMPLITUDE = 0.36
+"""Amplitude of the SOC, which therefore stays within 0.16 to 0.88."""
+SLOW_FRACTION = 0.75
+"""Amplitude of the slow oscillation of SOC as a fraction of ``SOC_AMPLITUDE``."""
+FAST_FRACTION = 0.25
+"""Amplitude of the fast oscillation of SOC as a fraction of ``SOC_AMPLITUDE``."""
+FREQUENCY_RATIO = 3.3
+"""Frequency of the fast oscillation divided by that of the slow oscillation."""
+MIN_PERIOD_S = 8 * 3600.0
+"""Minimum period of the slow oscillation [s], at which the current reaches 0.43 C."""
+MAX_PERIOD_S = 24 * 3600.0
+"""Maximum period of the slow oscillation [s]."""
+PULSE_S = 15
+"""Duration of the current pulse in each minute [s]. In the remaining 45 s a third of the current flows in the opposite
+direction, so that the mean is zero."""
+PULSE_C = 0.6
+"""Maximum current of a pulse as a C-rate [1/h]."""
 PAST_PULSES = 5
-"""Number of past pulses in the branch current; after these, e^(-300/20) of a pulse remains."""
-TAU_TS_S, TAU_TL_S = 20.0, 800.0
-"""Time constants of the branches [s]."""
+"""Number of past pulses in the branch current. Of an older pulse less than e^(-300/20) remains."""
+TAU_TS_S = 20.0
+"""Time constant of the fast RC branch [s]."""
+TAU_TL_S = 800.0
+"""Time constant of the slow RC branch [s]."""
 JITTER_S = 0.02
 """Maximum error of a real device's timestamps [s]."""
-MIN_CAPACITY, MAX_CAPACITY, WORN_OUT_CAPACITY = 0.75, 1.02, 0.6
-"""Range of true divided by rated capacity, and its value for a worn-out pack."""
-MAX_RESISTANCE, FAILING_RESISTANCE = 1.6, 3.0
-"""Maximum of true divided by the cell file's resistance, whose range begins at 0.8, and its value for a failing pack."""
+MIN_CAPACITY = 0.75
+"""Minimum true capacity as a fraction of the rated capacity."""
+MAX_CAPACITY = 1.02
+"""Maximum true capacity as a fraction of the rated capacity."""
+WORN_OUT_CAPACITY = 0.6
+"""True capacity of a worn-out pack as a fraction of the rated capacity."""
+MIN_RESISTANCE = 0.8
+"""Minimum true resistance as a multiple of that of the cell file."""
+MAX_RESISTANCE = 1.6
+"""Maximum true resistance as a multiple of that of the cell file."""
+FAILING_RESISTANCE = 3.0
+"""True resistance of a failing pack as a multiple of that of the cell file."""
 OUTLIER_FRACTION = 0.01
-"""Fraction of packs that are worn out, and fraction that are failing."""
+"""Fraction of packs that are worn out. An equal fraction is failing."""
 
 
 class Kind(NamedTuple):
@@ -69,7 +89,7 @@ KINDS = (
     Kind("nca", 3.0, 20, 10, 0.02, 0.1, thermometer=False),
     Kind("ncr18650", None, 10, 4, 0.01, 0.02, thermometer=True),
 )
-"""Home storage, bicycle, scooter, and a pack of the shipped cell: a quarter of the fleet each."""
+"""Kinds of packs: home storage, bicycle, scooter, and a pack of the shipped cell. Each kind is a quarter of the fleet."""
 
 COLUMNS = (
     "pack",
@@ -85,7 +105,7 @@ COLUMNS = (
 
 
 class _Curves:
-    """A kind's cells as functions of SOC on one grid: OCV [V] and elements [ohm] of the whole pack."""
+    """Curves of one kind of pack over SOC: OCV [V] and resistances [ohm] of the whole pack."""
 
     def __init__(self, kind: Kind) -> None:
         pack: CellModel = load_cell(kind.cell, kind.capacity_ah).pack(kind.series, kind.parallel)
@@ -111,7 +131,7 @@ class SimulatedFleet:
     Args:
         packs: Number of packs.
         seed: Seed of all random values.
-        begin_ns: Creation time of the first edge's store [ns since 1970]; the others follow within a minute.
+        begin_ns: Creation time of the first edge's store [ns since 1970]; those of the other edges follow within a minute.
         prefix: Prefix of the packs' names.
 
     Attributes:
@@ -137,7 +157,7 @@ class SimulatedFleet:
     def _draw_truth(self, pack: Whole) -> Truth:
         defect = self._uniform(pack, 5)
         capacity = MIN_CAPACITY + (MAX_CAPACITY - MIN_CAPACITY) * self._uniform(pack, 6)
-        resistance = 0.8 + (MAX_RESISTANCE - 0.8) * self._uniform(pack, 7)
+        resistance = MIN_RESISTANCE + (MAX_RESISTANCE - MIN_RESISTANCE) * self._uniform(pack, 7)
         capacity[defect < OUTLIER_FRACTION] = WORN_OUT_CAPACITY
         resistance[(defect >= OUTLIER_FRACTION) & (defect < 2 * OUTLIER_FRACTION)] = FAILING_RESISTANCE
         rated_as = np.array([curves.capacity_as for curves in self._curves])
@@ -157,7 +177,10 @@ class SimulatedFleet:
         """
         samples = self.samples(packs, numbers)
         for i, (pack, number) in enumerate(zip(packs.tolist(), numbers.tolist(), strict=True)):
-            yield encode(Block(int(self.store[pack]), number, 1, float(arrival_s[i]), samples[i]))
+            block = Block(
+                store=int(self.store[pack]), number=number, oldest=1, arrival_s=float(arrival_s[i]), samples=samples[i]
+            )
+            yield encode(block)
 
     def samples(self, packs: Whole, numbers: Whole) -> SampleBlock:
         """Return the samples of one block of each pack: shape (n, BLOCK_S), dtype ``SAMPLE``."""
@@ -199,7 +222,9 @@ class SimulatedFleet:
 
     def _slow_soc(self, packs: Whole, time_s: Floats) -> Floats:
         angle = self._omega[packs] * time_s + self._phase[packs]
-        return MEAN_SOC + SOC_AMPLITUDE * (SLOW_PART * np.sin(angle) + FAST_PART * np.sin(FREQUENCY_RATIO * angle))
+        return MEAN_SOC + SOC_AMPLITUDE * (
+            SLOW_FRACTION * np.sin(angle) + FAST_FRACTION * np.sin(FREQUENCY_RATIO * angle)
+        )
 
     def _slow_a(self, packs: Whole, time_s: Floats) -> Floats:
         """Return the current [A] that produces ``_slow_soc``, positive on discharge."""
@@ -207,7 +232,7 @@ class SimulatedFleet:
         slope = (
             SOC_AMPLITUDE
             * omega
-            * (SLOW_PART * np.cos(angle) + FREQUENCY_RATIO * FAST_PART * np.cos(FREQUENCY_RATIO * angle))
+            * (SLOW_FRACTION * np.cos(angle) + FREQUENCY_RATIO * FAST_FRACTION * np.cos(FREQUENCY_RATIO * angle))
         )
         return -slope * self.truth.capacity_as[packs]
 
@@ -229,7 +254,7 @@ class SimulatedFleet:
         ocv_v, r_s, r_ts, r_tl = (
             np.interp(soc, curves.soc, values) for values in (curves.ocv_v, curves.r_s, curves.r_ts, curves.r_tl)
         )
-        drop_v = r_s * current_a + r_ts * branch_a + r_tl * delayed_a  # (2.4)
+        drop_v = r_s * current_a + r_ts * branch_a + r_tl * delayed_a  # (2.4) of the thesis
         return current_a, ocv_v - self.truth.resistance[column] * drop_v
 
     def _uniform(self, packs: Whole, stream: int, index: Whole | int = 0) -> Floats:

@@ -1,7 +1,7 @@
 """Order of a pack's blocks, and replies to its edge. Both depend only on the received blocks.
 
-An edge stores each block until a reply confirms that all earlier blocks are safe. On request it resends from the expected
-block on. Therefore late, repeated and early blocks can be dropped.
+An edge stores each block until a reply confirms that all earlier blocks are safe. On request it resends the awaited block
+and all later blocks. Therefore late, repeated and early blocks can be dropped.
 """
 
 from enum import Enum
@@ -18,10 +18,10 @@ REQUEST_EVERY = 5
 """Number of early blocks between two replies that request a missing block."""
 
 MAX_EARLY_REPEATS = 20
-"""Missing blocks count as lost after the first block behind them has arrived this many times.
+"""Number of arrivals of the first block after missing blocks at which the missing blocks count as lost.
 
-The edge resends from the missing block on, at least 30 s apart. If only later blocks arrive, then the server rejects the
-missing ones, or they are damaged on the edge's disk."""
+The edge resends the missing blocks and all later blocks at intervals of at least 30 s. If only later blocks arrive, the
+server rejects the missing blocks, or they are damaged on the edge's disk."""
 
 
 class BlockOrder(Enum):
@@ -37,10 +37,10 @@ class BlockOrder(Enum):
 
 
 def classify_block(d: np.void, block: Block) -> BlockOrder:
-    """Classify a block by its header.
+    """Classify a block by its header, and update the pack's delivery record.
 
     Args:
-        d: The pack's record of dtype ``DELIVERY``. It is updated, but ``mark_taken`` advances it past a ``NEXT`` block.
+        d: The pack's record of dtype ``DELIVERY``. The caller advances it past a ``NEXT`` block by ``mark_taken``.
         block: The received block.
     """
     store, number = int(d["store"]), int(d["awaited"])
@@ -62,13 +62,17 @@ def classify_block(d: np.void, block: Block) -> BlockOrder:
 
 
 def mark_taken(d: np.void) -> None:
-    """Expect the block after the present one; ``d`` as in ``classify_block``."""
+    """Record that the awaited block was processed, and await the next block.
+
+    Args:
+        d: The pack's record of dtype ``DELIVERY``.
+    """
     _expect(d, int(d["awaited"]) + 1)
     d["blocks"] += 1
 
 
 def _skip_lost_blocks(d: np.void, number: int) -> int:
-    """Count the missing blocks before ``number`` as lost, expect ``number`` and return it."""
+    """Count the missing blocks before ``number`` as lost, await block ``number``, and return ``number``."""
     d["lost_blocks"] = min(int(d["lost_blocks"]) + number - int(d["awaited"]), MAX_LOST_BLOCKS)
     return _expect(d, number)
 
@@ -81,7 +85,7 @@ def _count_first_early_block(d: np.void, number: int) -> None:
 
 
 def _expect(d: np.void, number: int) -> int:
-    """Expect block ``number``, reset the counts of early blocks, and return ``number``."""
+    """Await block ``number``, reset the counts of early blocks, and return ``number``."""
     d["awaited"], d["ahead"], d["first_ahead"], d["passed"] = number, 0, 0, 0
     return number
 

@@ -28,10 +28,11 @@ from bms_estimator.telemetry.state import make_state_payload
 MAX_WALL_S = 2.0**34
 """Latest plausible wall clock [s since 1970]: the year 2514."""
 MAX_PART_SAMPLES = 4096
-"""Maximum number of samples estimated at a time. It limits the buffer of estimates, 200 bytes each, which every type of pack
-in every partition has."""
+"""Maximum number of samples that are estimated at a time. It limits the buffer of estimates of 200 bytes each, which
+exists for each type of pack in each partition."""
+
 Publications = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
-"""Payloads of the topics ``state`` and ``parameters``, and the rows of finished hours, each with its message id."""
+"""Payloads of the topics ``state`` and ``parameters``, and message ids and rows of finished hours."""
 
 
 class BlockProcessor:
@@ -77,16 +78,18 @@ class BlockProcessor:
         self._window = Window()
 
     def _restore_or_reset(self, pack_type: PackType, former: Fields | None, block: Block) -> None:
-        """Adapt the pack's state to its present settings and this version; reset it if they are incompatible."""
+        """Adapt the pack's state to its present settings and this version. Reset an incompatible state."""
         d, record = self._delivery, self._record[0]
-        same = _digest(d["made_of"]) == pack_type.config_digest
-        if same and former is None:
+        is_same_config = _digest(d["made_of"]) == pack_type.config_digest
+        if is_same_config and former is None:
             return
         has_state = bool(self._hour["store"])
         if _digest(d["meaning"]) == pack_type.state_digest and has_state:
             saved = former if former is not None else {name: v.copy() for name, v in fields(self._record["estimator"])}
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
-            error = restore_state(pack_type.estimator, saved if same else without_observer(saved), self._gap_s(block))
+            error = restore_state(
+                pack_type.estimator, saved if is_same_config else without_observer(saved), self._gap_s(block)
+            )
             self._flows["sums"]["counted"] = self._hour["outliers_before"] = self._hour["searches_before"] = 0
             self._counters["not_taken_over" if error else "taken_over"] += 1
         else:
@@ -97,7 +100,10 @@ class BlockProcessor:
         d["made_of"], d["meaning"] = pack_type.config_digest, pack_type.state_digest
 
     def _resume_after_store_change(self, estimator: Estimator, block: Block) -> None:
-        """Resume the estimator after a gap if the block is of another store, because timestamps count from the store's creation."""
+        """Resume the estimator after a gap if the block is of another store.
+
+        Timestamps count from the creation of the store, so that the estimator cannot compute the gap.
+        """
         if int(self._delivery["clock"]) == block.store:
             return
         self._flows["sums"]["counted"] = 0
@@ -133,7 +139,7 @@ class BlockProcessor:
         return _json(make_state_payload(window, remaining, counters, now_s, flow, pack_type.capacity_ah))
 
     def _parameters(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
-        """Return the payload of topic ``parameters``; its ages refer to the arrival of the samples, not to their processing."""
+        """Return the payload of topic ``parameters``. Its ages refer to the arrival time of the samples."""
         return _json(make_parameters_payload(estimator, arrival_s).model_copy(update={"publish_time": iso_utc(now_s)}))
 
     def _check_times(self, samples: SampleBlock) -> None:
@@ -149,8 +155,8 @@ class BlockProcessor:
         d, times_s = self._delivery, _finite_times_s(block.samples)
         if not d["clock"] or not times_s.size:
             return math.inf
-        passed_s = (block.store - int(d["clock"])) / 1e9 + (float(times_s[0]) - float(d["last_s"]))
-        return passed_s if passed_s >= 0.0 else math.inf
+        gap_s = (block.store - int(d["clock"])) / 1e9 + (float(times_s[0]) - float(d["last_s"]))
+        return gap_s if gap_s >= 0.0 else math.inf
 
     def _roll_over_hour(
         self, pack: str, block: Block, pack_type: PackType
@@ -158,7 +164,7 @@ class BlockProcessor:
         """Finish the current hour if the block is of a later one, and begin the new hour.
 
         Returns:
-            The row of the finished hour, none for the first hour of a pack; True if a new hour has begun.
+            Message id and row of the finished hour, empty for the first hour of a pack; and True if a new hour has begun.
         """
         hour, current = hour_summary.hour_of(block), int(self._delivery["hour"])
         if hour <= current:
@@ -183,7 +189,10 @@ class BlockProcessor:
             self._delivery["clock"], self._delivery["last_s"] = block.store, times_s[-1]
 
     def _arrival_s(self, block: Block) -> float:
-        """Return when the last sample arrived at the edge; if that is implausible, the time of the last sample [s since 1970]."""
+        """Return the arrival time of the last sample at the edge [s since 1970].
+
+        An implausible arrival time is replaced by the timestamp of the last sample.
+        """
         if 0.0 <= block.arrival_s <= MAX_WALL_S:
             return block.arrival_s
         self._counters["no_arrival"] += 1

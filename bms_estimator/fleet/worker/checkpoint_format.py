@@ -30,10 +30,15 @@ from bms_estimator.fleet.worker.pack_state import PACK_STATE
 from bms_estimator.kernels.packed_record import symmetry_map
 
 FORMAT = 1
+"""Version of the format."""
 CHUNK_BYTES = 1 << 20
 """Size at which a chunk of entries is finished [bytes]."""
 _HEAD, _CHUNK, _ENTRY = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
-_MAGIC, _FORMER_BLOCK, _MAX_LAYOUTS = b"BMSFLEET", 255, 255
+_MAGIC = b"BMSFLEET"
+_FORMER_BLOCK = 255
+"""Layout number of a block of an unknown pack, which an earlier version stored."""
+_MAX_LAYOUTS = 255
+"""Maximum number of layouts, whose indexes are below ``_FORMER_BLOCK``."""
 _MAX_RECORD_BYTES = 1 << 24
 """Maximum size of a record that a layout from a checkpoint may describe [bytes]."""
 
@@ -84,6 +89,7 @@ def _dtype_fields(layout: Any) -> list[Any]:
 
 
 CURRENT_LAYOUT = layout_of(PACK_STATE)
+"""Layout of a pack's record in this version."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""Checkpoints of partitions on the server: the bytes in an object store, and a pointer to them in a key-value bucket.
+"""Checkpoints of partitions on the server: content in an object store, and a pointer to it in a key-value bucket.
 
-A pointer is replaced by compare-and-set on its revision. A worker that takes over a partition first writes its own name into
-the pointer, so that the next checkpoint of a slow or suspended former owner fails. An object is written before the pointer that
-names it. A pointer also names the next object, so that the next owner finds and removes the object of a worker that was killed
-between the two writes.
+A pointer is replaced by compare-and-set on its revision. A worker that takes over a partition first writes its own name
+into the pointer. Therefore the next checkpoint of a slow or suspended former owner fails. An object is written before the
+pointer that names it. A pointer also names the next object, so that the next owner finds and removes the object of a
+worker that was killed between the two writes.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.model.clock import iso_utc
 
 CHECKPOINTS_PER_PARTITION = 2
-"""Number of stored checkpoints of a partition: the last one, and the one before in case the last one is damaged."""
+"""Number of stored checkpoints of a partition: the last checkpoint, and the previous one in case the last is damaged."""
 MESSAGE_BYTES = 128 << 10
 """Size of one message of an object [bytes]."""
 _STREAM = f"OBJ_{subjects.STATES_BUCKET}"
@@ -53,7 +53,7 @@ class CheckpointInfo(BaseModel):
     bytes: int
     """Size [bytes]."""
     made_s: float
-    """Wall clock at which it was written [s since 1970]."""
+    """Wall clock at which the checkpoint was written [s since 1970]."""
 
 
 class Pointer(BaseModel):
@@ -64,7 +64,7 @@ class Pointer(BaseModel):
     worker: str
     """Name of the owning worker."""
     next: str
-    """Name of the object that this worker writes next; it may exist in part."""
+    """Name of the object that this worker writes next. The object may already exist in part."""
     kept: tuple[CheckpointInfo, ...] = ()
     """Stored checkpoints, newest first."""
 

@@ -4,13 +4,14 @@ import time
 from collections.abc import Callable
 
 MAX_CPU_FRACTION = 0.1
-"""Fraction of a core that a pack may use continuously: a source at 1,000 Hz needs 0.005."""
+"""Fraction of a core that a pack may use continuously. A source at 1,000 Hz needs 0.005."""
 BURST_S = 0.2
-"""Processor time that a pack may use in a burst after a pause [s]: 500 minute blocks at 1 Hz."""
+"""Processor time that a pack may use in a burst after a pause [s], enough for 500 minute blocks at 1 Hz."""
 MAX_CHARGE_S = 0.1
-"""Maximum charge for one block [s]: the cost of 20,000 samples. The first block may take longer, because it compiles kernels."""
+"""Maximum processor time that is charged for one block [s], the cost of 20,000 samples. The first block may take longer,
+because it compiles kernels."""
 MAX_PACKS = 10_000
-"""Number of stored bucket levels above which those of idle packs are removed."""
+"""Number of stored bucket levels above which those of idle packs are removed. The pack that is charged stays."""
 
 
 class CpuBudget:

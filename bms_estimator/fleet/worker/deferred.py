@@ -1,19 +1,19 @@
-"""Deferred messages. They stay in the stream and are read from there when their pack is served."""
+"""Queue of packs with deferred messages. The messages stay in the stream until their pack is served."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 MAX_UNKNOWN = 8192
-"""Maximum number of packs of a partition with deferred messages: a server without tenants accepts any name."""
+"""Maximum number of packs of a partition with deferred messages, because a server without tenants accepts any name."""
 
 
 class Span(NamedTuple):
     """Range of the deferred messages of one pack."""
 
     first: int
-    """Stream sequence number of the first one."""
+    """Stream sequence number of the first deferred message."""
     last: int
-    """Stream sequence number of the last one."""
+    """Stream sequence number of the last deferred message."""
 
 
 class Deferred:
@@ -49,7 +49,7 @@ class Deferred:
         self._spans[pack] = Span(before.first if before else sequence, sequence)
 
     def next(self, is_due: Callable[[str], bool]) -> tuple[str, Span] | None:
-        """Return the next pack and its span; the pack moves to the end of the queue. None: no pack is due."""
+        """Return the next due pack and its span, and move it to the end of the queue. Return None if no pack is due."""
         pack = next(filter(is_due, self._spans), None)
         if pack is None:
             return None

@@ -6,15 +6,16 @@ from bms_estimator.edge.batching import MAX_SAMPLES as EDGE_MAX_SAMPLES
 from bms_estimator.model.sample import SampleBlock
 
 MAX_RATE_HZ = 1000.0
-"""Maximum sample rate of a source."""
+"""Maximum sample rate of a source [Hz]."""
 MAX_SAMPLES = 20_000
 """Maximum number of samples in a block: the limit of earlier edge versions. Present edges use ``EDGE_MAX_SAMPLES``."""
 MAX_TIMESTAMP_S = 2.0**33
-"""Latest plausible timestamp [s since the store was created]. A machine whose clock is not set creates its store in 1970."""
+"""Latest plausible timestamp [s since the creation of the store]. The limit allows for a store that was created in 1970
+by a machine whose clock was not set."""
 
 
 def density_fault(samples: SampleBlock) -> str:
-    """Return why a block has too many samples, in total or for its duration; empty if the number is plausible.
+    """Return the reason for which a block has too many samples; empty if the number is plausible.
 
     ``EDGE_MAX_SAMPLES`` are allowed beyond the rate, because an edge's clock may stand still while a source's is
     corrected.

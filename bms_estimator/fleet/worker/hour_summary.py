@@ -32,14 +32,14 @@ Sums = NDArray[np.void]
 def hour_of(block: Block) -> int:
     """Return the hour of a block by the edge's clock at its last sample [hours since 1970].
 
-    A block without a finite last time stamp belongs to the hour of its store.
+    A block whose last timestamp is not finite belongs to the hour in which its store was created.
     """
     last_s = float(block.samples["time_s"][-1])
     return int((block.store / 1e9 + (last_s if math.isfinite(last_s) else 0.0)) // HOUR_S)
 
 
 def begin(sums: Sums, record: np.void) -> None:
-    """Begin an hour: reset its counts and keep the last sample.
+    """Begin an hour: reset the sums and counts, but not the last sample.
 
     Args:
         sums: Updated in position.

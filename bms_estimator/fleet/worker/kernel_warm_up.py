@@ -1,4 +1,7 @@
-"""Kernel warm-up of a worker. Kernels are compiled before it connects, so that no response to the server is late."""
+"""Kernel warm-up of a worker.
+
+A worker compiles its kernels before it connects, so that no response to the server is late.
+"""
 
 import numpy as np
 
@@ -10,7 +13,9 @@ from bms_estimator.service.kernel_warm_up import CELL, load_kernels
 from bms_estimator.settings.pack import Settings
 
 PACK = "a pack"
+"""Name of the pack whose blocks are processed for the warm-up."""
 HOUR_NS = 3600 * 10**9
+"""Length of an hour [ns]."""
 
 
 def load_fleet_kernels() -> None:
@@ -19,6 +24,8 @@ def load_fleet_kernels() -> None:
     samples = np.zeros(3, dtype=SAMPLE)
     samples["time_s"], samples["voltage_v"] = np.arange(3.0), cell.cell.nominal_voltage_v
     partition = Partition(0, lambda _: (settings, cell))
-    for sequence, store in enumerate((HOUR_NS, 3 * HOUR_NS), 1):  # the second finishes an hour, on another clock
-        partition.take(PACK, encode(Block(store, 1, 1, store / 1e9, samples)), sequence)
+    # the second block finishes an hour, and is of another store
+    for sequence, store in enumerate((HOUR_NS, 3 * HOUR_NS), 1):
+        block = Block(store=store, number=1, oldest=1, arrival_s=store / 1e9, samples=samples)
+        partition.take(PACK, encode(block), sequence)
     load_kernels()

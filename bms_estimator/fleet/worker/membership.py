@@ -33,7 +33,7 @@ def _weight(partition: int, worker: str) -> tuple[bytes, str]:
 
 
 class Membership:
-    """Set of the workers that are alive; times are of one monotonic clock [s].
+    """Set of the live workers. All times are of one monotonic clock [s].
 
     Args:
         me: Name of this worker, which is always a member.
@@ -46,7 +46,7 @@ class Membership:
         self._share: set[int] = set()
 
     def on_heartbeat(self, worker: str, now_s: float, *, leaving: bool = False) -> bool:
-        """Process a heartbeat; return True if the worker is a new one."""
+        """Process a heartbeat. Return True if it is the first heartbeat of another worker."""
         if leaving:
             self._last_heartbeat_s.pop(worker, None)
             return False

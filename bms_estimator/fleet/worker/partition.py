@@ -1,7 +1,7 @@
-"""A partition: states of its packs, estimated block by block by the kernel that all commands use.
+"""Partition: states of its packs, which the kernel of all commands estimates block by block.
 
-The states depend only on the order of the stream and on the table of packs: from any checkpoint on, equal blocks lead to
-bit-identical states. There is no I/O here; the clock is used only for publish times.
+The states depend only on the order of the stream and on the table of packs. From any checkpoint on, equal blocks lead to
+bit-identical states. The module performs no I/O, and uses the clock only for publish times.
 """
 
 import time
@@ -42,10 +42,11 @@ class BlockResult(NamedTuple):
 
     Attributes:
         pack: Name of the pack.
-        reply: Reply to the edge; None: none is due.
-        state: Payload of topic ``state``.
-        parameters: Payload of topic ``parameters``.
-        hours: Rows of finished hours, each with a message id that is equal for all workers, so that the server drops repeats.
+        reply: Reply to the edge; None if no reply is due.
+        state: Payload of topic ``state``; None without one.
+        parameters: Payload of topic ``parameters``; None without one.
+        hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
+            drops repeated rows.
         failed: Number of blocks that were skipped because of an internal error.
     """
 
@@ -58,7 +59,7 @@ class BlockResult(NamedTuple):
 
 
 class Partition:
-    """The packs of one partition.
+    """Packs of one partition with their states.
 
     Args:
         number: Number of the partition.
@@ -162,7 +163,7 @@ class Partition:
         return BlockResult(pack)
 
     def take_deferred(self, pack: str, data: bytes, sequence: int) -> BlockResult:
-        """Process the next deferred message of a known pack; arguments as in ``take``."""
+        """Process the next deferred message of a known pack. The arguments are those of ``take``."""
         pack_type = self._look_up(pack)
         if pack_type is None or pack not in self.deferred:
             return BlockResult(pack)
@@ -171,7 +172,7 @@ class Partition:
         return self._take(pack, block, pack_type) if block else BlockResult(pack)
 
     def is_known(self, pack: str) -> bool:
-        """Return whether the table has the pack."""
+        """Return True if the table contains the pack."""
         return self._table(pack) is not None
 
     def reject_misplaced(self, pack: str, sequence: int) -> BlockResult:
@@ -183,7 +184,7 @@ class Partition:
         return BlockResult(pack)
 
     def settings_changed(self, pack: str) -> None:
-        """Have the settings of a pack read from the table again with its next block."""
+        """Drop the cached settings of a pack, so that its next block reads them from the table."""
         self._type_by_pack.pop(pack, None)
 
     def _decode(self, data: bytes) -> Block | None:
@@ -232,7 +233,7 @@ class Partition:
             self._former_deliveries.pop(pack, None)
         else:
             self._counters[order.value] += 1
-            if former is not None:  # the record is migrated only by the next block, but its counts must not be lost
+            if former is not None:  # only a processed block migrates the record, but the block counts must not be lost
                 self._former_deliveries[pack] = d.copy()
         # A record of another layout stays unchanged until a block is processed.
         if order is BlockOrder.NEXT or former is None:
@@ -263,7 +264,11 @@ class Partition:
         return None
 
     def _load(self, pack: str) -> Fields | None:
-        """Load a pack into the work record. Return the estimator fields if its record has another layout, else None."""
+        """Load a pack into the work record.
+
+        Returns:
+            The estimator fields by name if the pack's record has another layout; otherwise None.
+        """
         packed, former = self._packs.get(pack), self._former.get(pack)
         try:
             if packed is not None:

@@ -1,8 +1,8 @@
-"""Lease of one partition by a worker: take over, process message by message, save, release.
+"""Lease of one partition by a worker: take-over, processing of messages, checkpoints, release.
 
-The state depends only on the order of the stream, therefore the sequence number of its last message defines it. Messages that
-were delivered to another worker, or lost in transit, are read from the stream. The stream is also read after some time without
-a delivery, because the server does not redeliver messages that it delivered to a worker that has died.
+The state depends only on the order of the stream. Therefore the sequence number of the last message defines the state.
+Messages that were delivered to another worker, or lost in transit, are read from the stream. The stream is also read after
+some time without a delivery, because the server does not redeliver messages that it delivered to a worker that has died.
 """
 
 import asyncio
@@ -34,8 +34,8 @@ from bms_estimator.process.tasks import until_first_ends
 RETRY_S = 0.5
 """Retry interval of server requests [s]."""
 SILENCE_S = 3.0
-"""Time without a delivery after which the stream is searched for further messages [s]: a worker that releases a partition has
-finished by then."""
+"""Time without a delivery after which the stream is searched for further messages [s]. A worker that releases a partition
+has finished by then."""
 IDLE_SILENCE_S = 5.0 * SILENCE_S
 """Interval of further searches while the stream has no further message [s]."""
 MAX_PENDING_HOURS = 128
@@ -47,7 +47,7 @@ log = structlog.get_logger(__name__)
 
 
 class PartitionLease:
-    """Partition that this worker claims, and owns while no other worker has claimed it.
+    """Partition that this worker has claimed. The worker owns the partition until another worker claims it.
 
     Args:
         nc: Connection of the tenant.
@@ -119,7 +119,7 @@ class PartitionLease:
         self._wake_up.set()
 
     def check_silence(self) -> None:
-        """Have the stream searched after silence, and deferred packs checked; to be called about once a second."""
+        """Request a search of the stream after silence, and a check of deferred packs. Call it about once a second."""
         if time.monotonic() >= self._search_s:
             self._silent = True
             self._wake_up.set()
@@ -162,7 +162,7 @@ class PartitionLease:
                 return
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
             try:
-                # The next owner does not compute the summaries of saved samples again, therefore they are sent first.
+                # The summaries are sent first, because the next owner does not compute those of saved samples again.
                 await self.send_hours()
                 self.claim = await self._checkpoints.write(claim, snapshot.sequence, snapshot.chunks())
             except FencedError as error:

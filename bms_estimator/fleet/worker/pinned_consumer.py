@@ -1,7 +1,8 @@
-"""Consumer of one partition: a durable consumer that the server pins to one worker at a time (ADR-42).
+"""Consumer of one partition: a durable consumer that the server pins to one worker at a time.
 
-Measured with nats-server 2.15.1: a pin lasts ``streams.PIN_S`` from the last *request* that names it, with or without deliveries.
-Therefore a request is sent each ``RENEW_S``; because it expires later than that, two or three requests are pending. A request
+The protocol is ADR-42 of https://github.com/nats-io/nats-architecture-and-design. Measured with nats-server 2.15.1: a pin
+lasts ``streams.PIN_S`` from the last *request* that names it, with or without deliveries. Therefore a request is sent each
+``RENEW_S``. A request expires later than the next one is sent, so that two or three requests are pending. A request
 without a pin waits while another pin lasts. A request with an expired pin gets status 423.
 """
 
@@ -21,12 +22,16 @@ RENEW_S = PIN_S / 4.0
 EXPIRES_S = 2.5 * RENEW_S
 """Expiry of a request [s]."""
 BATCH = 32
-"""Number of messages in a request, and limit of waiting messages above which only one is requested."""
-PIN_HEADER, STATUS_HEADER = "Nats-Pin-Id", "Status"
+"""Number of messages in a request. If this many messages wait, a request is for one message only."""
+PIN_HEADER = "Nats-Pin-Id"
+"""Header with the identifier of the pin under which a message is delivered."""
+STATUS_HEADER = "Status"
+"""Header of a response without a message."""
 WRONG_PIN = "423"
 """Status of a request with an expired pin."""
 EXPECTED_STATUSES = frozenset({"404", "408", "409"})
-"""Statuses of a request that ended without messages, by its expiry or by a new leader of the consumer. The next request follows."""
+"""Statuses of a request that ended without messages, by its expiry or by a change of the consumer's leader. They need no
+action, because the next request follows."""
 
 
 class DeliveredMessage(NamedTuple):
@@ -87,7 +92,10 @@ class PinnedConsumer:
         return any(group.get("pinned_client_id") for group in response.get("priority_groups") or ())
 
     async def renew(self) -> None:
-        """Send a request; to be called each ``RENEW_S``. If many messages wait, only one is requested, to keep the pin."""
+        """Send a request, which renews the pin. If ``BATCH`` messages wait, only one message is requested.
+
+        The caller calls this method each ``RENEW_S``.
+        """
         await self._request(BATCH if len(self.waiting) < BATCH else 1)
 
     async def take(self) -> DeliveredMessage | None:
@@ -146,7 +154,7 @@ def parse_sequences(reply: str) -> tuple[int, int]:
     """Return a message's sequence numbers in its stream and in its consumer; the latter has no gaps.
 
     Args:
-        reply: Acknowledgment subject (ADR-15): 9 tokens, or 11 and more with the server's domain.
+        reply: Acknowledgment subject (ADR-15 of NATS): 9 tokens, or at least 11 with the server's domain.
     """
     tokens = reply.split(".")
     first = 5 if len(tokens) == 9 else 7

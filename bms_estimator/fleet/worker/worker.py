@@ -1,4 +1,4 @@
-"""Worker: processes its share of the partitions on one connection."""
+"""Worker process, which processes its share of the partitions on one connection."""
 
 import asyncio
 import resource
@@ -29,13 +29,14 @@ from bms_estimator.process.tasks import end, until_first_ends
 CHECKPOINT_S = 300.0
 """Default interval between two checkpoints of a partition [s]."""
 DISCOVERY_S = 0.5
-"""Time for discovering other workers before partitions are claimed [s]: they answer a new worker's heartbeat at once."""
+"""Time for discovering other workers before partitions are claimed [s]. They respond to a new worker's heartbeat at
+once."""
 CHECK_S = 0.5
 """Interval between two checks for a due checkpoint or waiting summaries [s]."""
 MAX_UNKNOWN = 20
 """Maximum number of unknown packs that a heartbeat names."""
 MAX_RELEASES = 8
-"""Maximum number of partitions that are saved and released at the same time."""
+"""Maximum number of partitions that are saved and released concurrently."""
 
 log = structlog.get_logger(__name__)
 
@@ -355,7 +356,7 @@ class Worker:
 
 
 async def _repeat(period_s: float, action: Callable[[], Awaitable[None]]) -> None:
-    """Call ``action`` periodically until cancelled; missed calls are not made up for."""
+    """Call ``action`` periodically until cancelled. Missed calls are not repeated."""
     while True:
         await action()
         await asyncio.sleep(period_s)

@@ -14,7 +14,7 @@ from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.queries.collector import Collector, only_collector
 from bms_estimator.fleet.queries.parquet_files import (
     MAX_FILES_PER_DAY,
-    UNFINISHED,
+    UNFINISHED_SUFFIX,
     compact,
     complete_files,
     to_compact,
@@ -139,7 +139,7 @@ def test_files_of_a_day_are_merged_after_its_end_or_if_many(tmp_path):
     late_s = (MIDNIGHT + 27) * 3600.0
     assert to_compact(tmp_path, late_s - 7200.0) == []
     (day,) = to_compact(tmp_path, late_s)
-    (day / f".x.parquet{UNFINISHED}").touch()
+    (day / f".x.parquet{UNFINISHED_SUFFIX}").touch()
     (day / "half.parquet").write_bytes(b"PAR1 and no more")
     compact(day)
     assert [row[:2] for row in rows_of(tmp_path)] == [("a", MIDNIGHT + n) for n in range(3)] + [("b", MIDNIGHT)]

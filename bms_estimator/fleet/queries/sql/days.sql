@@ -1,4 +1,5 @@
--- A day of a pack in one row: what was known at its end, what was measured in it. std as variances of logarithms.
+-- One row per day and pack: estimates at the end of the day, and measurements of the day. Relative standard deviations
+-- become variances of logarithms.
 CREATE TEMP TABLE days AS
 SELECT
     pack,
@@ -12,7 +13,8 @@ SELECT
     arg_max((capacity_ratio_std / capacity_ratio) ^ 2, hour)::DOUBLE AS capacity_variance,
     arg_max(capacity_first_std ^ 2, hour)::DOUBLE AS capacity_first_variance,
     sum((charge_out_ah + charge_in_ah) / capacity_ah) AS through,
-    -- R_s where data have told of it; hours of a day are not independent: their mean is no surer than the surest
+    -- Weighted mean of R_s over the hours with a recently identified R_s. The hours of a day are not independent, so the
+    -- variance of the mean is that of the most precise hour.
     sum(ln(r_s_ratio) / (r_s_ratio_std / r_s_ratio) ^ 2) FILTER (r_s_unlearned_s < $r_s_fresh_s)
         / sum(1 / (r_s_ratio_std / r_s_ratio) ^ 2) FILTER (r_s_unlearned_s < $r_s_fresh_s) AS ln_r_s,
     min((r_s_ratio_std / r_s_ratio) ^ 2) FILTER (r_s_unlearned_s < $r_s_fresh_s)::DOUBLE AS r_s_variance,

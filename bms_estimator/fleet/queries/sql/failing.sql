@@ -1,16 +1,16 @@
--- Needs: packs, days, fits.
+-- Packs that will soon t_quantile a limit, or have recent input faults. Needs: packs, days, fits.
 WITH limits(quantity, limit_value, shown, sense) AS (
     VALUES ('capacity', ln($capacity_limit), 'capacity_ratio', -1), ('r_s', ln($r_s_limit), 'r_s_ratio', 1),
         ('margin', 0.0, 'stability_margin_min', -1)
 ),
--- x: years from the middle of the points, where level and slope err independently. The line's band touches the limit
--- where a x^2 + 2 b x + c = 0 (Fieller).
+-- x: years from the weighted mean time of the points, at which the errors of level and slope are independent. The
+-- confidence band of the line reaches the limit at the roots of a x^2 + 2 b x + c = 0 (Fieller's theorem).
 bands AS (
     SELECT
         f.*, shown, sense, limit_value,
-        slope ^ 2 - (reach * slope_std) ^ 2 AS a,
+        slope ^ 2 - (t_quantile * slope_std) ^ 2 AS a,
         (mean - limit_value) * slope AS b,
-        (mean - limit_value) ^ 2 - (reach * mean_std) ^ 2 AS c
+        (mean - limit_value) ^ 2 - (t_quantile * mean_std) ^ 2 AS c
     FROM fits f JOIN limits USING (quantity)
 ),
 ends AS (
@@ -29,12 +29,13 @@ trends AS (
         CASE WHEN sense * (today - limit_value) >= 0 THEN 0 ELSE 365.25 * (limit_value - today) / slope END AS days_left,
         CASE WHEN a > 0 THEN 365.25 * (x_low + middle) END AS earliest,
         CASE WHEN a > 0 THEN 365.25 * (x_high + middle) END AS latest,
-        -- how sure it is that it moves there, or is there
+        -- significance of the trend towards the limit, or of the present value beyond the limit
         greatest(sense * slope / slope_std, sense * (today - limit_value) / today_std) AS stds
     FROM ends
     WHERE sense * slope > 0 OR sense * (today - limit_value) >= 0
 ),
--- What the filter has suspected of its input at the end of most of the last days, and before that of hardly any
+-- Input faults that the filter reports at the end of most of the recent days, and reported on less than 10 % of the days
+-- before
 suspected AS (
     SELECT
         pack, 'suspect: ' || name AS quantity,

@@ -1,16 +1,17 @@
--- A straight line over days through each pack's ln(capacity), ln(R_s) and margin, by weighted least squares; years from today.
--- Needs: days.
+-- Straight line through the daily values of each pack's ln(capacity), ln(R_s) and margin, by weighted least squares.
+-- Times are in years from today. Needs: days.
 CREATE TEMP TABLE fits AS
 WITH decayed AS (
-    SELECT *, exp(-through / $aged_soc) ^ 2 AS kept FROM days
+    SELECT *, exp(-through / $aged_soc) ^ 2 AS remaining FROM days
 ),
--- What a day alone told of the capacity. The filter's estimates of two days are nearly the same estimate: information
--- at the end of the day, less what was left of that at its begin, is independent from day to day.
+-- Information on the capacity from each single day. The filter's estimates of consecutive days are strongly correlated.
+-- The information at the end of a day, minus the remainder of the information at its beginning, is independent of that of
+-- other days.
 began AS (
     SELECT
         pack, day, ln_capacity, capacity_variance,
-        coalesce(lag(ln_capacity) OVER w * sqrt(kept), 0) AS ln_begin,
-        coalesce(lag(capacity_variance) OVER w * kept + (1 - kept) * capacity_first_variance, capacity_first_variance)
+        coalesce(lag(ln_capacity) OVER w * sqrt(remaining), 0) AS ln_begin,
+        coalesce(lag(capacity_variance) OVER w * remaining + (1 - remaining) * capacity_first_variance, capacity_first_variance)
             AS variance_begin
     FROM decayed
     WHERE capacity_variance > 0 AND capacity_first_variance > 0
@@ -24,7 +25,7 @@ points AS (
         (ln_capacity / capacity_variance - ln_begin / variance_begin)
             / (1 / capacity_variance - 1 / variance_begin) AS value
     FROM began
-    WHERE capacity_variance < 0.9999 * variance_begin  -- what is less is rounding
+    WHERE capacity_variance < 0.9999 * variance_begin  -- a smaller difference is a rounding error
     UNION ALL
     SELECT pack, day, 'r_s', 1 / r_s_variance, ln_r_s FROM days WHERE r_s_variance > 0
     UNION ALL
@@ -55,18 +56,19 @@ lines AS (
     SELECT
         *,
         tv / tt AS slope,
-        greatest(vv - tv ^ 2 / tt, 1e-12 * s) AS rest,
-        greatest(dvdv - 2 * (tv / tt) * dvdt + (tv / tt) ^ 2 * dtdt, 0) AS rest_of_steps
+        greatest(vv - tv ^ 2 / tt, 1e-12 * s) AS residual,
+        greatest(dvdv - 2 * (tv / tt) * dvdt + (tv / tt) ^ 2 * dtdt, 0) AS residual_of_steps
     FROM sums
 ),
--- By how much the points lie further from the line than their weights say, and how alike those of days in a row are
--- (Durbin and Watson; Cochrane and Orcutt): of capacities, whose errors are known, only the first, if it is more.
+-- Ratio of the observed to the expected variance of the points about the line, and autocorrelation of consecutive points
+-- (Durbin and Watson; Cochrane and Orcutt). The errors of capacities are known and independent: for them, only a ratio
+-- above 1 widens the band.
 widened AS (
     SELECT
         *,
-        least(greatest(1 - rest_of_steps / rest / 2 + 2 / n, 0), 0.9) AS alike,
-        CASE quantity WHEN 'capacity' THEN greatest(rest / (n - 2), 1)
-            ELSE rest / (n - 2) * (1 + alike) / (1 - alike) END AS factor
+        least(greatest(1 - residual_of_steps / residual / 2 + 2 / n, 0), 0.9) AS autocorrelation,
+        CASE quantity WHEN 'capacity' THEN greatest(residual / (n - 2), 1)
+            ELSE residual / (n - 2) * (1 + autocorrelation) / (1 - autocorrelation) END AS factor
     FROM lines
 )
 SELECT
@@ -75,6 +77,7 @@ SELECT
     sqrt(factor / tt) AS slope_std,
     mean - slope * middle AS today,
     sqrt(factor / s + factor / tt * middle ^ 2) AS today_std,
-    -- of Student's t, n - 2 degrees of freedom: what 1.96 is of a normal distribution (Cornish and Fisher)
-    1.96 + 2.37 / (n - 2) + 2.82 / (n - 2) ^ 2 AS reach
+    -- 97.5 % quantile of Student's t with n - 2 degrees of freedom (Cornish-Fisher expansion); 1.96 is that of the normal
+    -- distribution
+    1.96 + 2.37 / (n - 2) + 2.82 / (n - 2) ^ 2 AS t_quantile
 FROM widened

@@ -1,5 +1,6 @@
--- In hindsight: what the SOC was at an hour's end, as a later and surer estimate says with the charge counted between.
--- Of an optimal filter the two differ by P1 + Q - P2, where P2 is the later variance brought back. Needs: hours, packs.
+-- Comparison of the SOC at the end of an hour with a reference: a later, more precise estimate, brought back by the charge
+-- counted in between. For an optimal filter, the variance of their difference is P1 + Q - P2. P1 is the variance of the
+-- estimate, Q that of the counted charge, and P2 that of the later estimate, brought back. Needs: hours, packs.
 WITH chosen AS (
     SELECT pack FROM packs ORDER BY hash(pack) LIMIT $most_packs
 ),
@@ -13,7 +14,7 @@ rows AS (
         sum(charge_out_ah - charge_in_ah) OVER w AS charge_ah,
         sum(charge_out_ah + charge_in_ah) OVER w AS through_ah,
         sum(seen_s) OVER w AS seen_s,
-        sum(CASE WHEN gaps > 0 OR lost_blocks > 0 OR dropped > 0.01 * samples THEN 1 ELSE 0 END) OVER w AS holes,
+        sum(CASE WHEN gaps > 0 OR lost_blocks > 0 OR dropped > 0.01 * samples THEN 1 ELSE 0 END) OVER w AS gap_count,
         sum(searches) OVER w AS searches
     FROM hours JOIN chosen USING (pack)
     WHERE soc_mean_std > 0
@@ -23,27 +24,28 @@ pairs AS (
     SELECT
         a.pack, a.hour, a.soc, a.variance, a.temperature_c,
         b.capacity_ah, b.ln_q_std, b.offset_std_a,
-        (b.seen_s - a.seen_s) / 3600 / b.capacity_ah AS per_a,  -- SOC that 1 A takes in that time
-        (b.charge_ah - a.charge_ah - b.offset_a * (b.seen_s - a.seen_s) / 3600) / b.capacity_ah AS moved,
+        (b.seen_s - a.seen_s) / 3600 / b.capacity_ah AS per_a,  -- SOC that a current of 1 A draws in this time
+        (b.charge_ah - a.charge_ah - b.offset_a * (b.seen_s - a.seen_s) / 3600) / b.capacity_ah AS soc_change,
         $charge_error ^ 2 * (b.through_ah - a.through_ah) / b.capacity_ah AS noise,
-        b.soc + moved AS hindsight,
-        b.variance + (per_a * b.offset_std_a) ^ 2 + (moved * b.ln_q_std) ^ 2
-            - 2 * per_a * b.offset_std_a * b.s_o - 2 * moved * b.ln_q_std * b.s_l
-            + 2 * per_a * moved * b.offset_std_a * b.ln_q_std * b.l_o AS back
+        b.soc + soc_change AS hindsight,
+        b.variance + (per_a * b.offset_std_a) ^ 2 + (soc_change * b.ln_q_std) ^ 2
+            - 2 * per_a * b.offset_std_a * b.s_o - 2 * soc_change * b.ln_q_std * b.s_l
+            + 2 * per_a * soc_change * b.offset_std_a * b.ln_q_std * b.l_o AS projected_variance
     FROM rows a CROSS JOIN (VALUES (1), (3), (6), (12), (24)) AS later(hours)
     JOIN rows b ON b.pack = a.pack AND b.hour = a.hour + later.hours
-    WHERE a.holes = b.holes AND b.seen_s - a.seen_s > $least_seen_s * (b.hour - a.hour)
+    WHERE a.gap_count = b.gap_count AND b.seen_s - a.seen_s > $least_seen_s * (b.hour - a.hour)
 ),
--- Of the later ones the surest, where it is really surer: else counting is judged, not the filter
-surest AS (
-    SELECT pack, hour, arg_min(p, back + noise) AS p FROM pairs p GROUP BY pack, hour
-    HAVING min(back + noise) < $surer * any_value(variance)
+-- The most precise of the later estimates, if it is much more precise than the estimate. Otherwise the comparison would
+-- test the counted charge and not the filter.
+most_precise AS (
+    SELECT pack, hour, arg_min(p, projected_variance + noise) AS p FROM pairs p GROUP BY pack, hour
+    HAVING min(projected_variance + noise) < $surer * any_value(variance)
 ),
 judged AS (
     SELECT
         pack, type, p.temperature_c AS temperature_c, hour - 24 * first_day AS age_h,
-        abs(p.soc - p.hindsight) / sqrt(p.variance + p.noise - p.back) AS stds
-    FROM surest JOIN packs USING (pack)
+        abs(p.soc - p.hindsight) / sqrt(p.variance + p.noise - p.projected_variance) AS stds
+    FROM most_precise JOIN packs USING (pack)
 ),
 groups AS (
     SELECT 1 AS place, 'all' AS of, '' AS which, * FROM judged
@@ -55,7 +57,7 @@ groups AS (
     UNION ALL
     SELECT 4, 'age', CASE WHEN age_h < 24 THEN 'first day' WHEN age_h < 168 THEN 'first week' ELSE 'later' END, * FROM judged
 ),
--- Hours of one pack err together: what is independent are packs (a ratio of sums over clusters)
+-- The errors of one pack's hours are correlated, while packs are independent (ratio estimator over clusters)
 clusters AS (
     SELECT place, of, which, pack, count(*) AS n, sum(CASE WHEN stds <= 2 THEN 1 ELSE 0 END) AS within
     FROM groups GROUP BY place, of, which, pack
@@ -67,7 +69,8 @@ shares AS (
 effective AS (
     SELECT
         place, of, which, any_value(s.packs) AS packs, any_value(s.judgements) AS judgements, any_value(s.share) AS share,
-        -- as many independent judgements as would vary so much; where none varies, one of each pack
+        -- effective number of independent comparisons, from the variance between packs; without such a variance, one per
+        -- pack
         CASE WHEN sum((within - share * n) ^ 2) > 0 AND any_value(s.packs) > 1
             THEN least(
                 any_value(share * (1 - share)) * sum(n) ^ 2 * (1 - 1 / any_value(s.packs)) / sum((within - share * n) ^ 2), sum(n)
@@ -78,7 +81,7 @@ effective AS (
 factors AS (
     SELECT place, of, which, quantile_cont(stds, 0.9545) / 2 AS factor FROM groups GROUP BY place, of, which
 )
--- Wilson's interval
+-- Wilson's score interval of the fraction, 95 %
 SELECT
     of, which, packs, judgements, share AS within_2_std,
     (share + 1.9208 / m - 1.96 * sqrt(share * (1 - share) / m + 0.9604 / m ^ 2)) / (1 + 3.8416 / m) AS low,

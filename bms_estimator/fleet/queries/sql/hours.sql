@@ -1,4 +1,4 @@
--- Each hour of each pack once, with the time of its begin. Needs: once, maybe_twice, all_columns.
+-- One row per hour and pack, with the start time of the hour. Needs: once, maybe_twice, all_columns.
 CREATE TEMP VIEW hours AS
 SELECT *, make_timestamp(hour * 3600000000::BIGINT) AS time
 FROM (

@@ -1,4 +1,4 @@
--- Of what type a pack is. Needs: days.
+-- Type of each pack, with its first day and its last hour. Needs: days.
 CREATE TEMP TABLE packs AS
 SELECT
     pack,

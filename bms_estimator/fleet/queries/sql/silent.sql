@@ -1,4 +1,4 @@
--- Needs: packs, days.
+-- Packs without recent hours. Needs: packs, days.
 SELECT
     type, p.pack, to_timestamp((p.last_hour + 1) * 3600)::TIMESTAMP AS silent_since, $now_hour - p.last_hour AS hours_silent,
     d.soc, d.soc_std, d.temperature_c

@@ -1,26 +1,26 @@
--- Needs: packs, fits.
+-- Capacity trend of each type and pack, with its confidence band. Needs: packs, fits.
 WITH each AS (
-    SELECT type, pack, f.* EXCLUDE (pack), slope_std * reach / 1.96 AS std FROM fits f JOIN packs USING (pack)
+    SELECT type, pack, f.* EXCLUDE (pack), slope_std * t_quantile / 1.96 AS std FROM fits f JOIN packs USING (pack)
     WHERE quantity = 'capacity'
 ),
--- Packs of a type differ: their slopes spread by ``apart`` beyond their errors (DerSimonian and Laird)
-alike AS (
+-- Variance of the slopes between the packs of a type, in excess of the errors of the slopes (DerSimonian and Laird)
+spreads AS (
     SELECT
         type, count(*) AS packs,
         greatest(
             0,
             (sum(slope ^ 2 / std ^ 2) - sum(slope / std ^ 2) ^ 2 / sum(1 / std ^ 2) - (count(*) - 1))
             / nullif(sum(1 / std ^ 2) - sum(1 / std ^ 4) / sum(1 / std ^ 2), 0)
-        ) AS apart
+        ) AS spread_variance
     FROM each GROUP BY type
 ),
 types AS (
     SELECT
-        type, any_value(packs) AS packs, sqrt(any_value(coalesce(apart, 0))) AS spread,
-        sum(slope / (std ^ 2 + coalesce(apart, 0))) / sum(1 / (std ^ 2 + coalesce(apart, 0))) AS slope,
-        sqrt(1 / sum(1 / (std ^ 2 + coalesce(apart, 0)))) AS std,
+        type, any_value(packs) AS packs, sqrt(any_value(coalesce(spread_variance, 0))) AS spread,
+        sum(slope / (std ^ 2 + coalesce(spread_variance, 0))) / sum(1 / (std ^ 2 + coalesce(spread_variance, 0))) AS slope,
+        sqrt(1 / sum(1 / (std ^ 2 + coalesce(spread_variance, 0)))) AS std,
         avg(exp(today)) AS capacity_ratio, max(last_day - first_day + 1) AS days
-    FROM each JOIN alike USING (type) GROUP BY type
+    FROM each JOIN spreads USING (type) GROUP BY type
 )
 SELECT
     type, NULL AS pack, packs, days,
@@ -31,7 +31,7 @@ FROM types
 UNION ALL
 SELECT
     type, pack, 1, last_day - first_day + 1,
-    exp(today), exp(today - reach * today_std), exp(today + reach * today_std),
-    100 * slope, 100 * (slope - reach * slope_std), 100 * (slope + reach * slope_std), NULL
+    exp(today), exp(today - t_quantile * today_std), exp(today + t_quantile * today_std),
+    100 * slope, 100 * (slope - t_quantile * slope_std), 100 * (slope + t_quantile * slope_std), NULL
 FROM each
 ORDER BY pack IS NOT NULL, type, percent_per_year, pack
