@@ -51,7 +51,7 @@ def rms_mv(error_v: np.ndarray) -> float:
 
 
 def left_mv(model: FuelCellModel, held_back: Source) -> float:
-    return rms_mv(held_back.voltage_v - held_back.predicted(model.a, np.zeros(8))[0])
+    return rms_mv(held_back.voltage_v - held_back.predict(model.a, np.zeros(8))[0])
 
 
 def told(fit: FuelCellFit) -> str:

@@ -90,8 +90,7 @@ def test_a_stack_with_unmodelled_effects_is_predicted_to_some_millivolts() -> No
     *told, held_back = sources
     fit = fit_fuel_cell(told, PEM)
     before_v, after_v = (
-        np.sqrt(np.mean((held_back.voltage_v - held_back.predicted(m.a, np.zeros(8))[0]) ** 2))
-        for m in (PEM, fit.model)
+        np.sqrt(np.mean((held_back.voltage_v - held_back.predict(m.a, np.zeros(8))[0]) ** 2)) for m in (PEM, fit.model)
     )
     assert after_v < 0.016
     assert after_v < before_v

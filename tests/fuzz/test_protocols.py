@@ -73,7 +73,7 @@ def with_jbd_checksums(data: bytes) -> bytes:
 def with_daly_checksums(data: bytes) -> bytes:
     """Correct the checksum of each frame of 13 bytes."""
     first, *frames = data.split(b"\xa5")
-    return first + b"".join(daly.sealed(b"\xa5" + frame[:11].ljust(11, b"\0")) + frame[12:] for frame in frames)
+    return first + b"".join(daly.with_checksum(b"\xa5" + frame[:11].ljust(11, b"\0")) + frame[12:] for frame in frames)
 
 
 def with_jk_checksum(data: bytes) -> bytes:
@@ -84,7 +84,7 @@ def with_jk_checksum(data: bytes) -> bytes:
         return data[:begin] + frame + bytes((sum(frame) & 0xFF,)) + data[begin + 300 :]
     before, start, body = data.partition(jk.OLD_START)
     body = body[2:482]
-    return before + jk.old_sealed(start + (len(body) + 7).to_bytes(2, "big") + body + bytes((jk.OLD_END,)))
+    return before + jk.with_old_checksum(start + (len(body) + 7).to_bytes(2, "big") + body + bytes((jk.OLD_END,)))
 
 
 @edited_seeds("frames", DELIMITER, b"\x01\x01", b"\x01\x02", b"\xff\xff\xff\xff", others=FRAMES)

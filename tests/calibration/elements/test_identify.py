@@ -317,7 +317,7 @@ def in_hours(samples):
         (capture(steps()), with_capacity(5.0), ["charge and voltage disagree", "capacity of 5 Ah"]),
         (stuck(capture(steps()), 0), TRUTH, ["the voltage is constant", "check the column for repeated old values"]),
         (stuck(capture(steps()), 2000), TRUTH, ["the voltage changes by 0.000 mV per ampere"]),
-        (in_hours(capture(steps())[:9000]), TRUTH, ["it lasts 2.5 s", "is time_s in seconds?"]),
+        (in_hours(capture(steps())[:9000]), TRUTH, ["it lasts 2.5 s", "check that time_s is in seconds"]),
         (with_gap(capture(steps())), TRUTH, ["a gap of 3601 s", "A: the charge drawn in it is unknown"]),
         (capture(steps()), load_cell("thunder_power_6s"), ["lie within the cell's limits", "check the cell file"]),
     ],
