@@ -39,10 +39,14 @@ MIN_SOC_SPAN = 0.15
 MAX_RELATIVE_CAPACITY_STD = 0.2
 """Maximum relative std of a capacity."""
 MAX_BEYOND_CURVE_STDS = 3.0
-"""Maximum distance of a rest's voltage beyond the curve's ends, in standard deviations. A rest further out is of another
+"""Maximum distance of a rest's voltage beyond the curve's ends, in standard deviations. A larger distance indicates another
 cell."""
 MAX_REDUCED_CHI_SQUARED = 9.0
 """Maximum weighted squared residual of the anchors per degree of freedom."""
+OFFSET_ITERATIONS = 3
+"""Number of iterations that subtract hysteresis and entropy from a rest's voltage. Both hardly change with SOC."""
+SLOPE_SOC = 0.02
+"""Half of the SOC interval over which the slope of the OCV at a rest is computed."""
 HYSTERESIS_STD = 0.3
 """Std of the hysteresis state h with a known direction of the current. The std covers the error of the amplitude, which
 has the opposite sign after a charge."""
@@ -207,7 +211,7 @@ def _anchor(
     warmer = temperature_c - REFERENCE_C
     hyst, hyst_std = (arrhenius(HYSTERESIS_J, temperature_c) * part for part in hysteresis)
     soc = soc_from_ocv(rest.ocv_v, *curve)
-    for _ in range(3):  # hysteresis and entropy hardly change with SOC
+    for _ in range(OFFSET_ITERATIONS):
         offset_v = hyst * on_grid(soc, p["hysteresis_v"]) + warmer * on_grid(soc, p["per_kelvin_v"])
         soc = soc_from_ocv(rest.ocv_v - offset_v, *curve)
     cold_v = COLD_V * float(coldness(np.array([rest.temperature_c]))[0]) * min(1.0, LONG_REST_S / rest.duration_s)
@@ -215,8 +219,7 @@ def _anchor(
         rest.std_v**2 + (series * (RELAXED_V + cold_v)) ** 2 + (hyst_std * on_grid(soc, p["hysteresis_v"])) ** 2
     )
     curve_std_v = on_grid(soc, p["curve_error_v"])
-    half_width = 0.02
-    slope_v = (ocv(soc + half_width, *curve) - ocv(soc - half_width, *curve)) / (2.0 * half_width)
+    slope_v = (ocv(soc + SLOPE_SOC, *curve) - ocv(soc - SLOPE_SOC, *curve)) / (2.0 * SLOPE_SOC)
     return Anchor(
         capture=name,
         part=part,
@@ -301,7 +304,7 @@ def _solve(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> Ca
 
 
 def _covariance(anchors: Sequence[Anchor], p: np.void) -> Floats:
-    """Return the covariance of the anchors' SOCs by the errors of voltage, curve and charge count."""
+    """Return the covariance of the anchors' SOCs due to the errors of voltage, curve and charge count."""
     z, slope_v, own_std_v, curve_std_v, moved, part = (
         np.array([getattr(a, name) for a in anchors])
         for name in ("soc", "slope_v", "own_std_v", "curve_std_v", "throughput_ah", "part")

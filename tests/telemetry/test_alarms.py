@@ -141,7 +141,7 @@ def _values(state: AlarmState, *values: float, step_s: float = 1.0, begin_s: flo
     """Return the times at which values at intervals of ``step_s`` raise (True) and clear (False) the alarm."""
     times_s = begin_s + step_s * np.arange(len(values))
     steps_s = np.full(len(values), step_s)
-    return [(each.at_s, each.raised is not None) for each in state.take(times_s, steps_s, np.array(values), WALL_S)]
+    return [(each.at_s, each.raised is not None) for each in state.update(times_s, steps_s, np.array(values), WALL_S)]
 
 
 def _state(**changes: Any) -> AlarmState:

@@ -9,7 +9,7 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 
 MIN_PEAK_C_RATE = 0.1
-"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with less is of use to `ocv` only."""
+"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with a smaller one is useful only to `ocv`."""
 STEP_FRACTION = 0.1
 """Minimum change of current between two samples of a current step, as a fraction of the capture's largest current."""
 MAX_STEP_S = 3.0

@@ -37,22 +37,22 @@ remainder is polarisation. Measured fractions are 0.4 and 0.5 for an NCA cell, 1
 REST_SHARE_STD = 0.3
 """Std of ``REST_SHARE``."""
 PLATEAU_SHARE = 0.9
-"""Fraction that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the hysteresis (Dreyer et
+"""Fraction of the hysteresis that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the hysteresis (Dreyer et
 al., Nature Materials 9, 2010, 448). Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
 PLATEAU_V = 0.15
 """Maximum slope dOCV/dSOC of a plateau, per cell [V]."""
 PLATEAU_SOC = 0.05
 """SOC interval over which the slope of a plateau is computed."""
 TYPICAL_HYSTERESIS_STD = 0.6
-"""Relative std of a hysteresis taken from typical cells."""
+"""Relative std of a hysteresis that is that of typical cells."""
 MIN_SHARE = 0.1
-"""Lower limit of a fraction that rests show."""
+"""Lower limit of the remaining fraction that is measured by rests."""
 SHARE_POINTS = 6
-"""Minimum number of rests that determine the fraction."""
+"""Minimum number of rests that determine the remaining fraction."""
 SHARE_K = 10.0
-"""Maximum distance of these rests from 25 C beyond that of the low-rate curves [K]."""
+"""Maximum distance from 25 C of rests that determine the remaining fraction, beyond that of the low-rate curves [K]."""
 SHARE_SOC = (0.1, 0.95)
-"""SOC range of these rests, and of a plateau."""
+"""SOC range of rests that determine the remaining fraction, and of a plateau."""
 MAX_CAPACITY_DIFFERENCE = 0.05
 """Relative difference between the given and the measured capacity above which a source has a remark."""
 
