@@ -206,6 +206,16 @@ def append_anchors(
 def _anchor(
     name: str, part: int, rest: Rest, p: np.void, hysteresis: tuple[float, float], charge_ah: tuple[float, float]
 ) -> Anchor:
+    """Return the anchor of a rest.
+
+    Args:
+        name: Name of the capture.
+        part: Number of the continuous part.
+        rest: The rest.
+        p: Record of dtype EKF_SETTINGS.
+        hysteresis: Mean and std of the hysteresis state h.
+        charge_ah: Net charge and charge throughput since the part began [Ah].
+    """
     series, curve = p["series"], (p["ocv_v"], p["ocv_slope_v"])
     temperature_c = float(np.nan_to_num(rest.temperature_c, nan=REFERENCE_C))
     warmer = temperature_c - REFERENCE_C
@@ -236,6 +246,11 @@ def _anchor(
 
 
 def _check_swing(anchors: Sequence[Anchor], rejected: Sequence[str], capacity_ah: float) -> None:
+    """Check that the anchors of a part span enough SOC.
+
+    Raises:
+        UserError: There are no anchors, or their SOCs are too close.
+    """
     reasons = "".join(f"\n  {line}" for line in rejected[:8])
     if not anchors:
         raise UserError(

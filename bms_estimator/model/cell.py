@@ -252,6 +252,7 @@ class CellModel(Strict):
 
 
 def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
+    """Return the model of ``series`` x ``parallel`` cells. The factor of a value follows from the unit in its name."""
     ohm, farad = series / parallel, parallel / series
 
     def scaled_by_unit(part: Strict, factor: dict[str, float]) -> dict[str, object]:

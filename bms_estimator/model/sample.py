@@ -20,6 +20,7 @@ SAMPLE = np.dtype(
     ],
     align=True,
 )
+"""Sample of a battery."""
 
 CurrentSign = Literal["discharge_positive", "charge_positive"]
 """Direction of the current that a device reports as positive."""

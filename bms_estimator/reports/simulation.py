@@ -197,6 +197,7 @@ class Simulation:
         return self._fit_start(ALPHA, -1.4, 9.0), self._fit_start(OTHER_ALPHA, 1.4, 17.0)
 
     def _fit_start(self, alpha: float, near_v: float, near_lambda: float) -> OneStart:
+        """Fit start voltage and lambda to the changes of a2 in Tables 2 and 3, from ``near_v`` [V] and ``near_lambda``."""
         shifts = {"scheme-1": printed_values.TABLE_2_SHIFT, "scheme-2": printed_values.TABLE_3_SHIFT}
 
         def residuals(unknown: Floats) -> list[float]:

@@ -26,9 +26,10 @@ from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
 from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
 NO_VALUES = "The thesis prints no value of the figure that could be compared."
+"""Reason of a figure without printed values."""
 FULL_SOC_GRID = np.linspace(0.0, 1.0, 1001)
 """SOC grid over the full range."""
-WEAK_SOC = (0.85, 0.7)
+WEAK_BATTERY_SOC = (0.85, 0.7)
 """Initial SOC of the weak batteries in Fig. 43."""
 
 
@@ -385,7 +386,7 @@ def dynamic_static_plot(axes: Any, dynamic: Prediction, static: Prediction) -> N
 def figure_43(s: Simulation) -> Figure:
     """Draw E_o of a battery bank with a fault."""
     drawn = np.linspace(0.0, 1.0, 800)
-    starts = {"healthy bank": (1.0, 1.0, 1.0), "two weak batteries": (1.0, *WEAK_SOC)}
+    starts = {"healthy bank": (1.0, 1.0, 1.0), "two weak batteries": (1.0, *WEAK_BATTERY_SOC)}
 
     def draw(axes: Any) -> None:
         for label, initial in starts.items():
@@ -400,7 +401,7 @@ def figure_43(s: Simulation) -> Figure:
         plot(draw, salt="figure-43"),
         Reproduction.NO_DATA,
         "The bank's batteries and their SOC are not printed; here three cells of Chen and Mora in series, two of which start at SOC "
-        f"{WEAK_SOC[0]:g} and {WEAK_SOC[1]:g}. As in print, each weak battery causes a dip when it is empty.",
+        f"{WEAK_BATTERY_SOC[0]:g} and {WEAK_BATTERY_SOC[1]:g}. As in print, each weak battery causes a dip when it is empty.",
     )
 
 

@@ -75,6 +75,17 @@ def _scheme_table(
     started: Floats,
     reason: str,
 ) -> Table:
+    """Return the table of scheme 1 or 2.
+
+    Args:
+        simulation: Runs of the schemes.
+        key: Number of the table.
+        title: Caption.
+        print_: Printed estimates and printed errors [%].
+        plain: Averages of the run with x2(0) = x3(0) = 0.
+        started: Averages of the run with the fitted start.
+        reason: First sentences of the reason.
+    """
     rows = []
     for i, (start, estimate, error) in enumerate(zip(printed_values.CHEN_MORA_ROUNDED, *print_, strict=True), 1):
         recomputed, true = float(started[i]), float(simulation.cell.a[i])

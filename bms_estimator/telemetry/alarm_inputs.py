@@ -12,6 +12,7 @@ from bms_estimator.settings.alarm_kinds import Quantity
 
 Counts = NDArray[np.int64]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+"""All measured quantities."""
 LOSS_TEXTS: dict[Quantity, str] = {
     "voltage": "the voltage is no longer measured",
     "current": "the current is no longer measured",

@@ -267,6 +267,13 @@ class AlarmEvaluator:
         self._save_state()
 
     def _evaluate_samples(self, samples: SampleBlock, extremes_v: Floats, wall_s: float) -> None:
+        """Evaluate the alarms on measured values.
+
+        Args:
+            samples: Shape (n,), dtype SAMPLE.
+            extremes_v: Minimum and maximum cell voltage [V] and number of cell voltages, shape (n, 3).
+            wall_s: Wall clock minus the samples' clock [s].
+        """
         times_s, lowest_v, highest_v = samples["time_s"], extremes_v[:, 0], extremes_v[:, 1]
         self._at_s = float(times_s[-1])
         passed_s, observed_s = self._sample_intervals.measure(times_s)
@@ -341,6 +348,7 @@ class AlarmEvaluator:
         self._evaluate_values("sensor_fault", np.array([at_s]), observed_s, np.array([share]), wall_s)
 
     def _evaluate_estimates(self, trace: TraceBlock, suspects: InputFault, wall_s: float) -> None:
+        """Evaluate the alarms on estimates. Arguments are those of ``evaluate``; ``wall_s`` is wall minus samples' clock [s]."""
         times_s = trace["time_s"]
         _, observed_s = self._trace_intervals.measure(times_s)
         soc, std = trace["soc"], trace["soc_std"]
@@ -388,6 +396,7 @@ class AlarmEvaluator:
             self._reasons[name] = Reasons(suspects, texts)
 
     def _alarm(self, state: AlarmState) -> Alarm:
+        """Return the payload of an alarm, cached until its message changes."""
         name = state.definition.name
         message = AlarmMessage(
             state.raised,

@@ -16,6 +16,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
+"""Size of a memory page [MiB]."""
 _SAMPLE_COUNTERS = [
     name
     for name in OBSERVER_STATE.names or ()

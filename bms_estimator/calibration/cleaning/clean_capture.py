@@ -84,6 +84,11 @@ def clean_capture(name: str, samples: SampleBlock, cell: CellModel) -> CleanCapt
 
 
 def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBlock:
+    """Return the samples within the cell's limits of voltage and current.
+
+    Raises:
+        UserError: Most samples lie outside the limits, or too few lie within.
+    """
     limits = cell.cell
     voltage_v, current_a = samples["voltage_v"], samples["current_a"]
     good: SampleBlock = samples[

@@ -349,6 +349,7 @@ class _Candidate:
 
 
 def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
+    """Return a capture with its SOC by coulomb counting from ``soc``, or from its first rest if ``soc`` is None."""
     if temperature_c is not None:
         load = replace(load, temperature_c=temperature_of(load, temperature_c))
     temperature = temperature_of(load)
@@ -403,6 +404,7 @@ def _wrong_temperature(load: CleanCapture, temperature_c: float | None) -> list[
 
 
 def _temperature_range(runs: list[Run]) -> tuple[float, float]:
+    """Return the ``PERCENTILES`` of the temperatures of captures [C]."""
     low_c, high_c = np.percentile(np.concatenate([run.temperature_c for run in runs]), PERCENTILES)
     return round(float(low_c), 1), round(float(high_c), 1)
 
@@ -483,6 +485,7 @@ def _geometric_mean(scores: Floats) -> float:
 
 
 def _worse_replays(outcome: Identification) -> str:
+    """Return the message on replays that get worse, with the scores of each capture."""
     lines = [
         f"{c.name}: {c.score_before:.2f} before, {c.score_after:.2f} after"
         for c in outcome.captures

@@ -142,6 +142,11 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
 def _branch(
     good: SampleBlock, moved_ah: Floats, resting: NDArray[np.bool_], first: int, last: int, name: str
 ) -> SlowBranch:
+    """Return the low-rate discharge or charge in the samples ``first`` to ``last`` - 1.
+
+    Raises:
+        UserError: The voltage changes in the wrong direction for the current.
+    """
     part = good[first:last]
     charge = bool(np.median(part["current_a"]) < 0.0)
     ah = np.abs(moved_ah[first:last] - moved_ah[first])
@@ -227,6 +232,7 @@ def slow_curves(
 
 
 def _are_pair(discharge: SlowBranch, charge: SlowBranch) -> bool:
+    """Return True if temperatures and currents are nearly equal."""
     warmer = charge.temperature_c - discharge.temperature_c
     near = np.isnan(warmer) or abs(warmer) <= PAIR_K
     return bool(near) and abs(charge.current_a / discharge.current_a - 1.0) <= PAIR_CURRENT
@@ -265,6 +271,7 @@ def _pair(down: SlowBranch, soc: Floats, up: SlowBranch, up_soc: Floats, series_
 
 
 def _unpaired(branch: SlowBranch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
+    """Return the curve of an unpaired discharge or charge, without its ohmic drop."""
     grid = GRID[(soc.min() <= GRID) & (soc.max() >= GRID)]
     sign = -1.0 if branch.charge else 1.0
     ohmic_v = float(np.nan_to_num(branch.step_v))
@@ -285,6 +292,16 @@ def _voltage_at(grid: Floats, soc: Floats, voltage_v: Floats) -> Floats:
 def _points(
     grid: Floats, ocv_v: Floats, common_v: float, cold_fraction: float, temperature_c: float, series_count: int
 ) -> Points:
+    """Return the points of a low-rate curve at the SOCs ``grid``.
+
+    Args:
+        grid: SOC of the points.
+        ocv_v: Open-circuit voltage [V].
+        common_v: Std of the systematic error [V].
+        cold_fraction: Fraction of the cold-relaxation error that remains.
+        temperature_c: Temperature [C]; NaN if unknown.
+        series_count: Cells in series.
+    """
     std_v = np.hypot(POINT_V * series_count, POINT_SOC * np.gradient(ocv_v, grid))
     everywhere = np.ones(grid.size)
     cold_v = cold_fraction * COLD_V * series_count * coldness(temperature_c * everywhere)

@@ -8,8 +8,8 @@ from bms_estimator.numba_cache import njit
 
 FLOW_SUMS = np.dtype(
     [
-        ("charge_as", "f8"),  # charge since the sums were last taken, positive on discharge [A s]
-        ("energy_ws", "f8"),  # energy since the sums were last taken, positive on discharge [W s]
+        ("charge_as", "f8"),  # charge since the last update of the totals, positive on discharge [A s]
+        ("energy_ws", "f8"),  # energy since the last update of the totals, positive on discharge [W s]
         ("last_s", "f8"),  # time stamp of the last sample [s]
         ("last_a", "f8"),  # current of the last sample [A]
         ("last_w", "f8"),  # power of the last sample [W]

@@ -140,7 +140,7 @@ def apply_offdiagonal_transition(cov: Floats, f: Floats, by_offset: float, moved
         cov[k, SOC] += by_offset * cov[k, OFFSET] + moved * cov[k, LN_Q]
         for j in range(X, X + BRANCHES):
             cov[k, j] -= (1.0 - f[j]) * cov[k, OFFSET]
-    for j in range(SOC, X + BRANCHES):  # the rounding above is not symmetric
+    for j in range(SOC, X + BRANCHES):  # rounding makes the rows and columns differ
         for k in range(j):
             cov[j, k] = cov[k, j]
         for k in range(X + BRANCHES, STATES):

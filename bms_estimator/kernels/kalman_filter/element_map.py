@@ -47,6 +47,7 @@ ELEMENT_MAP = np.dtype(
     ],
     align=True,
 )
+"""Information-weighted sums of the logarithm of each element, by SOC bin."""
 
 ELEMENT_FIT = np.dtype(
     [
@@ -59,6 +60,7 @@ ELEMENT_FIT = np.dtype(
     ],
     align=True,
 )
+"""Parameters of (2.5)-(2.9) fitted to the map."""
 
 
 @njit(cache=True)

@@ -48,6 +48,7 @@ EQUIVALENT = np.dtype(
     ],
     align=True,
 )
+"""Circuit equivalent to the ladder at the present SOC and temperature."""
 
 
 @njit(cache=True)

@@ -83,7 +83,7 @@ CHECKS = np.dtype(
         ("slow_a", "f8"),  # running mean of the current [A]
         ("slower_v", "f8"),  # running mean of slow_v [V]
         ("slower_a", "f8"),  # running mean of slow_a [A]
-        ("sign_evidence", "f8"),  # filled fraction of the two averages below, 0..1
+        ("sign_evidence", "f8"),  # filled fraction of the averages change_v_a and change_a2, 0..1
         ("change_v_a", "f8"),  # running mean of fast voltage change times fast current change [V A]
         ("change_a2", "f8"),  # running mean of the squared fast current change [A^2]
         ("last_v", "f8"),  # voltage of the previous sample [V]; 0: none
@@ -110,6 +110,7 @@ CHECKS = np.dtype(
     ],
     align=True,
 )
+"""State of the input checks."""
 
 COUNTERS = np.dtype(
     [
@@ -119,6 +120,7 @@ COUNTERS = np.dtype(
     ],
     align=True,
 )
+"""Counters of the input checks."""
 
 
 @njit(cache=True)

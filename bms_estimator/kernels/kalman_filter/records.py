@@ -27,10 +27,14 @@ from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANCES
 
 SOC, X = 0, 1
+"""Index of the SOC, and first index of the RC pairs' currents, in the state vector."""
 LN_R0, LN_R, B_SLOW, B_FAST, OFFSET, LN_Q, HYST, CURVE = range(X + BRANCHES, X + BRANCHES + 8)
 NODE, NODES = CURVE + 1, 21
+"""First index of the OCV nodes in the state vector, and number of these nodes."""
 STATES = NODE + NODES
+"""Number of states."""
 HYPOTHESES = 7
+"""Maximum number of hypotheses."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,7 @@ EKF_SETTINGS = np.dtype(
     ],
     align=True,
 )
+"""Settings of the Kalman filter."""
 
 WINDOW = np.dtype(
     [
@@ -179,7 +184,7 @@ EKF_STATE = np.dtype(
         ("decay", "f8", BRANCHES),  # decay of the RC pairs over ``decay_s``
         ("decay_s", "f8"),
         ("mean_a", "f8"),  # mean current over 10 min [A]
-        ("rms_a2", "f8"),  # mean squared current over 10 min [A^2]
+        ("rms_a2", "f8"),  # mean square of the current over 10 min, not its root [A^2]
         ("usual_a", "f8"),  # mean current over hours [A]
         ("usual_a2", "f8"),  # mean squared current over hours [A^2]
         ("temperature_c", "f8"),  # temperature of the cell, measured or modelled [C]
@@ -199,3 +204,4 @@ EKF_STATE = np.dtype(
     ],
     align=True,
 )
+"""State of the Kalman filter."""

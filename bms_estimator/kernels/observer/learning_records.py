@@ -31,6 +31,7 @@ LEARNING_SETTINGS = np.dtype(
     ],
     align=True,
 )
+"""Settings of the learning law."""
 
 LEARNING_STATE = np.dtype(
     [
@@ -51,3 +52,4 @@ LEARNING_STATE = np.dtype(
     ],
     align=True,
 )
+"""State of the learning law."""

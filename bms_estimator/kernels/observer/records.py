@@ -32,7 +32,7 @@ OBSERVER_SETTINGS = np.dtype(
         ("epsilon_v", "f8"),  # eps2 of Algorithm 1 [V]
         ("lock_error_v", "f8"),  # |e| beyond which the observer does not track [V]
         ("lock_time_s", "f8"),  # time with |e| beyond or within lock_error_v until the lock is lost or regained [s]
-        ("margin_guard", "f8"),  # adaptation stops this far above max(delta1, delta2)
+        ("margin_guard", "f8"),  # SOC distance above max(delta1, delta2) at which adaptation stops
         ("soc_initial", "f8"),  # 0..1; NaN: from the first sample's voltage through the OCV
         ("voltage_min_v", "f8"),  # minimum voltage of an accepted sample [V]
         ("voltage_max_v", "f8"),  # maximum voltage of an accepted sample [V]
@@ -66,7 +66,7 @@ OBSERVER_STATE = np.dtype(
         ("unlocked_s", "f8"),  # time with |e| beyond (in lock) or within (out of lock) lock_error_v [s]
         ("started", "i8"),  # 1: initialized by a first sample
         ("lock", "i8"),  # 1 while the observer tracks
-        ("adapting", "i8"),  # 0 below the margins
+        ("adapting", "i8"),  # 1 while the parameters adapt; 0 at an SOC below the stability floor
         ("samples", "i8"),  # number of accepted samples
         ("dropped_not_finite", "i8"),
         ("dropped_range", "i8"),
@@ -74,8 +74,9 @@ OBSERVER_STATE = np.dtype(
         ("dropped_saturated", "i8"),  # voltage or current at the end of the converter's range
         ("time_steps_back", "i8"),  # times that the clock was set back; the sample is accepted, but not the step to it
         ("gaps", "i8"),  # number of gaps (``kernels.step.is_gap``)
-        ("lock_losses", "i8"),
-        ("gain_rearms", "i8"),
+        ("lock_losses", "i8"),  # number of times that the lock was lost
+        ("gain_rearms", "i8"),  # number of resets of k before the gain changed its sign
     ],
     align=True,
 )
+"""State of the observer."""

@@ -31,6 +31,7 @@ SERIES_RESISTANCE = np.dtype(
     ],
     align=True,
 )
+"""Sums of the least squares for R_s."""
 
 
 @njit(cache=True)
