@@ -39,10 +39,14 @@ MIN_SOC_SPAN = 0.15
 MAX_RELATIVE_CAPACITY_STD = 0.2
 """Maximum relative std of a capacity."""
 MAX_BEYOND_CURVE_STDS = 3.0
-"""Maximum distance of a rest's voltage beyond the curve's ends, in standard deviations. A rest further out is of another
+"""Maximum distance of a rest's voltage beyond the curve's ends, in standard deviations. A larger distance indicates another
 cell."""
 MAX_REDUCED_CHI_SQUARED = 9.0
 """Maximum weighted squared residual of the anchors per degree of freedom."""
+OFFSET_ITERATIONS = 3
+"""Number of iterations that subtract hysteresis and entropy from a rest's voltage. Both hardly change with SOC."""
+SLOPE_SOC = 0.02
+"""Half of the SOC interval over which the slope of the OCV at a rest is computed."""
 HYSTERESIS_STD = 0.3
 """Std of the hysteresis state h with a known direction of the current. The std covers the error of the amplitude, which
 has the opposite sign after a charge."""
@@ -202,12 +206,22 @@ def append_anchors(
 def _anchor(
     name: str, part: int, rest: Rest, p: np.void, hysteresis: tuple[float, float], charge_ah: tuple[float, float]
 ) -> Anchor:
+    """Return the anchor of a rest.
+
+    Args:
+        name: Name of the capture.
+        part: Number of the continuous part.
+        rest: The rest.
+        p: Record of dtype EKF_SETTINGS.
+        hysteresis: Mean and std of the hysteresis state h.
+        charge_ah: Net charge and charge throughput since the part began [Ah].
+    """
     series, curve = p["series"], (p["ocv_v"], p["ocv_slope_v"])
     temperature_c = float(np.nan_to_num(rest.temperature_c, nan=REFERENCE_C))
     warmer = temperature_c - REFERENCE_C
     hyst, hyst_std = (arrhenius(HYSTERESIS_J, temperature_c) * part for part in hysteresis)
     soc = soc_from_ocv(rest.ocv_v, *curve)
-    for _ in range(3):  # hysteresis and entropy hardly change with SOC
+    for _ in range(OFFSET_ITERATIONS):
         offset_v = hyst * on_grid(soc, p["hysteresis_v"]) + warmer * on_grid(soc, p["per_kelvin_v"])
         soc = soc_from_ocv(rest.ocv_v - offset_v, *curve)
     cold_v = COLD_V * float(coldness(np.array([rest.temperature_c]))[0]) * min(1.0, LONG_REST_S / rest.duration_s)
@@ -215,8 +229,7 @@ def _anchor(
         rest.std_v**2 + (series * (RELAXED_V + cold_v)) ** 2 + (hyst_std * on_grid(soc, p["hysteresis_v"])) ** 2
     )
     curve_std_v = on_grid(soc, p["curve_error_v"])
-    half_width = 0.02
-    slope_v = (ocv(soc + half_width, *curve) - ocv(soc - half_width, *curve)) / (2.0 * half_width)
+    slope_v = (ocv(soc + SLOPE_SOC, *curve) - ocv(soc - SLOPE_SOC, *curve)) / (2.0 * SLOPE_SOC)
     return Anchor(
         capture=name,
         part=part,
@@ -233,6 +246,11 @@ def _anchor(
 
 
 def _check_swing(anchors: Sequence[Anchor], rejected: Sequence[str], capacity_ah: float) -> None:
+    """Check that the anchors of a part span enough SOC.
+
+    Raises:
+        UserError: There are no anchors, or their SOCs are too close.
+    """
     reasons = "".join(f"\n  {line}" for line in rejected[:8])
     if not anchors:
         raise UserError(
@@ -301,7 +319,7 @@ def _solve(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> Ca
 
 
 def _covariance(anchors: Sequence[Anchor], p: np.void) -> Floats:
-    """Return the covariance of the anchors' SOCs by the errors of voltage, curve and charge count."""
+    """Return the covariance of the anchors' SOCs due to the errors of voltage, curve and charge count."""
     z, slope_v, own_std_v, curve_std_v, moved, part = (
         np.array([getattr(a, name) for a in anchors])
         for name in ("soc", "slope_v", "own_std_v", "curve_std_v", "throughput_ah", "part")

@@ -1,4 +1,4 @@
-"""Identification of a fuel cell from polarisation curves and records under changing current (thesis 7.3).
+"""Identification of a fuel cell from polarisation curves and records under changing current, section 7.3 of the thesis.
 
 The voltage is fitted by least squares over the logarithms of all parameters, with the kernel that the observer runs. A
 parameter with a relative std above ``MAX_RELATIVE_STD`` is not changed, and the result states the reason.
@@ -23,10 +23,10 @@ from bms_estimator.model.fuel_cell import FuelCellModel, Parameter
 MAX_RELATIVE_STD = 0.3
 """Maximum relative std of a parameter that the data determine."""
 MAX_LN_CHANGE = math.log(100.0)
-"""Maximum ln of the ratio between a parameter and its value in the file."""
-FITS = 3
+"""Maximum magnitude of ln of the ratio between a parameter and its value in the file."""
+FIT_PASSES = 3
 """Number of successive fits. The residuals of each fit give the weights of the sources in the next."""
-MIN_V = 1e-4
+MIN_STD_V = 1e-4
 """Minimum std of a source [V]. A smaller residual means that a source has hardly more points than parameters."""
 BLOCKS = 20
 """Number of blocks of a record whose means give the correlation length of its errors."""
@@ -76,7 +76,7 @@ class FuelCellFit:
     Attributes:
         model: The stack with its parameters, and their errors in ``std``.
         rms_v: Residual voltage by the name of each source, RMS [V].
-        undetermined: Reason why a parameter kept the value of the file, by its key in ``[fuel_cell]``.
+        undetermined: Reason why a parameter has the value of the file, by its key in ``[fuel_cell]``.
     """
 
     model: FuelCellModel
@@ -89,7 +89,7 @@ def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFi
 
     Args:
         sources: Polarisation curves and records.
-        start: Initial values, which parameters keep that the data do not determine.
+        start: Initial values. A parameter that the data do not determine has its initial value in the result.
 
     Raises:
         UserError: The data determine no parameter.
@@ -134,7 +134,7 @@ def _fit(sources: Sequence[Source], file: Floats, free: list[int]) -> tuple[Floa
         pairs = zip(weights, predictions(values.tobytes()), strict=True)
         return np.concatenate([-w * psi[:, free] for w, (_, psi) in pairs])
 
-    for _ in range(FITS):
+    for _ in range(FIT_PASSES):
         found = least_squares(residual, theta[free], jacobian, bounds=(-MAX_LN_CHANGE, MAX_LN_CHANGE), x_scale=0.1)
         theta = full_theta(found.x)
         weights = np.array([_weight(source, file, theta, len(free)) for source in sources])
@@ -154,7 +154,7 @@ def _weight(source: Source, file: Floats, theta: Floats, parameters: int) -> flo
     """Return the inverse std of a source's voltage, reduced for correlated errors of successive samples."""
     error_v = source.voltage_v - source.predict(file, theta)[0]
     freedom = max(error_v.size - parameters, 1) / error_v.size
-    rms_v = max(_rms(error_v) / math.sqrt(freedom), MIN_V)
+    rms_v = max(_rms(error_v) / math.sqrt(freedom), MIN_STD_V)
     return 1.0 / (rms_v * math.sqrt(_correlation_length(error_v) if source.time_s is not None else 1.0))
 
 
@@ -167,13 +167,13 @@ def _correlation_length(error_v: Floats) -> float:
     if size < 2:
         return 1.0
     means = error_v[: size * BLOCKS].reshape(BLOCKS, size).mean(axis=1)
-    return float(np.clip(size * (means**2).mean() / max((error_v**2).mean(), MIN_V**2), 1.0, size))
+    return float(np.clip(size * (means**2).mean() / max((error_v**2).mean(), MIN_STD_V**2), 1.0, size))
 
 
 def _errors(a: Floats, free: list[int], covariance: Floats) -> dict[Parameter, float]:
     """Return the relative standard deviations by key.
 
-    That of the exchange current i_0 = e^(-a / A) follows from those of a and A.
+    The standard deviation of the exchange current i_0 = e^(-a / A) follows from those of a and A.
     """
     std = {KEYS[j]: math.sqrt(covariance[k, k]) for k, j in enumerate(free)}
     slope, activation = NAMES.index("tafel_slope_v"), NAMES.index("activation_v")

@@ -1,4 +1,7 @@
-"""Validation of a cell on a capture: open-loop simulation with frozen parameters, (5.3) and chapter 6."""
+"""Validation of a cell on a capture: open-loop simulation with constant parameters.
+
+Section 5.3 and chapter 6 of the thesis validate in this way. (2.2)-(2.9) are equations of the thesis.
+"""
 
 from dataclasses import dataclass
 
@@ -49,9 +52,9 @@ class Validation:
         final_soc: SOC at the last sample by coulomb counting.
         all: Errors over all samples.
         above: Errors over the samples at SOC above ``LOW_SOC``.
-        resting: Errors over the samples of ``above`` without current: of the OCV, and of the remaining relaxation.
+        resting: Errors over the samples of ``above`` without current. They are errors of the OCV and of the relaxation.
         loaded: Errors over the samples of ``above`` with current.
-        extra_ohm: Additional series resistance that minimizes the errors ``above``: contacts, temperature, age [ohm].
+        extra_ohm: Additional series resistance that minimizes the errors ``above``, as of contacts, temperature or age [ohm].
         without_extra_ohm: Errors over the samples of ``above`` with that resistance added.
         warnings: Contradictions between capture and cell.
         time_s: Shape (n,), times of the good samples, from 0 [s].

@@ -24,7 +24,8 @@ from bms_estimator.settings.sampling import BOARD, Sampling
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
 SAMPLE_OUTCOMES = tuple(SampleOutcome)
-"""Outcomes by value. A tuple is used, because ``SampleOutcome(value)`` takes nearly as long as the kernel."""
+"""Outcomes by their integer values. Indexing a tuple is faster than ``SampleOutcome(value)``, which takes nearly as long as
+the kernel."""
 IDENTIFIER = IdentifierSettings()
 """Default settings of the identifier."""
 
@@ -178,9 +179,9 @@ def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
 def estimate(
     capture: Columns, cell: PackModel, *, initial_soc: float | None = None, voltage_resolution_v: float = 1e-3
 ) -> Columns:
-    """Estimate over a whole capture with default settings.
+    """Estimate a whole capture with default settings.
 
-    ``Columns(Estimator(cell, ...).run(capture.rows))`` is the equivalent for other settings.
+    For other settings, use ``Columns(Estimator(cell, ...).run(capture.rows))``.
 
     Args:
         capture: Rows of dtype ``SAMPLE``.

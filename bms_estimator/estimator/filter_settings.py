@@ -1,4 +1,7 @@
-"""Settings record of the Kalman filter from cell file and settings."""
+"""Settings record of the Kalman filter from cell file and settings.
+
+(2.5)-(2.9) are equations of the thesis.
+"""
 
 from dataclasses import fields, replace
 
@@ -42,7 +45,7 @@ BIAS_OF_STD = 0.15
 """Minimum of ``bias_relative``, as a fraction of the resistances' relative std, because the ratios of uncertain
 resistances are uncertain, too."""
 ROOM_C = 15.0, 35.0
-"""Temperature range of resistances without a declared range: that of a room [C]."""
+"""Lower and upper end of the temperature range of resistances without a declared range, as in a room [C]."""
 MIN_SHARE = 1e-4
 """Minimum resistance of an RC pair, as a fraction of the sum at SOC 0.5. Equivalent time constants are weighted by resistance
 and need weights above 0."""

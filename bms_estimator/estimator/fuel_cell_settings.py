@@ -15,7 +15,7 @@ MEMORY_S = 60.0
 """Time constant with which the learning law of a stack discounts data [s]. Water and gas supply change within a minute."""
 SETTLE_S = 5.0
 """Settling time of double layer and oxygen supply after an unmeasured gap [s]."""
-FACTORS = {
+MAX_FACTORS = {
     "r_ohm": 4.0,
     "tafel_slope_v": 1.5,
     "activation_v": 1.3,
@@ -24,7 +24,7 @@ FACTORS = {
     "limiting_current_a": 2.0,
     "internal_current_a": 4.0,
 }
-"""Maximum factor between a parameter and its value in the file. A factor of 1.3 in the activation loss at 1 A corresponds
+"""Maximum factor between a parameter and its value in the file, and the inverse of the minimum factor. A factor of 1.3 in the activation loss at 1 A corresponds
 to about 8 in the exchange current."""
 
 
@@ -43,7 +43,7 @@ def fuel_cell_settings(cell: FuelCellModel, of_observer: np.void) -> NDArray[np.
     record = np.zeros(1, dtype=LEARNING_SETTINGS)
     q, n = record[0], len(NAMES)
     q["enabled"], q["model"], q["count"], q["file"] = 1, Model.FUEL_CELL, n, cell.a
-    q["upper"][:n] = [math.log(FACTORS[name]) for name in NAMES]
+    q["upper"][:n] = [math.log(MAX_FACTORS[name]) for name in NAMES]
     q["lower"] = -q["upper"]
     q["told_v"], q["cells"] = of_observer["epsilon_v"], cell.cell.series_count
     q["leak_v2s"][:n] = LEAK_S * float(q["told_v"]) ** 2 / q["upper"][:n] ** 2

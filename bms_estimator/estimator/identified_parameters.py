@@ -20,7 +20,7 @@ from bms_estimator.model.cell import CellModel, TableOcv
 MAX_CAPACITY_STD = 0.3
 """Maximum relative std of the capacity that a cell file may contain."""
 EVEN_SOC = tuple(np.round(np.linspace(0.0, 1.0, 101), 2).tolist())
-"""SOC nodes of a table computed from (2.10)."""
+"""SOC nodes of a table that is computed from (2.10) of the thesis."""
 MIN_RISE_V = 1e-6
 """Minimum rise of the OCV between two SOCs of its table [V]."""
 

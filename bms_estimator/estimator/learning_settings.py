@@ -24,6 +24,7 @@ REACH = 0.5
 """Trust region for theta. The sensitivities are a linearization; beyond this step the second-order error is no longer
 small."""
 TAU_TS, TAU_TL = NAMES.index("tau_ts"), NAMES.index("tau_tl")
+"""Indices of the time constants in theta."""
 SCALED = {"r_s": (13, 15), "r_ts": (1, 3), "tau_ts": (7, 9), "r_tl": (4, 6), "tau_tl": (10, 12)}
 """Indices of the a_i that scale with each element of theta. A time constant has the bounds of its capacitance, because its
 resistance is that of the file."""
@@ -61,7 +62,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
 
 
 def _bounds(cell: CellModel, scaled: tuple[int, ...]) -> tuple[float, float]:
-    """Return the bounds of an element of theta by the bounds of its ``scaled`` parameters; they include the file's value."""
+    """Return the bounds of an element of theta by the bounds of its ``scaled`` parameters. 0, the file's value, is included."""
     bounds = [(cell.bounds(i), cell.a[i]) for i in scaled]
     lower = max(np.log(b.lower / value) for b, value in bounds)
     upper = min(np.log(b.upper / value) for b, value in bounds)

@@ -14,7 +14,7 @@ from bms_estimator.settings.pack import Settings
 MAX_CAPACITY_AH = 2000.0
 """Maximum plausible capacity of a cell [Ah]. The largest Li-ion cells on sale have some 1300 Ah."""
 CELL_V = 1.5, 4.5
-"""Range of plausible nominal voltages of a Li-ion cell [V]: titanate has 2.3 V, NMC 3.7 V."""
+"""Lowest and highest plausible nominal voltage of a Li-ion cell [V]. Titanate has 2.3 V, NMC 3.7 V."""
 SMALL_CELL_AH = 5.5
 """Maximum capacity of a 18650 or 21700 cell [Ah]."""
 MAX_SINGLE_ROW = 8

@@ -1,4 +1,7 @@
-"""Conversion of typed settings to the settings records of the kernels."""
+"""Conversion of typed settings to the settings records of the kernels.
+
+Numbers in parentheses are equations of the thesis.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +28,7 @@ LOCK_FRACTION = 0.02
 GAP_S = 5.0
 """Duration of a step above which it counts as a gap [s]; for a slow source, ``PERIODS`` of its periods."""
 IMPROVED = range(1, 13)
-"""Indices of the a_i that the improved method adapts (Algorithm 1). a13..a15 follow from (4.2)."""
+"""Indices of the a_i that the improved method adapts (Algorithm 1 of the thesis). a13..a15 follow from (4.2)."""
 
 
 def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -76,7 +79,10 @@ def estimator_settings(
     _period_limits(p["observer"], sampling)
     p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
-    p["hand_over"] = observer.law in ("improved", "scheme-3")  # (3.16) and (3.17) have no limit to set
+    p["hand_over"] = observer.law in (
+        "improved",
+        "scheme-3",
+    )  # (3.16) and (3.17) have no limit that the identifier could set
     p["series_resistance"] = observer.law == "improved" and not identifier.enabled
     p["map_memory_s"] = identifier.map_memory_h * 3600.0
     p["configured"][1:] = cell.a[1:PARAMETERS]

@@ -1,4 +1,4 @@
-"""Conditions of Lemma 4.1.1, under which C_ts and C_tl stay positive during adaptation."""
+"""Conditions of Lemma 4.1.1 of the thesis, under which C_ts and C_tl stay positive during adaptation."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from bms_estimator.model.cell import Bounds, CellModel
 
 @dataclass(frozen=True)
 class Condition:
-    """One inequality, with its two sides and a flag that it holds."""
+    """Condition of Lemma 4.1.1: the inequality left < right, and True in ``holds`` if it is satisfied."""
 
     name: str
     holds: bool
@@ -18,8 +18,8 @@ class Condition:
 def lemma_conditions(cell: CellModel) -> list[Condition]:
     """Check the conditions of Lemma 4.1.1 on bounds, weights and initial values of (a7, a9) and (a10, a12).
 
-    The list also contains conditions that are not required, because the capacitance is positive over SOC 0..1 at both
-    ends of the adaptation. ``failed_conditions`` omits these.
+    The list also contains conditions that are not required. A condition is not required if the capacitance is positive
+    over SOC 0..1 both at the beginning and at the end of the adaptation. ``failed_conditions`` omits such conditions.
     """
     conditions = []
     for number, (amplitude, offset) in enumerate(((7, 9), (10, 12)), start=1):

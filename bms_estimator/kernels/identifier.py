@@ -1,4 +1,6 @@
-"""Identifier: one sample updates the Kalman filter, the map of elements over SOC, and the targets of (3.18).
+"""Identifier: one sample updates the Kalman filter, the map of elements over SOC, and the targets of the adaptive law.
+
+The adaptive law is (3.18) of the thesis. Errata are listed in docs/theory/thesis.md.
 
 ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 """
@@ -47,7 +49,7 @@ FIT_EVERY_S = 120.0
 MIN_BINS = 3
 """Minimum number of SOC bins for a fit of an element's three parameters."""
 MIN_EXCITATION_C = 0.05
-"""Minimum load that excites the resistances, RMS over 10 min [C]."""
+"""Minimum load that excites the resistances, as a C-rate, RMS over 10 min."""
 
 
 @njit(cache=True)
@@ -129,6 +131,7 @@ def add_elements_to_map(s: Record, p: Record, dt_s: float) -> None:
     exciting_a = MIN_EXCITATION_C * p.filter.capacity_as / 3600.0
     loaded = f.rms_a2 > exciting_a * exciting_a
     branches = loaded and scale_is_identified(f, p.filter, LN_R)
+    # the second argument is the row of the map
     add_element_to_map(s, 0, R_TS, branches, dt_s)
     add_element_to_map(s, 1, R_TL, branches, dt_s)
     add_element_to_map(s, 2, C_TS, branches, dt_s)

@@ -18,14 +18,19 @@ from bms_estimator.numba_cache import njit
 Words = NDArray[np.uint64]
 SymmetryMap = NDArray[np.int32]
 """Shape (words of a record,): index of the earlier word that each word is likely to equal; -1: likely 0."""
-WORD_BYTES, WORD_BITS = 8, 64
+WORD_BYTES = 8
+"""Size of a word [bytes]."""
+WORD_BITS = 64
+"""Size of a word [bits], and number of words that a word of the bitmap describes."""
 _WORD_TYPES = "f8", "i8", "u8"
 """Data types of a word."""
 
 
 @lru_cache(maxsize=64)
 def symmetry_map(dtype: np.dtype[Any]) -> SymmetryMap:
-    """Return the words of a record that are likely equal: those below and above the diagonal of a square matrix.
+    """Return the symmetry map of a record. Each word below the diagonal of a square matrix refers to the word above.
+
+    Covariances are symmetric, so that the words below their diagonals are redundant.
 
     Raises:
         ValueError: A field does not consist of whole words, or the record has padding.
@@ -99,7 +104,7 @@ def pack(words: Words, mirror: SymmetryMap, out: Words) -> int:
 
 @njit(cache=True)
 def unpack(packed: Words, mirror: SymmetryMap, words: Words) -> bool:
-    """Write the record that was packed to ``words``.
+    """Unpack a record into ``words``.
 
     Args:
         packed: Words written by ``pack``.

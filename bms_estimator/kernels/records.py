@@ -1,4 +1,7 @@
-"""Settings and state records of the whole estimator."""
+"""Settings and state records of the whole estimator.
+
+(3.18) and (4.2) are equations of the thesis.
+"""
 
 import numpy as np
 
@@ -20,8 +23,8 @@ ESTIMATOR_SETTINGS = np.dtype(
         ("series_resistance", "i8"),  # 1: R_s by (4.2), step 3 of the thesis
         ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
         ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
-        ("lower", "f8", PARAMETERS),  # configured bounds of the values handed over
-        ("upper", "f8", PARAMETERS),
+        ("lower", "f8", PARAMETERS),  # configured lower bounds of the parameters that become limits of (3.18)
+        ("upper", "f8", PARAMETERS),  # upper bounds
         ("map_memory_s", "f8"),  # time constant with which the map discounts data [s]
     ],
     align=True,

@@ -1,4 +1,7 @@
-"""Estimator step for one sample (``step``) and for a block of samples (``run``)."""
+"""Estimator step for one sample (``step``) and for a block of samples (``run``).
+
+(4.2) and (7.1) are equations of the thesis.
+"""
 
 import math
 from enum import IntEnum
@@ -100,7 +103,7 @@ def step(
         dt_s = state[0].unseen_s
         settle_s = settings[0].learning.settle_s  # the load in the gap is unknown
         state[0].learning.settle_s = state[0].series_resistance.settle_s = settle_s
-    if not 0.0 <= dt_s < math.inf:  # the clock was set back, or the gap is unknown
+    if not 0.0 <= dt_s < math.inf:  # the clock was set back, or the duration of the gap is unknown
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
         if new_clock:
@@ -126,7 +129,10 @@ def step(
 
 @njit(cache=True)
 def is_gap(s: Record, p: Record, dt_s: float) -> bool:
-    """Return True if samples are missing in a step of ``dt_s``, and count the gap. Records as in ``validate_sample``."""
+    """Return True if samples are missing in a step of ``dt_s``, and count the gap.
+
+    ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+    """
     gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
     s.step_s = dt_s
     if gap:
@@ -139,8 +145,8 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
     """Process a block of samples and write a row of ``trace`` for each accepted sample.
 
     Args:
-        state: As in ``step``.
-        settings: As in ``step``.
+        state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
+        settings: Shape (1,), dtype ESTIMATOR_SETTINGS.
         samples: Shape (n,), dtype SAMPLE.
         trace: Shape (m,) with m >= n, dtype TRACE; written from its start.
 

@@ -1,4 +1,7 @@
-"""Trace of the estimator: one row of values for each accepted sample."""
+"""Trace of the estimator: one row of values for each accepted sample.
+
+Numbers in parentheses are equations of the thesis.
+"""
 
 import numpy as np
 
@@ -10,16 +13,19 @@ TRACE = np.dtype(
         ("temperature_c", "f8"),
         ("soc", "f8"),
         ("voltage_estimate_v", "f8"),
-        ("innovation_v", "f8"),  # measured minus predicted voltage: the identifier's, or the observer's e
+        (
+            "innovation_v",
+            "f8",
+        ),  # measured minus predicted voltage of the identifier; without the identifier, the observer's e [V]
         ("tracking_error_v", "f8"),  # the observer's e (3.15)
-        ("nussbaum_gain", "f8"),  # N(k) (3.12) of a printed law, or NaN
+        ("nussbaum_gain", "f8"),  # N(k) (3.12) of a law of the thesis, or NaN
         ("adaptation_gain_hz", "f8"),  # gamma k of the learning law, or NaN [1/s]
         ("k", "f8"),
         ("delta_1", "f8"),
         ("delta_2", "f8"),
         ("stability_margin", "f8"),  # soc - max(delta_1, delta_2)
         ("lock", "i8"),
-        ("converged", "i8"),  # |e| < eps2
+        ("converged", "i8"),  # 1: |e| < eps2 of Algorithm 1
         ("soc_coulomb", "f8"),  # by coulomb counting alone
         (
             "soc_ocv",

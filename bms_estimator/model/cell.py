@@ -1,5 +1,7 @@
 """Cell model: contents of a cell file, with a1..a21.
 
+Numbers in parentheses are equations of the thesis, and Lemma 4.1.1 and Lemma 4.1.3 are lemmas of the thesis.
+
 The values describe ``series_count`` cells in series as one two-terminal object. ``CellModel.pack`` scales them to packs
 of such objects in series and parallel.
 """
@@ -78,13 +80,14 @@ class TableOcv(Strict):
     soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=4, description="increasing, from 0 to 1")
     ocv_v: tuple[Positive, ...] = Field(
         min_length=4,
-        description="increasing, one for each SOC; after discharge, or with hysteresis_v midway to that after charge",
+        description="open-circuit voltage at each SOC, increasing; after discharge, or with hysteresis_v the mean of that after discharge "
+        "and that after charge",
     )
     error_v: tuple[Positive, ...] | None = Field(default=None, description="standard deviation of ocv_v")
     hysteresis_v: tuple[NotNegative, ...] | None = Field(
-        default=None, description="half of what ocv_v is higher after charge than after discharge"
+        default=None, description="half of the difference of the open-circuit voltage after charge and after discharge"
     )
-    per_kelvin_v: tuple[float, ...] | None = Field(default=None, description="growth of ocv_v with temperature [V/K]")
+    per_kelvin_v: tuple[float, ...] | None = Field(default=None, description="temperature coefficient of ocv_v [V/K]")
 
     @model_validator(mode="after")
     def _increasing(self) -> Self:
@@ -107,24 +110,26 @@ class TableOcv(Strict):
 class Ladder(Strict):
     """RC ladder: series resistance and RC pairs with fixed time constants (``kernels.cell_model.rc_ladder.TAU_S``).
 
-    R(SOC, T) is the sum of a weak and a strong part, given at 25 C, each with the Arrhenius factor of its activation
-    energy.
+    R(SOC, T) is the sum of two parts, given at 25 C. The weak part has the low activation energy, the strong part the high
+    one. Each part is scaled with the Arrhenius factor of its activation energy.
     """
 
     soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=2, description="increasing")
     weak_ohm: tuple[tuple[NotNegative, ...], ...] = Field(
-        min_length=7, max_length=7, description="series resistance, then each branch's, one for each SOC; at 25 C"
+        min_length=7,
+        max_length=7,
+        description="part with the low activation energy at 25 C: series resistance, then resistance of each RC pair, one value for each SOC",
     )
     strong_ohm: tuple[tuple[NotNegative, ...], ...] = Field(
-        min_length=7, max_length=7, description="the same of the part that grows strongly in the cold"
+        min_length=7,
+        max_length=7,
+        description="part with the high activation energy at 25 C: series resistance, then resistance of each RC pair, one value for each SOC",
     )
     std: Positive = Field(
-        description="relative standard deviation of the resistances, as a whole, on another such cell"
+        description="relative standard deviation of a common factor of all resistances between cells of this type"
     )
-    error_v: Positive = Field(
-        description="RMS of what the ladder leaves of the captures that it was fitted to, at 25 C"
-    )
-    temperature_c: tuple[float, float] = Field(description="lowest and highest cell temperature of those captures")
+    error_v: Positive = Field(description="RMS voltage error of the fit to the captures, at 25 C")
+    temperature_c: tuple[float, float] = Field(description="lowest and highest cell temperature of the captures")
 
     @model_validator(mode="after")
     def _equal_lengths(self) -> Self:
@@ -146,7 +151,7 @@ class Bounds(Strict):
     lower: Positive = Field(description="a_il")
     weight_upper: Annotated[float, Field(ge=0)] = Field(description="lambda_x [1/s]")
     weight_lower: Annotated[float, Field(ge=0)] = Field(description="lambda_y [1/s]")
-    initial: Positive | None = Field(default=None, description="a_i(t0); the limit of Lemma 4.1.3 when left out")
+    initial: Positive | None = Field(default=None, description="a_i(t0); default: the limit of Lemma 4.1.3")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -193,7 +198,7 @@ class Cell(Rated):
 
     capacity_ah: Positive = Field(description="rated capacity in ampere-hours")
     capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
-        default=None, description="how wrong capacity_ah may be, relative; as for most cells when left out"
+        default=None, description="relative standard deviation of capacity_ah; default: that of most cells"
     )
 
 
@@ -207,7 +212,7 @@ class CellModel(Strict):
     c_tl: Capacitance
     r_s: Resistance
     ocv: Annotated[ChenMoraOcv | TableOcv, Field(discriminator="form")]
-    ladder: Ladder | None = Field(default=None, description="made of the elements when left out")
+    ladder: Ladder | None = Field(default=None, description="RC ladder; default: computed from the elements")
     adaptation: dict[str, Bounds] = Field(default_factory=dict, description="bounds by parameter, keys a1 to a15")
 
     @model_validator(mode="after")
@@ -225,7 +230,10 @@ class CellModel(Strict):
         return np.array([np.nan, *self.r_ts.a, *self.r_tl.a, *self.c_ts.a, *self.c_tl.a, *self.r_s.a, *ocv])
 
     def bounds(self, index: int) -> Bounds:
-        """Return the configured bounds of a_index, or a quarter and four times the model's value with that value as limit."""
+        """Return the configured bounds of a_index.
+
+        Without configured bounds, these are a quarter and four times the model's value, with that value as limit.
+        """
         configured = self.adaptation.get(f"a{index}")
         if configured is not None:
             return configured
@@ -244,6 +252,7 @@ class CellModel(Strict):
 
 
 def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
+    """Return the model of ``series`` x ``parallel`` cells. The factor of a value follows from the unit in its name."""
     ohm, farad = series / parallel, parallel / series
 
     def scaled_by_unit(part: Strict, factor: dict[str, float]) -> dict[str, object]:

@@ -10,9 +10,11 @@ from bms_estimator.model.config_file import write_text
 from bms_estimator.model.fuel_cell import PackModel
 
 EQUATIONS = {"r_ts": "(2.5)", "r_tl": "(2.6)", "c_ts": "(2.7)", "c_tl": "(2.8)", "r_s": "(2.9)"}
-"""Equation of each section, for its comment."""
+"""Equation of the thesis for each section, for the section's comment."""
+LINE_VALUES = 8
+"""Number of values on a line of a list."""
 DIGITS = 8
-"""Number of significant digits. The rounding error of a cell's voltage is below 0.1 uV."""
+"""Number of significant digits of a written number. The rounding error of a cell's voltage is below 0.1 uV."""
 
 
 def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None:
@@ -65,7 +67,7 @@ def _bounds(values: dict[str, dict[str, object]]) -> tomlkit.items.Table:
 
 
 def _value(value: object) -> object:
-    """Return a value for TOML: numbers rounded, lists with several lines."""
+    """Return a value for TOML. Numbers are rounded, and lists are divided into lines."""
     if isinstance(value, list):
         array = tomlkit.array()
         if value and isinstance(value[0], list):  # a matrix: one line for each row
@@ -75,8 +77,8 @@ def _value(value: object) -> object:
                 array.add_line(line)
             array.add_line(indent="")
             return array
-        for i in range(0, len(value), 8):
-            array.add_line(*(_value(x) for x in value[i : i + 8]))
+        for i in range(0, len(value), LINE_VALUES):
+            array.add_line(*(_value(x) for x in value[i : i + LINE_VALUES]))
         array.add_line(indent="")
         return array
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value

@@ -19,7 +19,7 @@ class Clock:
 
 
 def since_boot() -> float:
-    """Return the time since boot, with suspended time [s], because the load continues while the host is suspended."""
+    """Return the time since boot, including suspended time [s]. The load continues while the host is suspended."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 

@@ -51,7 +51,7 @@ def _make_strict(schema: Any) -> None:
 
 
 class Strict(BaseModel):
-    """Base of all configured values: unknown keys and values of other types are errors, instances are immutable."""
+    """Base of all configured values. Unknown keys and values of other types are errors. Instances are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -72,7 +72,7 @@ MESSAGES = {
     "model_type": "must be a table, {key = value}",
     "string_pattern_mismatch": "is not of the form that it must have",
 }
-"""Replacements for messages of pydantic that are for programmers, by error type."""
+"""Replacements for messages of pydantic that only programmers understand, by error type."""
 
 
 def read_toml(path: Path, model: type[T]) -> T:

@@ -11,7 +11,7 @@ from bms_estimator.model.payloads import Health, Payload, Snapshot
 MIN_UNSEEN_S = 1.0
 """Minimum duration of a gap that causes an event [s]. Shorter gaps only count in ``health``."""
 NOT_SAVED = ("cannot be saved", "not saved")
-"""Prefixes of ``health.checkpoint`` after a failed checkpoint."""
+"""Prefixes of ``health.checkpoint`` that report a failed checkpoint."""
 
 Name = Literal[
     "start",
@@ -69,8 +69,8 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
 def _alarms(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
     """Yield raised and cleared alarms.
 
-    An alarm that was cleared and raised again between the snapshots has another ``since``. The previous run reported alarms
-    that were raised before the start.
+    An alarm that was cleared and raised again between the snapshots has another ``since``. Alarms that were raised before
+    the start are skipped, because the previous run reported them.
     """
     was = {alarm.name: alarm.since for alarm in before.alarms} if before else {}
     for alarm in snapshot.alarms:

@@ -39,15 +39,21 @@ Parameter = Literal[
 class FuelCell(Strict):
     """Parameters of a stack: losses of all its cells in series, and gas supply."""
 
-    r_ohm: Positive = Field(description="membrane and contacts")
-    tafel_slope_v: Positive = Field(description="growth of the activation loss when the current grows e times")
-    exchange_current_a: Annotated[float, Field(gt=0, lt=1)] = Field(description="where Tafel's line meets 0 V")
-    c_dl_farad: Positive = Field(description="double layer")
-    concentration_v: Positive = Field(description="B of the loss -B ln(1 - i / limiting_current_a)")
-    limiting_current_a: Positive = Field(description="what the gas that reaches the electrodes allows at most")
-    internal_current_a: Positive = Field(description="of gas that crosses the membrane: flows at no load, too")
+    r_ohm: Positive = Field(description="resistance of membrane and contacts")
+    tafel_slope_v: Positive = Field(
+        description="Tafel slope: increase of the activation loss if the current increases by a factor of e"
+    )
+    exchange_current_a: Annotated[float, Field(gt=0, lt=1)] = Field(
+        description="current at which Tafel's line has an activation loss of 0 V"
+    )
+    c_dl_farad: Positive = Field(description="capacitance of the double layer")
+    concentration_v: Positive = Field(description="B of the concentration loss -B ln(1 - i / limiting_current_a)")
+    limiting_current_a: Positive = Field(description="maximum current that the gas supply of the electrodes allows")
+    internal_current_a: Positive = Field(
+        description="current equivalent to the gas that crosses the membrane, also at no load"
+    )
     temperature_c: Annotated[float, Field(gt=-40, lt=200)] = Field(
-        description="of the values; taken where none is measured"
+        description="temperature of the values, and assumed temperature of a stack without a sensor"
     )
     hydrogen_atm: Positive = Field(description="partial pressure at the anode")
     oxygen_atm: Positive = Field(description="partial pressure at the cathode; 0.21 in air at 1 atm")
@@ -79,14 +85,14 @@ class FuelCellModel(Strict):
 
     @property
     def activation_v(self) -> float:
-        """Activation loss at 1 A [V]: the a of Tafel's line a + A ln i."""
+        """Activation loss at 1 A [V]: parameter a of Tafel's line a + A ln i."""
         return -self.fuel_cell.tafel_slope_v * math.log(self.fuel_cell.exchange_current_a)
 
     def identified(self, a: NDArray[np.float64], std: dict[Parameter, float]) -> "FuelCellModel":
         """Return the stack with identified parameters.
 
         Args:
-            a: Constants as in the property ``a``; only the parameters are used.
+            a: Constants in the order of the property ``a``. Only the parameters are used.
             std: Relative standard deviations of the identified parameters.
         """
         r_ohm, tafel_v, activation_v, c_dl, b, limit, internal = (float(f"{value:.6g}") for value in a[1:8])

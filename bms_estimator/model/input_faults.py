@@ -18,10 +18,10 @@ class InputFault(IntFlag):
     @property
     def text(self) -> str:
         """Description and remedy of every set bit."""
-        return "; ".join(_TEXT[suspect] for suspect in InputFault if suspect in self)
+        return "; ".join(_TEXTS[suspect] for suspect in InputFault if suspect in self)
 
 
-_TEXT = {
+_TEXTS = {
     InputFault.SIGN_OF_CURRENT: "innovation grows with current, the voltage rises when discharge is said to rise: "
     "check the sign of the current (sensor.current_sign; --current-sign of a recording)",
     InputFault.OFFSET: "counted charge and voltage drift apart with time: "

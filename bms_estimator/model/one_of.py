@@ -11,7 +11,7 @@ from pydantic_core.core_schema import no_info_after_validator_function
 
 @dataclass(frozen=True)
 class OneOf:
-    """Annotation of a ``str`` field, the run-time equivalent of ``Literal``. The JSON schema lists the names."""
+    """Annotation of a ``str`` field that allows only ``names``, a ``Literal`` at run time. The JSON schema lists the names."""
 
     names: Collection[str]
 

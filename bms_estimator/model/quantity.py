@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple
 from pydantic import BaseModel
 
 FAST_INTERVAL_S = 15.0
-"""Minimum interval between two rows of a value that follows the load, in Home Assistant's recorder [s]."""
+"""Minimum interval between two recorded values of a quantity that changes with the load, in Home Assistant [s]."""
 SLOW_INTERVAL_S = 60.0
-"""Minimum interval between two rows of any other value [s]."""
+"""Minimum interval between two recorded values of any other quantity, in Home Assistant [s]."""
 
 
 class Entity(NamedTuple):
@@ -25,7 +25,7 @@ class Entity(NamedTuple):
     decimals: int
     """Number of decimals of a published value."""
     step: float
-    """Minimum change that is published, in the entity's unit; it exceeds the noise."""
+    """Minimum change that is published, in the entity's unit. It exceeds the noise."""
     device_class: str | None = None
     min_interval_s: float = SLOW_INTERVAL_S
     """Minimum interval between two published changes [s]."""
@@ -37,7 +37,7 @@ class Entity(NamedTuple):
     signed: bool = False
     """True if the sign depends on the configured direction of positive current."""
     immediate_step: float = math.inf
-    """Minimum change that is published at once, as after a user has set the SOC."""
+    """Minimum change that is published at once, for example after a user has set the SOC."""
 
 
 def raw_entity(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:

@@ -14,12 +14,13 @@ SAMPLE = np.dtype(
     [
         ("time_s", "f8"),  # time on the source's clock, not decreasing without faults
         ("current_a", "f8"),  # positive on discharge
-        ("voltage_v", "f8"),  # pack terminals
-        ("temperature_c", "f8"),  # NaN where there is no sensor
+        ("voltage_v", "f8"),  # voltage at the pack's terminals
+        ("temperature_c", "f8"),  # NaN without a sensor
         ("status", "u4"),  # bits of SampleStatus
     ],
     align=True,
 )
+"""Sample of a battery."""
 
 CurrentSign = Literal["discharge_positive", "charge_positive"]
 """Direction of the current that a device reports as positive."""

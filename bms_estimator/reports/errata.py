@@ -1,4 +1,7 @@
-"""Errata E1 to E36 of the thesis. Corrected numbers are computed, printed numbers are those of ``printed_values``."""
+"""Errata E1 to E36 of the thesis, numbered as in docs/theory/thesis.md.
+
+Corrected numbers are computed. Printed numbers are those of ``printed_values``.
+"""
 
 from dataclasses import dataclass
 
@@ -18,7 +21,7 @@ OCV_ERROR_V = 0.010
 """Error of E_o assumed by erratum 19 [V]."""
 SLOW_C = 1.0 / 20.0
 """C-rate of erratum 19 [1/h]."""
-BY_OHM = ("50 ohm", "25 ohm", "12.5 ohm")
+RESISTORS = ("50 ohm", "25 ohm", "12.5 ohm")
 """Resistors in order of decreasing resistance."""
 CELLS = ("chen_mora", "ncr18650", "thunder_power_6s")
 """Cells of 275 mAh, 3 Ah and 6.6 Ah."""
@@ -165,8 +168,8 @@ def _theory(s: Simulation) -> list[Erratum]:
 def _experiments(s: Simulation) -> list[Erratum]:
     """Return E20 to E26."""
     currents = printed_pack.current_errors_percent()
-    ohm = " / ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in BY_OHM)
-    off = " / ".join(f"{currents[load]:.1f}" for load in BY_OHM)
+    ohm = " / ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in RESISTORS)
+    off = " / ".join(f"{currents[load]:.1f}" for load in RESISTORS)
     six, small = load_cell("thunder_power_6s").cell, s.cell.cell
     parallel = six.capacity_ah / small.capacity_ah
     inferred = printed_values.INFERRED_WEIGHTS["10"]
@@ -232,7 +235,7 @@ def _second_audit(s: Simulation) -> list[Erratum]:
     bulb_v = printed_pack.mean_voltage_v(bulb_a)
     offset_a, gain = printed_pack.current_sensor()
     differences_a = printed_pack.current_differences_a()
-    off = ", ".join(f"{1e3 * differences_a[load]:.0f}" for load in BY_OHM)
+    off = ", ".join(f"{1e3 * differences_a[load]:.0f}" for load in RESISTORS)
     rates = {i: printed_values.implied_rates(i) for i in printed_values.INFERRED_WEIGHTS["5"]}
     above = {i: printed_values.TABLE_10[i][1] - printed_values.bounds("10", i).limit for i in (10, 12)}
     return [
@@ -266,7 +269,7 @@ def _second_audit(s: Simulation) -> list[Erratum]:
             "5.2.1",
             "currents of the loads (E21)",
             f"their differences from Ohm's law, {off} mA at "
-            + ", ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in BY_OHM)
+            + ", ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in RESISTORS)
             + f" Ω, are an offset of {1e3 * offset_a:.0f} mA and {100.0 * gain:.1f} % of the current. These are plausible errors of the "
             "sensor, which would make the counted charge too small as well",
         ),

@@ -1,4 +1,4 @@
-"""Data of chapter 5: real captures, or the simulated pack measured by two sensor chains."""
+"""Data of chapter 5 of the thesis: real captures, or the simulated pack measured by two sensor chains."""
 
 from dataclasses import dataclass
 from functools import cached_property

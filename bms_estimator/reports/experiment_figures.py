@@ -1,4 +1,7 @@
-"""Figures 26 to 38 and 40 to 42: results of the procedure of chapter 5."""
+"""Figures 26 to 38 and 40 to 42 of the thesis: results of the procedure of chapter 5.
+
+Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +17,7 @@ from bms_estimator.reports.simulation import SOC_GRID
 from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot, products_plot
 from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
 
-PER_FIGURE = 4
+MAX_LOADS = 4
 """Maximum number of loads in a figure, as in Fig. 32."""
 
 
@@ -63,6 +66,7 @@ def figure_27(experiment: Experiment) -> Figure:
 
 
 def _currents(captures: list[Any], key: str) -> str:
+    """Return a figure of the currents of captures, one plot for each; empty without captures."""
     if not captures:
         return ""
     columns = 2 if len(captures) > 1 else 1
@@ -151,10 +155,12 @@ def figure_31(experiment: Experiment) -> Figure:
 
 
 def _constant(p: Procedure) -> list[str]:
-    return [c.name for c in p.of(Kind.CONSTANT)][:PER_FIGURE]
+    """Return the names of the constant loads, at most ``MAX_LOADS``."""
+    return [c.name for c in p.of(Kind.CONSTANT)][:MAX_LOADS]
 
 
 def _steps(p: Procedure) -> list[str]:
+    """Return the names of the first two loads that are not constant."""
     return [name for name in p.dynamic if name not in _constant(p)][:2]
 
 
@@ -165,6 +171,7 @@ def _largest(p: Procedure, names: list[str]) -> str:
 
 
 def _grid(names: list[str], one: Callable[[Any, str], None], key: str) -> str:
+    """Return a figure with one plot for each load in ``names``, drawn by ``one``; empty without loads."""
     if not names:
         return ""
     columns = 2 if len(names) > 1 else 1
@@ -220,7 +227,7 @@ def figure_33(experiment: Experiment) -> Figure:
 
 def figure_34(experiment: Experiment) -> Figure:
     """Draw the currents of the constant loads."""
-    captures = experiment.protocol.of(Kind.CONSTANT)[:PER_FIGURE]
+    captures = experiment.protocol.of(Kind.CONSTANT)[:MAX_LOADS]
     return _figure("34", "Constant loads: currents", _currents(captures, "34"), experiment, "")
 
 

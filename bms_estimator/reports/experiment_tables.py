@@ -1,4 +1,7 @@
-"""Tables 8 to 11 and 13: results of the procedure of chapter 5, with the printed values."""
+"""Tables 8 to 11 and 13 of the thesis: results of the procedure of chapter 5, with the printed values.
+
+Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+"""
 
 from collections.abc import Callable
 

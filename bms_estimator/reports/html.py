@@ -7,7 +7,7 @@ from bms_estimator.reports.report_items import Figure, Item, Reproduction, Table
 from bms_estimator.reports.thesis_report import Report
 from bms_estimator.version import __version__
 
-BADGE = {
+CSS_CLASSES = {
     Reproduction.FITTED: "fitted",
     Reproduction.RECOMPUTED: "recomputed",
     Reproduction.CLAIM_HOLDS: "holds",
@@ -17,6 +17,7 @@ BADGE = {
     Reproduction.GIVEN: "given",
     Reproduction.ADDED: "added",
 }
+"""CSS class of each verdict."""
 
 STYLE = """
 :root { --ink: #1d2733; --soft: #5a6776; --line: #dfe4ea; --paper: #fff; --shade: #f5f7f9; --accent: #1f5fa8; }
@@ -65,6 +66,7 @@ footer { color: var(--soft); font-size: .85rem; margin-top: 3rem; }
 @media (max-width: 60rem) { body { display: block; } nav { display: none; } main { padding: 1.2rem; } }
 @media print { nav { display: none; } body { display: block; } article { break-inside: avoid; } }
 """
+"""Style sheet of the page."""
 
 LONG_CELL = 40
 """Maximum length of a cell in a table of numbers [characters]. A table with longer cells is left-aligned and wraps."""
@@ -107,14 +109,16 @@ def write(report: Report, folder: Path) -> Path:
 
 
 def _anchor(item: Item) -> str:
+    """Return the HTML id of an item."""
     return f"{item.kind}-{item.key}".lower().replace(" ", "-")
 
 
 def _navigation(report: Report) -> str:
+    """Return the side bar with links to all items."""
     parts = ["<nav>"]
     for chapter, items in report.chapters:
         links = "".join(
-            f'<a class="{BADGE[item.verdict]}" href="#{_anchor(item)}" title="{escape(item.title)}">{_short(item)}</a>'
+            f'<a class="{CSS_CLASSES[item.verdict]}" href="#{_anchor(item)}" title="{escape(item.title)}">{_short(item)}</a>'
             for item in items
         )
         parts.append(f'<b>{escape(chapter)}</b><div class="marks">{links}</div>')
@@ -122,14 +126,16 @@ def _navigation(report: Report) -> str:
 
 
 def _short(item: Item) -> str:
+    """Return the short name of an item, such as T 5 or F 19."""
     if item.verdict is Reproduction.ADDED:
         return item.key
     return f"{'T' if isinstance(item, Table) else 'F'} {item.key}"
 
 
 def _counts(report: Report) -> str:
+    """Return the list of verdicts, each with its number of items."""
     parts = []
-    for verdict, css in BADGE.items():
+    for verdict, css in CSS_CLASSES.items():
         count = sum(item.verdict is verdict for item in report.items)
         if count:
             words = "diagram, photograph or input" if verdict is Reproduction.GIVEN else verdict.value
@@ -138,7 +144,7 @@ def _counts(report: Report) -> str:
 
 
 def _badge(item: Item) -> str:
-    return f'<span class="badge {BADGE[item.verdict]}">{escape(label(item))}</span>'
+    return f'<span class="badge {CSS_CLASSES[item.verdict]}">{escape(label(item))}</span>'
 
 
 def _article(item: Item) -> str:
@@ -149,6 +155,8 @@ def _article(item: Item) -> str:
 
 
 def _table(table: Table) -> str:
+    """Return a table; printed columns are faint, columns computed by this project are bold."""
+
     def style(column: str) -> str:
         # values of this project are emphasized: recomputed values, and the joint fit of Table 8
         if column.startswith("printed"):
@@ -167,6 +175,7 @@ def _table(table: Table) -> str:
 
 
 def _summary(report: Report) -> str:
+    """Return the table of all items with their verdicts and reasons."""
     rows = "".join(
         f'<tr><td><a href="#{_anchor(item)}">{_short(item)}</a></td><td>{escape(item.title)}</td>'
         f"<td>{_badge(item)}</td><td>{escape(item.reason)}</td></tr>"

@@ -1,4 +1,7 @@
-"""Pack with the printed parameters of Tables 8 to 10: Figures 28 to 30, and a check of the printed currents."""
+"""Pack with the parameters of Tables 8 to 10 of the thesis: Figures 28 to 30, and a check of the printed currents.
+
+Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +19,7 @@ from bms_estimator.reports.svg_plot import plot
 from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
 A = printed_values.tables_8_to_10()
+"""Parameters a1..a21 of Tables 8 to 10 at index 1..21."""
 EMPTY_SOC = 0.02
 """SOC at the end of a discharge through a resistor, above delta2."""
 GRID = np.linspace(EMPTY_SOC, 1.0, 9801)
@@ -54,7 +58,7 @@ def mean_voltage_v(current_a: float) -> float:
 
 
 def current_differences_a() -> dict[str, float]:
-    """Return each printed current minus that of Ohm's law [A]."""
+    """Return each printed current minus the current by Ohm's law [A]."""
     return {
         load: printed_values.CURRENTS_A[load] - mean_current_a(ohm)
         for load, ohm in printed_values.RESISTORS_OHM.items()

@@ -1,4 +1,7 @@
-"""Numbers as printed in the thesis, including misprints."""
+"""Numbers as printed in the thesis, including misprints.
+
+Numbers in parentheses are sections and equations of the thesis, and E1 to E36 are its errata (``errata``).
+"""
 
 import numpy as np
 
@@ -9,7 +12,7 @@ CHEN_MORA_ROUNDED = (0.30, 29.0, 0.04, 6.0, 155.0, 0.04, 752.0, 13.0, 703.0, 605
 """Rounded a1..a15 of Chen and Mora, which are also the initial values of Tables 2 and 3."""
 
 TABLE_1 = (1.031, 35.0, 3.685, 0.2156, 0.1178, 0.3201)
-"""a16..a21."""
+"""Parameters a16..a21 of the simulations."""
 
 TABLE_2 = (
     0.7607,
@@ -30,7 +33,9 @@ TABLE_2 = (
 )
 """Estimates a1..a15, scheme 1."""
 TABLE_2_ERROR = (153, 1.5, 1151, 7.67, 0.297, 1151.75, 0.0612, 3.54, 0.0655, 0.00761, 1.7, 0.0089, 460.7, 1.919, 658.14)
+"""Errors of a1..a15, scheme 1 [%]."""
 TABLE_2_SHIFT = 0.4607
+"""Common change of a1..a15 in scheme 1."""
 
 TABLE_3 = (
     0.3,
@@ -51,9 +56,11 @@ TABLE_3 = (
 )
 """Estimates a1..a15, scheme 2."""
 TABLE_3_ERROR = (0, 2.13, 0, 10.3, 0.34, 0, 0.0822, 4.755, 0.0879, 0.00991, 2.289, 0.0134, 0, 2.575, 0)
+"""Errors of a1..a15, scheme 2 [%]."""
 TABLE_3_SHIFT = 0.6182
+"""Common change of the parameters that scheme 2 does not pull back."""
 SMALL = (1, 3, 6, 13, 15)
-"""Indices of the small parameters (set q), which schemes 2 and 3 pull back."""
+"""Indices of the small parameters, the set q of the thesis. Schemes 2 and 3 pull them back."""
 
 TABLE_4 = {
     1: (0.30, 0.25, 0.2946, 0.3208, 8.16),
@@ -62,8 +69,9 @@ TABLE_4 = {
     13: (0.15, 0.1, 0.1475, 0.1562, 5.569),
     15: (0.07, 0.04, 0.0489, 0.04669, 4.7),
 }
-"""Index: upper bound, lower bound, estimate, desired value, error [%]; weights 100 and 1."""
+"""Upper bound, lower bound, estimate, desired value and error [%] by index."""
 TABLE_4_WEIGHTS = (100.0, 1.0)
+"""Weights lambda_x and lambda_y of Table 4 [1/s]."""
 
 BOUNDS = {
     1: (1.0, 0.1, 50.0, 50.0),
@@ -99,18 +107,18 @@ TABLE_5 = {
     11: (162.0, 27.5014, 27.12, 1.386),
     12: (363.0, 3666.6, 4475.0, 22.04),
 }
-"""Index: initial value, estimate, desired value, error [%]."""
+"""Initial value, estimate, desired value and error [%] by index."""
 
 TABLE_6 = {13: (0.1562, 0.4963, "2.17"), 14: (24.37, 33.07, "35.6"), 15: (0.07446, 0.06546, "0.06546")}
-"""Index: desired value, estimate, error column as printed."""
+"""Desired value, estimate and error as printed, by index."""
 
 TABLE_7 = {"R_ts": 8.61, "R_tl": 3.54, "C_tl": 1.326, "C_ts": 19.166, "R_ts C_ts": 1.9225, "R_tl C_tl": 0.0384}
 """Absolute average estimation error [%]."""
 
 TABLE_8 = (5.112, 40.955, 22.195, 1.9215, 1.7590, 3.0435)
-"""a16..a21."""
+"""Estimates a16..a21 of the experiments."""
 TABLE_9 = (0.0439, 59.07, 0.2246)
-"""a13..a15."""
+"""Estimates a13..a15 of the experiments."""
 TABLE_10 = {
     1: (1800.0, 0.5505),
     2: (174000.0, 30.0475),
@@ -125,7 +133,7 @@ TABLE_10 = {
     11: (162000.0, 27.5422),
     12: (42000000.0, 3696.0),
 }
-"""Index: initial value, estimate."""
+"""Initial value and estimate by index."""
 TABLE_11 = {
     "25 ohm": 0.234,
     "50 ohm": 0.2697,
@@ -144,18 +152,20 @@ MAX_STEPS = 1.5
 USUAL_STEPS = 0.1
 """Error under steps "most of the time" (5.3.2) [%]."""
 TABLE_12 = {"dynamic": 4.5, "static": 6.44}
+"""Mean errors of the dynamic and the static model in simulation, as printed."""
 TABLE_13 = {"dynamic": 0.003, "static": 0.358}
+"""Mean errors of the dynamic and the static model in the experiment, as printed."""
 
 CURRENTS_A = {"25 ohm": 0.860, "50 ohm": 0.416, "12.5 ohm": 1.741, "50 W bulb": 3.652}
-"""Average current of each load (5.2.1)."""
+"""Average current of each load (5.2.1) [A]."""
 RESISTORS_OHM = {"25 ohm": 25.0, "50 ohm": 50.0, "12.5 ohm": 12.5}
-"""Resistances of the loads (5.1)."""
+"""Resistances of the loads (5.1) [ohm]."""
 SENSOR_RANGE_V = 25.0
 """Range of the voltage sensor (5.1) [V]."""
 BULB_W = 50.0
-"""Rating of one bulb (5.1)."""
+"""Rated power of one bulb (5.1) [W]."""
 RUN_HOURS = (4.0, 16.0)
-"""Length of the experimental runs (5.2)."""
+"""Minimum and maximum duration of the experimental runs (5.2) [h]."""
 
 INFERRED_WEIGHTS = {
     "5": {7: (196.0, 182.0), 8: (15.0, 30.0), 10: (20.0, 20.0), 11: (150.0, 150.0), 12: (50.0, 100.0)},

@@ -1,10 +1,12 @@
-"""Experimental procedure of chapter 5 on captures: steps 1 to 3, validation, SOC by interpolation.
+"""Experimental procedure of chapter 5 of the thesis on captures: steps 1 to 3, validation, SOC by interpolation.
+
+Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
 
 The captures are real ones, or those of the simulated pack. Each result is computed on first use.
 
 No parameter is estimated from the capture that validates it. Step 1 uses only the relaxation tests. Step 2 uses the
 constant load of the smallest current, with bounds that do not depend on captures. Step 3 uses the constant loads up to
-0.6C and the loads of the relaxation tests; for the validation of a constant load, that load is excluded.
+0.6C and the loads of the relaxation tests. For the validation of a constant load, that load is excluded.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Response of (3.1)-(3.3) to a constant current with true parameters, for errata 15, 16 and 27.
+"""Response of (3.1)-(3.3) of the thesis to a constant current with true parameters, for errata 15, 16 and 27.
 
 Both RC pairs of the observer are driven by one input u, but those of the cell by i/C_ts and i/C_tl. If x2^ and x3^ change
 slowly, u = x2^/tau_ts = x3^/tau_tl. Therefore x2^ : x3^ is tau_ts : tau_tl in the observer and R_ts : R_tl in the cell.

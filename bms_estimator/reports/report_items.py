@@ -97,6 +97,6 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def percent(value: float, true: float) -> str:
-    """Format the error of ``value`` in percent of the true value (E7)."""
+    """Format the error of ``value`` in percent of the true value (erratum 7)."""
     error = 100.0 * abs(value - true) / abs(true)
     return "0" if error < 1e-4 else number(error, 3)

@@ -1,8 +1,8 @@
-"""Simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5, measured by a simulated sensor chain.
+"""Simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5 of the thesis, measured by a simulated sensor chain.
 
 The pack has the open-circuit voltage of Table 8, the R_s of Table 9, and the R_ts, R_tl, C_ts, C_tl of Chen and Mora, with
 which Fig. 29 compares. These lie within the bounds of Table 10, but not at their Lemma 4.1.3 limits. The loads are the
-resistors of 5.1, whose currents differ from the printed ones (E21). The bulb is a resistor with the bulb's printed
+resistors of section 5.1, whose currents differ from the printed ones (erratum 21). The bulb is a resistor with the bulb's printed
 current. The voltage is measured by a divider, the current by a +-10 A sensor. Noise is uniform within half a step, before
 rounding.
 """
@@ -28,7 +28,7 @@ QUARTER_HOUR_S = 900.0
 LOWEST_SOC = 0.012
 """SOC at the end of a discharge, just above delta2 of the true pack."""
 VARIABLE_STEPS = ((600.0, "12.5 ohm"), (300.0, "50 W bulb"), (900.0, "12.5 ohm"), (420.0, ""), (240.0, "50 W bulb"))
-"""Durations [s] and loads of test protocol 4, which the thesis does not print."""
+"""Duration [s] and load of each step of test protocol 4. The thesis does not print them."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 Values that the thesis does not print are chosen as N(k) = E_2.5(-k^2.5), k0 = 0, x2(0) = x3(0) = 0, without sensor noise.
 If the printed weights contradict the printed estimates, the inferred weights are used (E4, E24, E32).
+Numbers in parentheses are equations and sections of the thesis, and E1 to E36 are its errata (``errata``).
 """
 
 from dataclasses import dataclass
@@ -34,15 +35,15 @@ CURRENT_A = 0.275
 SMALL_CURRENT_A = 0.0275
 """Current of C/10 for step 2 [A]. Algorithm 1 needs a very small current, which the thesis does not print."""
 R_S_CURRENTS_A = (0.1, 0.275, 0.55)
-"""Currents for (4.2) [A]; the thesis does not print its own."""
+"""Currents for (4.2) [A]. The thesis does not print its currents."""
 LOWEST_SOC = 0.05
 """Lower end of the SOC range of errors: below it the elements diverge (E14)."""
 SOC_GRID = np.linspace(LOWEST_SOC, 1.0, 951)
-"""SOC range of errors."""
+"""SOC grid over which errors are computed."""
 PULSE_S = 600.0
-"""Half period of the pulsed load of Fig. 39."""
+"""Half period of the pulsed load of Fig. 39 [s]."""
 STATIC_SOC = 0.5
-"""SOC at which the static model's elements are frozen; the thesis does not print its own."""
+"""SOC whose elements the static model has. The thesis does not print this SOC."""
 FINAL_SOC = 0.02
 """SOC at which the comparison of model and cell ends, above delta2 = 0.0179 of Table 5's estimates."""
 EPSILON_V = 1e-3
@@ -50,7 +51,7 @@ EPSILON_V = 1e-3
 START_OVER_S = 60.0
 """t_int of (3.19) for a start with a large error, after which |e| settles late [s]."""
 START_TIMES_S = np.r_[np.arange(0.0, 10.0, 0.0002), np.arange(10.0, START_OVER_S, STEP_S)]
-"""Sample times of a start with a large error [s]. The kernel keeps N constant during a step, although N decreases while k
+"""Sample times of a start with a large error [s]. In the kernel N is constant during a step, although N decreases while k
 grows. With steps of 0.2 ms the result agrees with the differential equations to four digits; with 10 ms the fitted lambda
 is 2 % larger."""
 AFTER_START_S = 1.0
@@ -196,6 +197,7 @@ class Simulation:
         return self._fit_start(ALPHA, -1.4, 9.0), self._fit_start(OTHER_ALPHA, 1.4, 17.0)
 
     def _fit_start(self, alpha: float, near_v: float, near_lambda: float) -> OneStart:
+        """Fit start voltage and lambda to the changes of a2 in Tables 2 and 3, from ``near_v`` [V] and ``near_lambda``."""
         shifts = {"scheme-1": printed_values.TABLE_2_SHIFT, "scheme-2": printed_values.TABLE_3_SHIFT}
 
         def residuals(unknown: Floats) -> list[float]:
@@ -284,6 +286,7 @@ class Simulation:
 
 
 ELEMENTS = {"R_ts": r_ts, "C_ts": c_ts, "R_tl": r_tl, "C_tl": c_tl}
+"""Functions of SOC and parameters by element."""
 
 
 def element(name: str, a: Floats, soc: Floats = SOC_GRID) -> Floats:

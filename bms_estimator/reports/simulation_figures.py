@@ -1,4 +1,7 @@
-"""Figures 3 to 10, 13 to 17, 19 to 23 and 39 of the thesis, recomputed."""
+"""Figures 3 to 10, 13 to 17, 19 to 23 and 39 of the thesis, recomputed.
+
+Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -23,9 +26,10 @@ from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
 from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
 NO_VALUES = "The thesis prints no value of the figure that could be compared."
-WHOLE = np.linspace(0.0, 1.0, 1001)
-"""Whole range of SOC."""
-WEAK_SOC = (0.85, 0.7)
+"""Reason of a figure without printed values."""
+FULL_SOC_GRID = np.linspace(0.0, 1.0, 1001)
+"""SOC grid over the full range."""
+WEAK_BATTERY_SOC = (0.85, 0.7)
 """Initial SOC of the weak batteries in Fig. 43."""
 
 
@@ -33,7 +37,7 @@ def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, 
     """Draw an element or the EMF of the cell over SOC."""
 
     def draw(axes: Any) -> None:
-        axes.plot(WHOLE, values)
+        axes.plot(FULL_SOC_GRID, values)
         axes.set(xlabel="SOC $x_1$", ylabel=unit, xlim=(0.0, 1.0))
         if limits is not None:
             axes.set_ylim(*limits)
@@ -44,32 +48,34 @@ def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, 
 
 def figure_3(s: Simulation) -> Figure:
     """Draw E_o."""
-    return curve("3", "Open-circuit voltage E_o over SOC, (2.10)", "V", np.array([emf(x, s.cell.a) for x in WHOLE]))
+    return curve(
+        "3", "Open-circuit voltage E_o over SOC, (2.10)", "V", np.array([emf(x, s.cell.a) for x in FULL_SOC_GRID])
+    )
 
 
 def figure_4(s: Simulation) -> Figure:
     """Draw R_s."""
-    return curve("4", "R_s over SOC, (2.9)", "Ω", np.array([r_s(x, s.cell.a) for x in WHOLE]))
+    return curve("4", "R_s over SOC, (2.9)", "Ω", np.array([r_s(x, s.cell.a) for x in FULL_SOC_GRID]))
 
 
 def figure_5(s: Simulation) -> Figure:
     """Draw R_ts."""
-    return curve("5", "R_ts over SOC, (2.5)", "Ω", element("R_ts", s.cell.a, WHOLE))
+    return curve("5", "R_ts over SOC, (2.5)", "Ω", element("R_ts", s.cell.a, FULL_SOC_GRID))
 
 
 def figure_6(s: Simulation) -> Figure:
     """Draw C_ts."""
-    return curve("6", "C_ts over SOC, (2.7)", "F", element("C_ts", s.cell.a, WHOLE))
+    return curve("6", "C_ts over SOC, (2.7)", "F", element("C_ts", s.cell.a, FULL_SOC_GRID))
 
 
 def figure_7(s: Simulation) -> Figure:
     """Draw R_tl."""
-    return curve("7", "R_tl over SOC, (2.6)", "Ω", element("R_tl", s.cell.a, WHOLE), (0.0, 0.5))
+    return curve("7", "R_tl over SOC, (2.6)", "Ω", element("R_tl", s.cell.a, FULL_SOC_GRID), (0.0, 0.5))
 
 
 def figure_8(s: Simulation) -> Figure:
     """Draw C_tl."""
-    return curve("8", "C_tl over SOC, (2.8)", "F", element("C_tl", s.cell.a, WHOLE))
+    return curve("8", "C_tl over SOC, (2.8)", "F", element("C_tl", s.cell.a, FULL_SOC_GRID))
 
 
 def figure_9(_: Simulation) -> Figure:
@@ -380,7 +386,7 @@ def dynamic_static_plot(axes: Any, dynamic: Prediction, static: Prediction) -> N
 def figure_43(s: Simulation) -> Figure:
     """Draw E_o of a battery bank with a fault."""
     drawn = np.linspace(0.0, 1.0, 800)
-    starts = {"healthy bank": (1.0, 1.0, 1.0), "two weak batteries": (1.0, *WEAK_SOC)}
+    starts = {"healthy bank": (1.0, 1.0, 1.0), "two weak batteries": (1.0, *WEAK_BATTERY_SOC)}
 
     def draw(axes: Any) -> None:
         for label, initial in starts.items():
@@ -395,7 +401,7 @@ def figure_43(s: Simulation) -> Figure:
         plot(draw, salt="figure-43"),
         Reproduction.NO_DATA,
         "The bank's batteries and their SOC are not printed; here three cells of Chen and Mora in series, two of which start at SOC "
-        f"{WEAK_SOC[0]:g} and {WEAK_SOC[1]:g}. As in print, each weak battery causes a dip when it is empty.",
+        f"{WEAK_BATTERY_SOC[0]:g} and {WEAK_BATTERY_SOC[1]:g}. As in print, each weak battery causes a dip when it is empty.",
     )
 
 

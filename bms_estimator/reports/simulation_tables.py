@@ -1,4 +1,7 @@
-"""Tables 1 to 7 and 12 of the thesis with printed and recomputed values, and a test of Theorem 4.1.2."""
+"""Tables 1 to 7 and 12 of the thesis with printed and recomputed values, and a test of Theorem 4.1.2.
+
+Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+"""
 
 from collections.abc import Callable
 
@@ -72,6 +75,17 @@ def _scheme_table(
     started: Floats,
     reason: str,
 ) -> Table:
+    """Return the table of scheme 1 or 2.
+
+    Args:
+        simulation: Runs of the schemes.
+        key: Number of the table.
+        title: Caption.
+        print_: Printed estimates and printed errors [%].
+        plain: Averages of the run with x2(0) = x3(0) = 0.
+        started: Averages of the run with the fitted start.
+        reason: First sentences of the reason.
+    """
     rows = []
     for i, (start, estimate, error) in enumerate(zip(printed_values.CHEN_MORA_ROUNDED, *print_, strict=True), 1):
         recomputed, true = float(started[i]), float(simulation.cell.a[i])

@@ -10,11 +10,13 @@ import numpy as np
 from bms_estimator.model.arrays import Floats
 
 INK = "#1d2733"
+"""Color of texts and ticks."""
 FAINT = "#8a97a6"
+"""Color of axes and secondary lines."""
 COLOURS = ("#1f5fa8", "#d1602b", "#2f8f5b", "#8a4fa3", "#b08a1e", "#4aa3b5")
 """Colors that differ in print and for color-blind readers: blue, orange, green, violet, ochre, teal."""
 POINTS = 1200
-"""Maximum number of points on a line; more are not visible at this width."""
+"""Maximum number of points on a line. More points are not visible at the width of a figure."""
 WIDTH_IN = 8.0
 """Width of a figure [inches]."""
 ROW_IN = 3.0
@@ -70,7 +72,7 @@ def plot(draw: Callable[[Any], None], *, rows: int = 1, columns: int = 1, salt: 
 
 
 def thin(x: Floats, *curves: Floats, points: int = POINTS) -> tuple[Floats, ...]:
-    """Reduce the points of curves; keep first, lowest and highest of the first curve in each interval."""
+    """Reduce the points of curves to the first, lowest and highest point of the first curve in each interval."""
     if x.size <= points:
         return (x, *curves)
     y = curves[0]

@@ -1,4 +1,4 @@
-"""Test of Theorem 4.1.2, that the products R_ts C_ts and R_tl C_tl converge to the true values.
+"""Test of Theorem 4.1.2 of the thesis, that the products R_ts C_ts and R_tl C_tl converge to the true values.
 
 The theorem claims this for a small current, for any limits of a1..a12. Here the observer runs at several currents and
 with several bounds on a simulated cell.
@@ -22,7 +22,7 @@ from bms_estimator.reports.simulation import (
 )
 
 C_RATES = (1.0, 0.1, 0.01)
-"""C-rates of the runs [1/h]; the smallest takes a hundred hours from full to empty."""
+"""C-rates of the runs [1/h]. The run at the smallest takes a hundred hours from full to empty."""
 SAMPLES = 100_000
 """Number of samples of each run, from full to empty."""
 SETTLED_FROM_S = 60.0
@@ -49,6 +49,7 @@ class RunResult:
 
 
 PRODUCTS = ("R_ts C_ts", "R_tl C_tl")
+"""Names of the RC products."""
 
 
 def bounds_sets(cell: CellModel) -> dict[str, dict[int, Bounds]]:
@@ -57,7 +58,7 @@ def bounds_sets(cell: CellModel) -> dict[str, dict[int, Bounds]]:
     def around(low: float, high: float) -> dict[int, Bounds]:
         bounds = {}
         for i in range(1, 13):
-            # scaled are only offsets and amplitudes of the resistances, not exponents and capacitances
+            # only offsets and amplitudes of the resistances are scaled, not exponents and capacitances
             scale = (low, high) if i in (1, 3, 4, 6) else (0.5, 1.5)
             value = float(cell.a[i])
             bounds[i] = Bounds(lower=scale[0] * value, upper=scale[1] * value, weight_upper=50.0, weight_lower=50.0)
@@ -84,6 +85,7 @@ def measure() -> tuple[RunResult, ...]:
 
 
 def _measure(cell: CellModel, name: str, c_rate: float, limit: Floats) -> RunResult:
+    """Run the improved method from full to empty at ``c_rate``; ``limit`` are the limits of a1..a12 at index 1..12."""
     current_a = c_rate * cell.cell.capacity_ah
     samples = discharge(cell, current_a, 3600.0 / c_rate / SAMPLES)
     estimator = Estimator(

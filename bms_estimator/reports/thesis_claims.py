@@ -20,8 +20,8 @@ from bms_estimator.reports.simulation import element
 PRODUCTS_PERCENT = 20.0
 """Maximum error of the RC products [%]: ten times the 1.9 % of Table 7. Theorem 4.1.2 claims that they are exact."""
 SOC_PERCENT = 5.0
-"""Maximum error of the interpolated SOC [%]. Coulomb counting keeps an initial error of this size; section 7.1 claims that
-interpolation is more accurate."""
+"""Maximum error of the interpolated SOC [%]. An initial error of this size persists in coulomb counting. Section 7.1 of the
+thesis claims that interpolation is more accurate."""
 MIDDLE_SOC = 0.5
 """SOC at which the RC products are compared."""
 
@@ -51,7 +51,7 @@ class Claim:
     """Claim of the thesis, and the results on other captures.
 
     Attributes:
-        key: Mark in the tables: "mean, constant loads".
+        key: Name of the claim in the tables, such as "constant loads, mean".
         location: Table or figure.
         criterion: Condition for more than half of the captures.
         results: Results of each capture that the claim can be tested on.
@@ -142,8 +142,11 @@ def _products(p: Procedure) -> list[Result]:
 
 
 PRINTED_RATIO = printed_values.TABLE_13["dynamic"] / printed_values.TABLE_13["static"]
+"""Printed mean error of the dynamic model divided by that of the static model."""
 LARGEST_CONSTANT = max(printed_values.TABLE_11[load] for load in printed_values.CURRENTS_A)
+"""Largest printed mean error under a constant load [%]."""
 LARGEST_STEPS = max(printed_values.TABLE_11[load] for load in ("constant steps", "variable steps"))
+"""Largest printed mean error under steps [%]."""
 
 CLAIMS: dict[str, tuple[str, str, Callable[[Procedure], list[Result]]]] = {
     "constant loads, mean": (

@@ -38,6 +38,7 @@ FUEL_CELL = dict.fromkeys(
     "The recording is not published, nor are the equations of its model. The project's own model of a fuel cell, after section "
     "7.3, is in docs/theory/fuel-cell.md.",
 )
+"""Reason of the figures of a fuel cell, by number."""
 
 CHAPTERS: dict[str, tuple[str, ...]] = {
     "2  The model and the Nussbaum gain": ("F1", "F2", "F3", "F4", "F5", "F6", "F7", "F8", "F9", "F10"),

@@ -12,7 +12,8 @@ from bms_estimator.settings.alarm_kinds import Quantity
 
 Counts = NDArray[np.int64]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
-LOST: dict[Quantity, str] = {
+"""All measured quantities."""
+LOSS_TEXTS: dict[Quantity, str] = {
     "voltage": "the voltage is no longer measured",
     "current": "the current is no longer measured",
     "temperature": "the temperature is no longer measured",
@@ -37,8 +38,8 @@ class _Input:
     _back_s: float | None = None
     """Time since the first value after a loss [s]; None: no value has arrived since."""
 
-    def take(self, times_s: Floats, steps_s: Floats, counts: Counts, lost_s: float) -> list[float]:
-        """Take the number of values in each sample. Return the times at which the quantity was lost or measured again [s]."""
+    def update(self, times_s: Floats, steps_s: Floats, counts: Counts, lost_s: float) -> list[float]:
+        """Process the number of values in each sample. Return the times at which the quantity was lost or measured again [s]."""
         expected = np.maximum.accumulate(np.concatenate(([self.measured], counts)))[1:]
         self.measured = int(expected[-1])
         present = counts >= expected
@@ -46,10 +47,10 @@ class _Input:
             self._missing_s = None
             return []
         steps = zip(times_s.tolist(), steps_s.tolist(), present.tolist(), strict=True)
-        return [at_s for at_s, step_s, there in steps if self._step(step_s, lost_s, present=there)]
+        return [at_s for at_s, step_s, is_present in steps if self._step(step_s, lost_s, present=is_present)]
 
     def _step(self, step_s: float, lost_s: float, *, present: bool) -> bool:
-        """Take one sample. Return True if ``lost`` has changed."""
+        """Process one sample. Return True if ``lost`` has changed."""
         before = self.lost
         self._missing_s = None if present else 0.0 if self._missing_s is None else self._missing_s + step_s
         if self._missing_s is not None and self._missing_s >= lost_s:
@@ -88,8 +89,8 @@ class Inputs:
         """Return True if all these quantities were measured at some time."""
         return all(self._inputs[name].measured for name in names)
 
-    def take(self, times_s: Floats, steps_s: Floats, counts: Mapping[Quantity, Counts]) -> list[float]:
-        """Take samples.
+    def update(self, times_s: Floats, steps_s: Floats, counts: Mapping[Quantity, Counts]) -> list[float]:
+        """Process the number of values in each sample.
 
         Args:
             times_s: Time of each sample [s], shape (n,).
@@ -103,7 +104,7 @@ class Inputs:
         return [
             at_s
             for name, each in self._inputs.items()
-            for at_s in each.take(times_s, steps_s, bounded[name], self.lost_s)
+            for at_s in each.update(times_s, steps_s, bounded[name], self.lost_s)
         ]
 
     def restore(self, saved: Mapping[str, Any]) -> None:

@@ -15,7 +15,7 @@ from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
 INITIAL_ROWS = 256
 """Initial capacity of a buffer [rows]."""
 RECENT_STEPS = 4.0
-"""Multiple of a long interval's length within which another one of about its length must follow for both to be usual."""
+"""Maximum time between two long intervals that count as regular, in multiples of their length."""
 _NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
 """Row of ``_extremes`` for a sample without cell voltages."""
 
@@ -24,8 +24,8 @@ _NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
 class SampleIntervals:
     """Intervals between samples. A value is assumed to hold between two samples, unless there is a gap.
 
-    A gap is much longer than the longest interval shortly before. Samples that arrive in bursts have one long interval
-    before each burst; from the second burst on, these intervals are no gaps.
+    A gap is much longer than the longest recent interval. Samples that arrive in bursts have one long interval before each
+    burst. From the second burst on, these intervals do not count as gaps.
 
     Attributes:
         gap_s: Minimum length of a gap [s].
@@ -43,7 +43,8 @@ class SampleIntervals:
         """Return two arrays of shape (n,) for the interval before each sample.
 
         Returns:
-            The interval [s], 0 where the clock was set back; and the interval during which values held [s], 0 in gaps.
+            The interval, 0 where the clock was set back [s]; and the part of the interval during which values held, 0 in
+            gaps [s].
         """
         passed_s = np.diff(times_s, prepend=self._last_s)
         passed_s = np.where(passed_s > 0.0, passed_s, 0.0)
@@ -56,7 +57,7 @@ class SampleIntervals:
         return passed_s, observed_s
 
     def _is_usual(self, at_s: float, step_s: float) -> bool:
-        """Return True if an interval of about this length occurred recently; record this one."""
+        """Return True if an interval of about this length occurred recently, and record the interval."""
         is_recent = abs(at_s - self._longest_at_s) <= RECENT_STEPS * self._longest_s
         is_usual = is_recent and step_s <= GAP_RATIO * self._longest_s
         if not is_recent or step_s >= self._longest_s:
@@ -100,7 +101,7 @@ class SampleBuffer:
 
 
 class _Rows:
-    """Buffer of rows of one dtype. Rows are copied in place: joining hundreds of short structured arrays takes milliseconds."""
+    """Buffer of rows of one dtype. Rows are copied in place, because joining hundreds of short arrays takes milliseconds."""
 
     def __init__(self, dtype: Any, columns: tuple[int, ...] = ()) -> None:
         self._rows = np.zeros((INITIAL_ROWS, *columns), dtype=dtype)

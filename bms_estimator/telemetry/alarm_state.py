@@ -1,4 +1,4 @@
-"""State machine of one alarm: hysteresis, delays, latch. Its time is that of the samples; it reads no clock."""
+"""State machine of one alarm: hysteresis, delays, latch. All times are those of the samples, so that no clock is read."""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +14,9 @@ class RaisedAlarm(NamedTuple):
     """Time and value at which an alarm was raised."""
 
     since_s: float
-    """Wall clock [s since 1970]."""
+    """Time on the wall clock at which the alarm was raised [s since 1970]."""
     value: float | None
+    """Value in the unit of the alarm; None without a number."""
 
 
 class AlarmTransition(NamedTuple):
@@ -35,7 +36,7 @@ class AlarmState:
         definition: Definition of the alarm.
         raised: Time and value of an active alarm; None if inactive.
         cause_cleared: True if the cause is gone but the alarm is latched.
-        acknowledged: True if acknowledged: the alarm ends once its cause is gone.
+        acknowledged: True if the alarm is acknowledged, so that it ends once its cause is gone.
         has_value: True once a value has arrived.
         lost_s: Maximum time without values that counts toward a delay [s].
     """
@@ -51,8 +52,8 @@ class AlarmState:
     _held_s: float | None = None
     """Time for which the condition of the next state has held [s]; None: it does not hold."""
 
-    def take(self, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float) -> list[AlarmTransition]:
-        """Take values in the order of their arrival.
+    def update(self, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float) -> list[AlarmTransition]:
+        """Process values in the order of their arrival.
 
         Args:
             times_s: Times on the samples' clock [s], shape (n,).

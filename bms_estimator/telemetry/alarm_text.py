@@ -1,10 +1,11 @@
-"""Texts of alarms."""
+"""Text of an alarm in its payload."""
 
 from collections.abc import Sequence
 
 from bms_estimator.settings.alarm_limits import AlarmDefinition
 
 LATCHED = "the cause is gone; acknowledge it to end it: "
+"""Prefix of the text of a latched alarm."""
 
 
 def alarm_text(alarm: AlarmDefinition, value: float | None, reasons: Sequence[str], *, cause_cleared: bool) -> str:

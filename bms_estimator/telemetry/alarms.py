@@ -1,7 +1,7 @@
 """All alarms of a pack, evaluated from samples and estimates.
 
 Alarms evaluate each sample, not the published means, and use the samples' clock. A replay therefore raises the alarms of
-the live run. They use raw values, including glitches that the estimator drops; the delays suppress single glitches.
+the live run. They use raw values, including glitches that the estimator drops. The delays suppress single glitches.
 """
 
 import json
@@ -20,7 +20,7 @@ from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarm_limits import AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
-from bms_estimator.telemetry.alarm_inputs import LOST, Inputs, counted
+from bms_estimator.telemetry.alarm_inputs import LOSS_TEXTS, Inputs, counted
 from bms_estimator.telemetry.alarm_samples import SampleBuffer, SampleIntervals
 from bms_estimator.telemetry.alarm_state import AlarmState, AlarmTransition, RaisedAlarm
 from bms_estimator.telemetry.alarm_text import alarm_text
@@ -28,14 +28,16 @@ from bms_estimator.telemetry.alarm_text import alarm_text
 SENSOR_SUSPECTS = (
     InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
 )
+"""Input faults that raise ``sensor_fault``."""
 MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
+"""Input faults that raise ``model_mismatch``."""
 ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """Alarms that are watched even before the first sample."""
 INPUTS = "inputs"
-"""Key of the saved state of measured quantities, beside the alarms' names."""
+"""Key of the measured quantities in the saved state. All other keys but ``SILENCE`` are names of alarms."""
 SILENCE = "silence"
-"""Key of the saved reason why no samples arrived."""
-SHARE_S = 1.0
+"""Key of the reason why no samples arrived, in the saved state."""
+BAD_FRACTION_INTERVAL_S = 1.0
 """Minimum interval over which the fraction of lost and unusable samples is computed [s]."""
 
 
@@ -43,6 +45,7 @@ class SampleCounts(NamedTuple):
     """Numbers of samples since start."""
 
     good: int
+    """Samples that the estimator accepted."""
     bad: int
     """Lost on the line, damaged, or rejected by the estimator."""
 
@@ -63,6 +66,7 @@ class Reasons(NamedTuple):
     suspects: InputFault
     """Input faults that the filter suspects."""
     texts: tuple[str, ...]
+    """Causes, one sentence each."""
 
 
 class AlarmMessage(NamedTuple):
@@ -84,7 +88,7 @@ _NO_REASONS = Reasons(InputFault(0), ())
 
 
 class AlarmEvaluator:
-    """The alarms of one pack.
+    """Evaluator of all alarms of one pack.
 
     Args:
         watched: Definitions of the alarms.
@@ -150,7 +154,7 @@ class AlarmEvaluator:
         if samples.size:
             wall_s = arrival_s - float(samples["time_s"][-1])
             self._evaluate_samples(samples, extremes_v, wall_s)
-            self._evaluate_share(float(samples["time_s"][-1]), counts, suspects, wall_s)
+            self._evaluate_bad_fraction(float(samples["time_s"][-1]), counts, suspects, wall_s)
         if trace.size:
             self._evaluate_estimates(trace, suspects, arrival_s - float(trace["time_s"][-1]))
         self._save_state()
@@ -227,7 +231,10 @@ class AlarmEvaluator:
         return changes
 
     def report(self) -> tuple[Alarm, ...]:
-        """Return all alarms that were ever watched. An alarm raised since the last call is reported as raised, even if it has ended."""
+        """Return all alarms that were ever watched.
+
+        An alarm that was raised since the last call is reported as raised, even if it has ended.
+        """
         unreported, self._unreported = self._unreported, {}
         return tuple(
             _alarm(state.definition, unreported[name])
@@ -260,12 +267,20 @@ class AlarmEvaluator:
         self._save_state()
 
     def _evaluate_samples(self, samples: SampleBlock, extremes_v: Floats, wall_s: float) -> None:
+        """Evaluate the alarms on measured values.
+
+        Args:
+            samples: Shape (n,), dtype SAMPLE.
+            extremes_v: Minimum and maximum cell voltage [V] and number of cell voltages, shape (n, 3).
+            wall_s: Wall clock minus the samples' clock [s].
+        """
         times_s, lowest_v, highest_v = samples["time_s"], extremes_v[:, 0], extremes_v[:, 1]
         self._at_s = float(times_s[-1])
         passed_s, observed_s = self._sample_intervals.measure(times_s)
         voltage_v, temperature_c = samples["voltage_v"], samples["temperature_c"]
         at_end = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
         current_a = np.where(at_end, np.copysign(np.inf, samples["current_a"]), samples["current_a"])
+        # the temperature while charging; infinite while not charging, NaN if a quantity is not measured
         charged_c = np.where(current_a <= -self._charging_a, temperature_c, np.inf)
         charged_c[np.isnan(current_a) | np.isnan(temperature_c)] = np.nan
         values: dict[AlarmName, Floats] = {
@@ -285,13 +300,13 @@ class AlarmEvaluator:
         self._evaluate_values("link_lost", times_s, passed_s, np.where(observed_s < passed_s, passed_s, 0.0), wall_s)
         counts = {name: counted(samples[column]) for name, column in _COLUMNS.items()}
         cells = extremes_v[:, 2].astype(np.int64)
-        for at_s in self._inputs.take(times_s, observed_s, counts | {"cells": cells}):
+        for at_s in self._inputs.update(times_s, observed_s, counts | {"cells": cells}):
             self._update_unwatched(at_s)
             if self._is_blinded():
                 self._raise_sensor_fault(at_s, wall_s)
 
     def _update_unwatched(self, at_s: float) -> None:
-        """Update which alarms cannot be watched, as of ``at_s`` on the samples' clock [s]."""
+        """Update the alarms that cannot be watched at ``at_s`` on the samples' clock [s], and record the changes."""
         before, self._unwatched = self._unwatched, self._reasons_unwatched()
         for name in sorted(before.keys() ^ self._unwatched.keys()):
             self._changes.append(Change(at_s, self._alarm(self._states[name]), "watched"))
@@ -302,7 +317,7 @@ class AlarmEvaluator:
         found: dict[AlarmName, str] = {}
         for name in self._states:
             needed = ALARM_KINDS[name].needs
-            missing = [LOST[each] for each in needed if each in lost]
+            missing = [LOSS_TEXTS[each] for each in needed if each in lost]
             if missing:
                 found[name] = "; ".join(missing)
             elif self._silence and needed and self._inputs.measured(needed):
@@ -320,9 +335,9 @@ class AlarmEvaluator:
         if state is not None:
             self._record(state, state.raise_at(at_s, RaisedAlarm(at_s + wall_s, None)))
 
-    def _evaluate_share(self, at_s: float, counts: SampleCounts, suspects: InputFault, wall_s: float) -> None:
+    def _evaluate_bad_fraction(self, at_s: float, counts: SampleCounts, suspects: InputFault, wall_s: float) -> None:
         """Evaluate the fraction of samples that are lost or unusable."""
-        if 0.0 <= at_s - self._counted_s < SHARE_S:
+        if 0.0 <= at_s - self._counted_s < BAD_FRACTION_INTERVAL_S:
             return
         before, self._counts, self._counted_s = self._counts, counts, at_s
         _, observed_s = self._loss_intervals.measure(np.array([at_s]))
@@ -333,14 +348,14 @@ class AlarmEvaluator:
         self._evaluate_values("sensor_fault", np.array([at_s]), observed_s, np.array([share]), wall_s)
 
     def _evaluate_estimates(self, trace: TraceBlock, suspects: InputFault, wall_s: float) -> None:
+        """Evaluate the alarms on estimates. Arguments are those of ``evaluate``; ``wall_s`` is wall minus samples' clock [s]."""
         times_s = trace["time_s"]
         _, observed_s = self._trace_intervals.measure(times_s)
         soc, std = trace["soc"], trace["soc_std"]
         lost = (trace["lock"] == 0) | self._mismatch_suspected
         self._mismatch_suspected = bool(suspects & MODEL_SUSPECTS)
-        lost[-1] |= (
-            self._mismatch_suspected
-        )  # a new suspicion counts from the last sample on, since its start is unknown
+        # a new suspicion counts from the last sample on, because its start is unknown
+        lost[-1] |= self._mismatch_suspected
         values: dict[AlarmName, Floats] = {
             "soc_low": soc - np.where(np.isnan(std), 0.0, std),
             "stability_margin_low": trace["stability_margin"],
@@ -354,7 +369,7 @@ class AlarmEvaluator:
     ) -> None:
         state = self._states.get(name)
         if state is not None:
-            self._record(state, state.take(times_s, steps_s, values, wall_s))
+            self._record(state, state.update(times_s, steps_s, values, wall_s))
 
     def _record(self, state: AlarmState, transitions: Iterable[AlarmTransition]) -> None:
         """Record transitions for ``changes``, and raised alarms for ``report``."""
@@ -371,13 +386,17 @@ class AlarmEvaluator:
             self._changes.append(Change(transition.at_s, _alarm(state.definition, message)))
 
     def _update_reasons(self, name: AlarmName, suspects: InputFault, suspicions: Sequence[str]) -> None:
-        """Store the texts of suspected faults when their set changes, because the numbers in the texts may change each second."""
+        """Store the texts of suspected faults if their set has changed.
+
+        The numbers in the texts may change each second and are therefore not compared.
+        """
         state, before = self._states.get(name), self._reasons.get(name, _NO_REASONS)
         if state is not None and suspects != before.suspects and (suspects or state.raised is None):
             texts = tuple(text for text in suspicions for suspect in suspects if text.endswith(suspect.text))
             self._reasons[name] = Reasons(suspects, texts)
 
     def _alarm(self, state: AlarmState) -> Alarm:
+        """Return the payload of an alarm, cached until its message changes."""
         name = state.definition.name
         message = AlarmMessage(
             state.raised,
@@ -398,7 +417,7 @@ class AlarmEvaluator:
     def _lost_text(self, quantity: Quantity) -> str:
         """Describe a lost quantity and the alarms that need it."""
         names = ", ".join(name for name in self._unwatched if quantity in ALARM_KINDS[name].needs)
-        return f"{LOST[quantity]}: {names} cannot be raised" if names else LOST[quantity]
+        return f"{LOSS_TEXTS[quantity]}: {names} cannot be raised" if names else LOSS_TEXTS[quantity]
 
     def _save_state(self) -> None:
         """Update ``saved_state``, so that for example a relay that has cut the load stays open over a restart."""

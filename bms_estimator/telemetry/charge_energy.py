@@ -45,7 +45,7 @@ class ChargeEnergyMeter:
     directions.
 
     Args:
-        before: Charge and energy of the runs before.
+        before: Charge and energy of the previous runs.
         gap_s: Minimum length of a gap, see ``kernels.step.is_gap`` [s].
         sums: External storage of the sums, shape (1,), dtype ``FLOW_SUMS``; None: internal.
     """

@@ -35,8 +35,8 @@ def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parame
 def ln_covariance(estimator: Estimator) -> np.ndarray:
     """Return the covariance of the logarithms of the learned parameters, shape (n, n).
 
-    It follows from the information of past data [V^2 s] plus a prior: the bounds of each parameter count as one standard
-    deviation. Errors of the model itself are not included.
+    The covariance is the inverse of the information of past data [V^2 s] plus a prior. In the prior the bounds of each
+    parameter count as one standard deviation. Errors of the model itself are not included.
     """
     m, q = estimator.record[0]["learning"], estimator.settings_record[0]["learning"]
     n = int(q["count"])

@@ -1,4 +1,4 @@
-"""Health of service and line: topic ``health``."""
+"""Payload of the topic ``health``: state of the service and of the source."""
 
 import math
 import os
@@ -16,6 +16,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
+"""Size of a memory page [MiB]."""
 _SAMPLE_COUNTERS = [
     name
     for name in OBSERVER_STATE.names or ()
@@ -24,7 +25,7 @@ _SAMPLE_COUNTERS = [
 
 
 def resident_mib() -> float | None:
-    """Resident memory of this process [MiB]; None if the system does not report it."""
+    """Return the resident memory of this process [MiB]; None if the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * _PAGE_MIB
     except OSError:
@@ -37,7 +38,7 @@ def sample_counters(state: np.void) -> dict[str, int]:
 
 
 def dropped_text(dropped: Mapping[str, int]) -> str:
-    """Describe dropped samples: counts by kind, names without ``dropped_``."""
+    """Return a description of dropped samples: the number of each kind. ``dropped`` has names without ``dropped_``."""
     words = {"range": "outside the cell's range"}
     return ", ".join(f"{n:,} {words.get(kind, kind).replace('_', ' ')}" for kind, n in dropped.items() if n) or "none"
 
@@ -96,7 +97,7 @@ def make_health_payload(
         loop_lag_s: Longest delay of the event loop since the last report [s].
         restarts: Starts that found a checkpoint.
         checkpoint: Result of restoring the last checkpoint.
-        sensor_message: Reason why no fresh values arrive; None when they do.
+        sensor_message: Reason why no fresh values arrive; None while fresh values arrive.
         delivery: Counters of sent messages and received requests.
         clock_ppm: Drift of the board's clock relative to the host [1e-6]; None if unknown.
         total: Totals over restarts.

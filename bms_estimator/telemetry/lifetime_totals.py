@@ -1,4 +1,4 @@
-"""Totals over all restarts: samples, crashes, time without samples, charge and energy."""
+"""Totals over all runs of the service: samples, crashes, time without samples, charge and energy."""
 
 import math
 from collections import Counter
@@ -21,11 +21,11 @@ def new_totals(now_s: float) -> Totals:
 
 
 class LifetimeTotals:
-    """Totals of the runs before and of this run.
+    """Totals of the previous runs and of this run.
 
     Args:
         estimator: Estimator of this run, with its state restored; read only.
-        before: Totals of the runs before.
+        before: Totals of the previous runs.
 
     Attributes:
         unseen_s: Length of the last gap without samples, which may have begun before this run [s]; None without a gap
@@ -37,7 +37,7 @@ class LifetimeTotals:
         self._gap_s = float(estimator.settings["gap_s"][0])
         self._meter = ChargeEnergyMeter(ChargeEnergy.of(before), self._gap_s)
         self._last_time_s, self._last_step_s, self._gaps = self._clock()
-        self._unseen_s = 0.0  # of this run
+        self._unseen_s = 0.0  # total time without samples in this run [s]
         self.unseen_s: float | None = None
 
     @property

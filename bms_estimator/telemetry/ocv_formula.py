@@ -1,4 +1,4 @@
-"""Parameters a16..a21 of (2.10), fitted to the OCV table of a cell file."""
+"""Parameters a16..a21 of (2.10) of the thesis, fitted to the OCV table of a cell file."""
 
 from functools import cache
 from typing import NamedTuple
@@ -8,7 +8,7 @@ import numpy as np
 from bms_estimator.model.cell import CellModel, TableOcv
 
 POINTS = 101
-"""Number of evenly spaced SOCs at which the formula is fitted."""
+"""Number of evenly spaced SOCs at which (2.10) is fitted."""
 
 
 class OcvFormulaFit(NamedTuple):

@@ -1,4 +1,8 @@
-"""Topic ``parameters``: a1..a21 and the circuit elements, each with its std, its source, and the reason if it is not valid."""
+"""Payload of the topic ``parameters``: a1..a21 and the circuit elements.
+
+Each value has its std, its source, and the reason if the value is not valid. Numbers in parentheses are equations of the
+thesis.
+"""
 
 import math
 from functools import lru_cache
@@ -30,12 +34,14 @@ from bms_estimator.telemetry.state import finite
 OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
 """SOCs at which the OCV is published."""
 CONFIGURED = "configured value: no data has identified it"
+"""Reason of a configured value."""
 LEARNED = "learned by the adaptive law, which gives no std"
+"""Reason of a value of the learning law."""
 VALID_FIT_STD = 0.5
 """Maximum relative std of a valid a1..a15. Amplitudes and exponents can be separated only after a sweep of the SOC."""
 VALID_CAPACITY_STD = 0.02
-"""Maximum std of a valid capacity, relative to the cell file."""
-VALID_OFFSET = 0.5
+"""Maximum std of a valid capacity, relative to the capacity of the cell file."""
+VALID_OFFSET_FRACTION = 0.5
 """Maximum std of a valid current offset, as a fraction of its std at the start."""
 _FUNCTIONS = {
     "r_s_ohm": chen_mora.r_s,  # (2.9)
@@ -56,19 +62,19 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
         now_s: Wall clock [s since 1970].
     """
     if isinstance(estimator.cell, FuelCellModel):
-        return _of_fuel_cell(estimator, now_s)
+        return _fuel_cell_report(estimator, now_s)
     a, state = estimator.cell.a.copy(), estimator.state[0]
     if not state["started"]:
         return ParameterReport(
             publish_time=iso_utc(now_s),
             soc=None,
-            a=_of_cell_file(estimator.cell, a),
+            a=_cell_file_parameters(estimator.cell, a),
             ocv=None,
             elements={},
             state_of_health={},
         )
     a[1:16] = state["a"][1:16]
-    parameters, elements = _of_cell_file(estimator.cell, a), _elements_of(estimator, a)
+    parameters, elements = _cell_file_parameters(estimator.cell, a), _elements_of(estimator, a)
     health: dict[str, Parameter] = {}
     learning, record = bool(estimator.settings_record["learning"]["enabled"][0]), estimator.record[0]
     from_data = _is_data_driven(estimator)
@@ -96,13 +102,13 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
     )
 
 
-def _of_fuel_cell(estimator: Estimator, now_s: float) -> ParameterReport:
+def _fuel_cell_report(estimator: Estimator, now_s: float) -> ParameterReport:
     """Return the payload of a fuel cell: no SOC, no a1..a21, and the learned values as elements."""
     elements = fuel_cell_parameters(estimator, now_s) if estimator.state[0]["started"] else {}
     return ParameterReport(publish_time=iso_utc(now_s), soc=None, a={}, ocv=None, elements=elements, state_of_health={})
 
 
-def _of_cell_file(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:
+def _cell_file_parameters(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:
     """Return a1..a21 as configured values; a16..a21 are fitted if the cell file has an OCV table."""
     parameters = {f"a{i}": _configured(a[i], "") for i in range(1, 22)}
     fit = fit_ocv_formula(cell)
@@ -131,7 +137,10 @@ def _cell_file_ocv(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
 
 
 def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
-    """Return the elements of (2.5)-(2.10) at the present SOC. A capacitance that is not positive, below delta1 or delta2, is null."""
+    """Return the elements of (2.5)-(2.10) at the present SOC.
+
+    A capacitance that is not positive is null. C_ts is not positive below delta1, C_tl below delta2.
+    """
     state, ocv = estimator.state[0], estimator.settings[0]
     soc = float(state["soc"])
     limits = {"c_ts_farad": "delta_1", "c_tl_farad": "delta_2"}
@@ -153,7 +162,9 @@ def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]
     return {
         "capacity": _bias(capacity, VALID_CAPACITY_STD, "identifier.capacity_std", now_s),
         "r_s": _identified(ratio, _configured(1.0, ""), VALID_STD, now_s),
-        "current_offset_a": _bias(offset_a, VALID_OFFSET * first_std_a, "identifier.current_offset_std_a", now_s),
+        "current_offset_a": _bias(
+            offset_a, VALID_OFFSET_FRACTION * first_std_a, "identifier.current_offset_std_a", now_s
+        ),
     }
 
 
@@ -169,7 +180,7 @@ def _bias(learned: IdentifiedValue, limit: float, setting: str, now_s: float) ->
 
 
 def _is_data_driven(estimator: Estimator) -> np.ndarray:
-    """Return which of a1..a15 data have changed, through the adaptive law or through the fit that (3.18) follows."""
+    """Return a mask of the parameters a1..a15 that data have changed, by the adaptive law or by the fit that (3.18) follows."""
     state, settings = estimator.state[0], estimator.settings_record[0]
     if settings["learning"]["enabled"]:
         return np.asarray(state["a"] != settings["learning"]["file"])
@@ -203,9 +214,8 @@ def _identified(learned: IdentifiedValue, held: Parameter, limit: float, now_s: 
     if held.value is None:
         return held
     reason = f"identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
-    std = math.hypot(
-        learned.std, learned.value - held.value
-    )  # of the observer's value, which the learned value estimates
+    # std of the observer's value as an estimate of the true one: std and distance of the learned value
+    std = math.hypot(learned.std, learned.value - held.value)
     return held.model_copy(update={"std": finite(std), "reason": reason})
 
 

@@ -1,4 +1,4 @@
-"""The publish window: sums over the samples since the last publication."""
+"""Publish window: sums over the samples since the last publication."""
 
 import math
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ class Window:
         self._arrival_s = arrival_s
 
     def take(self) -> WindowSummary | None:
-        """Return the summary since the last call; None without a sample."""
+        """Return the summary of the samples since the last call, and begin a new window. Return None without a sample."""
         if self._last is None:
             return None
         n, first_s, voltage, current, power, temperatures, temperature = self._sums[0].item()

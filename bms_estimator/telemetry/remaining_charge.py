@@ -10,7 +10,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import present_resistance, relative_capacity
 from bms_estimator.kernels.cell_model import chen_mora
 
-MAX_H = 1000.0
+MAX_TIME_H = 1000.0
 """Maximum published time to empty or full [h]. A current that would take longer counts as zero."""
 
 
@@ -20,7 +20,7 @@ class RemainingCharge:
 
     Attributes:
         capacity_ah: Charge down to SOC 0 [Ah].
-        usable_ah: Charge down to max(delta1, delta2), below which the model does not hold [Ah].
+        usable_ah: Charge down to max(delta1, delta2), the SOC below which a capacitance of the model is negative [Ah].
         energy_wh: Energy at the terminals down to SOC 0 at the present current [Wh].
         time_to_empty_s: Time to SOC 0 at the present current [s].
         time_to_full_s: Time to SOC 1 at the present current [s].
@@ -57,8 +57,8 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
 
 
 def _time(charge_ah: float, current_a: float, capacity_ah: float) -> float:
-    """Return the time for ``charge_ah`` [s]; NaN if the current is negligible for a pack of ``capacity_ah``."""
-    return 3600.0 * charge_ah / current_a if current_a * MAX_H > capacity_ah else math.nan
+    """Return the time in which the current moves ``charge_ah`` [s]; NaN if the current is negligible for ``capacity_ah``."""
+    return 3600.0 * charge_ah / current_a if current_a * MAX_TIME_H > capacity_ah else math.nan
 
 
 def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:
@@ -68,7 +68,7 @@ def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:
 
 
 def _resistance(estimator: Estimator, soc: float) -> float:
-    """Return the total DC resistance with all RC pairs settled [ohm]."""
+    """Return the total DC resistance, with all RC pairs in steady state [ohm]."""
     if estimator.identifying:
         return present_resistance(estimator.record[0])
     a = estimator.state[0]["a"]

@@ -1,4 +1,4 @@
-"""Detection of rest. The zero of the current sensor may be calibrated only at rest."""
+"""Detection of rest, a condition for the calibration of the current sensor's zero."""
 
 from collections import deque
 
@@ -6,9 +6,9 @@ from bms_estimator.model.payloads import Estimate
 
 REST_S = 30.0
 """Time for which current and voltage must have been constant [s]."""
-MAX_CURRENT = 0.04
+MAX_CURRENT_FRACTION = 0.04
 """Maximum current at rest, as a fraction of the maximum current in the cell file. A sensor may have such an offset."""
-MAX_STEPS = 2.0
+MAX_VOLTAGE_STEPS = 2.0
 """Maximum range of the voltage at rest, in resolution steps (LSB) of the voltage."""
 
 
@@ -21,7 +21,10 @@ class RestDetector:
     """
 
     def __init__(self, current_max_a: float, voltage_resolution_v: float) -> None:
-        self._current_a, self._voltage_v = MAX_CURRENT * current_max_a, MAX_STEPS * voltage_resolution_v
+        self._max_current_a, self._max_change_v = (
+            MAX_CURRENT_FRACTION * current_max_a,
+            MAX_VOLTAGE_STEPS * voltage_resolution_v,
+        )
         self._windows: deque[tuple[float, float, float]] = deque()  # monotonic time [s], current [A], voltage [V]
 
     def add(self, estimate: Estimate, now_s: float) -> None:
@@ -45,9 +48,11 @@ class RestDetector:
             return f"the pack was watched for {watched_s:.0f} s only; wait until it is {REST_S:.0f} s"
         _, currents_a, voltages_v = zip(*self._windows, strict=True)
         current_a = max(currents_a, key=abs)
-        if abs(current_a) > self._current_a:
-            return f"current flows: {current_a:.3g} A within the last {REST_S:.0f} s; at most {self._current_a:.3g} A"
+        if abs(current_a) > self._max_current_a:
+            return (
+                f"current flows: {current_a:.3g} A within the last {REST_S:.0f} s; at most {self._max_current_a:.3g} A"
+            )
         moved_v = max(voltages_v) - min(voltages_v)
-        if moved_v > self._voltage_v:
+        if moved_v > self._max_change_v:
             return f"current flows: the voltage moved by {moved_v:.3g} V within the last {REST_S:.0f} s"
         return None

@@ -7,6 +7,7 @@ from bms_estimator.model.payloads import Parameter
 from bms_estimator.telemetry.state import finite
 
 ORIGIN = "by (4.2), step 3 of the thesis; includes errors of the OCV and of a1..a12, which std does not cover"
+"""Reason of the published parameters."""
 
 
 def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
@@ -29,11 +30,11 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
     try:
         fit = fit_series_resistance(summed(record), LOWEST_SOC)
     except UserError:  # the swept range of SOC is too small for three parameters: use one mean value
-        return {"r_s_ohm": _of_4_2(float(sums["product_va"].sum()) / square_a2, None)}
-    parameters = {f"a{i}": _of_4_2(*pair) for i, *pair in zip((13, 14, 15), fit.a, fit.std, strict=True)}
-    return parameters | {"r_s_ohm": _of_4_2(float(fit(record["observer"]["soc"])), fit.rms_ohm)}
+        return {"r_s_ohm": _parameter(float(sums["product_va"].sum()) / square_a2, None)}
+    parameters = {f"a{i}": _parameter(*pair) for i, *pair in zip((13, 14, 15), fit.a, fit.std, strict=True)}
+    return parameters | {"r_s_ohm": _parameter(float(fit(record["observer"]["soc"])), fit.rms_ohm)}
 
 
-def _of_4_2(value: float, std: float | None) -> Parameter:
+def _parameter(value: float, std: float | None) -> Parameter:
     finite_std = None if std is None else finite(std)
     return Parameter(value=finite(value), std=finite_std, valid=False, source="identified", reason=ORIGIN)

@@ -1,4 +1,4 @@
-"""Payloads of the topics ``state`` and ``info``. All functions are pure."""
+"""Payloads of the topics ``state`` and ``info``."""
 
 import math
 from collections.abc import Mapping
@@ -19,9 +19,9 @@ from bms_estimator.telemetry.remaining_charge import RemainingCharge
 from bms_estimator.version import __version__
 
 COMPUTED = {"voltage_v", "current_a", "temperature_c", "converged", "lock"}
-"""Columns of the trace whose field of ``Estimate`` is not the last value: means, and integers that become booleans."""
+"""Columns of the trace whose field of ``Estimate`` is computed: means, and booleans from integers."""
 COPIED = tuple(name for name in TRACE.names or () if name in Estimate.model_fields and name not in COMPUTED)
-"""Columns of the trace whose last value becomes the field of ``Estimate`` of equal name."""
+"""Columns of the trace whose last value is copied to the field of ``Estimate`` with an equal name."""
 
 
 def finite(value: float) -> float | None:
@@ -82,7 +82,7 @@ def make_state_payload(
 
 
 def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
-    """Return the fields of single cells; ``cells_v`` has shape (m,) [V], NaN for an unknown voltage."""
+    """Return the fields of single cells. ``cells_v`` has shape (m,) [V], NaN for an unknown voltage."""
     if not (cells_v.size and np.isfinite(cells_v).any()):
         return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))
     lowest, highest = int(np.nanargmin(cells_v)), int(np.nanargmax(cells_v))

@@ -149,7 +149,7 @@ def _take_values(
     times_s = begin_s + step_s * np.arange(len(values))
     steps_s = np.full(len(values), step_s)
     return [
-        (change.at_s, change.raised is not None) for change in state.take(times_s, steps_s, np.array(values), WALL_S)
+        (change.at_s, change.raised is not None) for change in state.update(times_s, steps_s, np.array(values), WALL_S)
     ]
 
 

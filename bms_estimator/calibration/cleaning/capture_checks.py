@@ -9,7 +9,7 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 
 MIN_PEAK_C_RATE = 0.1
-"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with less is of use to `ocv` only."""
+"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with a smaller one is useful only to `ocv`."""
 STEP_FRACTION = 0.1
 """Minimum change of current between two samples of a current step, as a fraction of the capture's largest current."""
 MAX_STEP_S = 3.0
@@ -103,6 +103,7 @@ def _no_excitation(load: CleanCapture, cell: CellModel) -> str | None:
 
 
 def _wrong_sign(load: CleanCapture, cell: CellModel) -> str | None:
+    """Return a message if the voltage shows the wrong sign of the current, by its steps or by the trend over SOC."""
     ohm = step_resistance(load)
     if ohm is not None and ohm < 0.0:
         return (
@@ -130,6 +131,7 @@ def _unresponsive_voltage(load: CleanCapture, cell: CellModel) -> str | None:
 
 
 def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
+    """Return a message on the first gap over which an unknown charge flowed."""
     step_s = np.diff(load.time_s)
     charge_ah = np.abs(load.current_a[:-1]) * step_s / 3600.0
     gaps = (step_s > MIN_GAP_PERIODS * np.median(step_s)) & (charge_ah > MIN_GAP_CHARGE * cell.cell.capacity_ah)
@@ -143,6 +145,7 @@ def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
 
 
 def _wrong_capacity(load: CleanCapture, cell: CellModel, start: float) -> str | None:
+    """Return a message if the counted SOC leaves 0..1 or contradicts the voltage of a long rest."""
     capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
     outside = soc_outside(load, capacity_ah, start)
     if outside:

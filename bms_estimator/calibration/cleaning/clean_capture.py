@@ -11,7 +11,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 NEIGHBOURS = 2
-"""Number of neighbours on each side whose median a sample is compared with."""
+"""Number of neighbours on each side of a sample. A sample is compared with the median of itself and its neighbours."""
 MIN_SAMPLES = 2 * NEIGHBOURS + 1
 """Minimum number of good samples of a capture."""
 SPIKE_V = 0.03
@@ -22,16 +22,22 @@ RESISTANCE_FACTOR = 3.0
 """Largest plausible voltage change per ampere, in multiples of the series resistance at SOC 0.5."""
 
 
+UNCHANGED_FRACTION = 0.01
+"""Maximum change of the voltage at a current spike, as a fraction of the change that the largest resistance explains."""
+MIN_GOOD_FRACTION = 0.5
+"""Minimum fraction of samples within the limits of the cell. With fewer, the cell file is that of another cell."""
+
+
 @dataclass(frozen=True)
 class CleanCapture:
-    """One capture.
+    """Capture without glitches.
 
     Attributes:
         name: Name for messages.
         time_s: Shape (n,), increasing, from 0 [s].
         current_a: Shape (n,), positive on discharge [A].
         voltage_v: Shape (n,), measured [V].
-        temperature_c: Shape (n,), of the cell [C]; NaN where it was not measured.
+        temperature_c: Shape (n,), temperature of the cell [C]; NaN where it was not measured.
         discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
         resting_samples: Number of samples at rest before the first load.
         samples: Number of samples in the capture.
@@ -78,6 +84,11 @@ def clean_capture(name: str, samples: SampleBlock, cell: CellModel) -> CleanCapt
 
 
 def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBlock:
+    """Return the samples within the cell's limits of voltage and current.
+
+    Raises:
+        UserError: Most samples lie outside the limits, or too few lie within.
+    """
     limits = cell.cell
     voltage_v, current_a = samples["voltage_v"], samples["current_a"]
     good: SampleBlock = samples[
@@ -85,7 +96,7 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
         & (voltage_v <= limits.voltage_max_v)
         & (np.abs(current_a) <= limits.current_max_a)
     ]
-    if good.size < 0.5 * samples.size:
+    if good.size < MIN_GOOD_FRACTION * samples.size:
         raise UserError(
             f"{name}: {good.size} of {samples.size} samples lie within the cell's limits ({limits.voltage_min_v:g} to "
             f"{limits.voltage_max_v:g} V, {limits.current_max_a:g} A); the capture runs from {voltage_v.min():.3f} to "
@@ -102,7 +113,9 @@ def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
     deviation_a = np.abs(_deviation_from_median(samples["current_a"]))
     ohm = RESISTANCE_FACTOR * (cell.a[13] * np.exp(-0.5 * cell.a[14]) + cell.a[15])
     voltage_spike = deviation_v > SPIKE_V * cell.cell.series_count + ohm * deviation_a
-    current_spike = (deviation_a > SPIKE_C * cell.cell.capacity_ah) & (deviation_v < 0.01 * ohm * deviation_a)
+    current_spike = (deviation_a > SPIKE_C * cell.cell.capacity_ah) & (
+        deviation_v < UNCHANGED_FRACTION * ohm * deviation_a
+    )
     good: SampleBlock = samples[~(voltage_spike | current_spike)]
     return good
 

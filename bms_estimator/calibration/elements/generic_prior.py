@@ -8,7 +8,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells, load_cell
 
 COMPARED_SOC = 0.1, 0.95
-"""SOC range in which OCV curves are compared. Their steep ends would dominate the difference."""
+"""Lower and upper end of the SOC range in which OCV curves are compared. Their steep ends would dominate the difference."""
 RESTS_STD = 0.35
 """Relative standard deviation of resistances from rests, distributed over RC pairs as in typical cells."""
 

@@ -60,7 +60,7 @@ OCV_STEP = 0.01
 """SOC step between the nodes of the corrected OCV table."""
 MIN_SLOPE_V = 1e-3
 """Minimum slope dOCV/dSOC of the corrected table per cell [V]."""
-SPAN_K = 10.0
+MIN_SPAN_K = 10.0
 """Minimum temperature difference that gives activation energies and dE/dT [K]."""
 FULL_TOLERANCE_V = 0.03
 """Maximum distance of a first rest's voltage from that of a full cell at which the capture counts as starting full, per
@@ -76,7 +76,7 @@ PERCENTILES = (2.0, 98.0)
 LADDER_STD = 0.1
 """Relative std of resistances between cells of one make: two NCR18650 differ by 5 to 8 %, and cells age."""
 GENERIC_STD = 0.3
-"""Relative std from which on a ladder counts as generic, not identified, so that its temperature range is unknown."""
+"""Minimum relative std of a generic ladder. A ladder with a smaller std is identified, and its temperature range is known."""
 SHAPE_MIN_SOC = 0.4
 """SOC above which a resistance is averaged to normalize its shape."""
 SHAPE_LIMITS = (0.2, 20.0)
@@ -85,8 +85,8 @@ MIN_RMS_SOC = 0.1
 """Lower SOC limit of the reported RMS errors."""
 COUNT_PASSES = 3
 """Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a knee."""
-NO_WORSE = 1.05
-"""Ratio within which two scores count as equal, because four replays do not resolve more."""
+EQUAL_SCORE_RATIO = 1.05
+"""Ratio up to which two scores count as equal. Four replays do not resolve a smaller difference."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,8 @@ class CaptureFit:
         name: Name of the capture.
         samples: Number of samples in the capture.
         glitches: Number of dropped glitches.
-        initial_soc: At the first sample, 0..1.
-        temperature_c: Lowest and highest [C]; None without a sensor.
+        initial_soc: SOC at the first sample, 0..1.
+        temperature_c: Lowest and highest temperature [C]; None without a sensor.
         miscount: Relative error of the counted charge, corrected in the SOC of the fit.
         voltage_rms_v: RMS residual of the voltage, weighted by time, at SOC above 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
@@ -124,7 +124,7 @@ class Identification:
 
     Attributes:
         cell: The cell with its ladder, the elements of two RC pairs, and a corrected OCV if that improves the replays.
-        elements: SOC -> ``r_s``, ``r_ts``, ``r_tl`` at 25 C -> value, standard error [ohm].
+        elements: Value and standard error of ``r_s``, ``r_ts`` and ``r_tl`` at 25 C by SOC and name [ohm].
         captures: Fit of each capture, in the order given.
         left_out: Names of captures without excitation.
         ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0: the OCV is the given one.
@@ -143,7 +143,7 @@ class Identification:
 
 @dataclass(frozen=True)
 class Run:
-    """One capture with its SOC and temperature."""
+    """Capture with its SOC and temperature at each sample."""
 
     load: CleanCapture
     soc: Floats
@@ -204,13 +204,13 @@ def identify(
     candidates = [_Candidate(runs, moments_of_runs, cell, refine_ocv=refine) for refine in variants]
     before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
     after = [candidate.scores() for candidate in candidates]
-    best = len(after) - 1  # without scores: the last candidate
+    best = len(after) - 1  # the last candidate, if no capture has a score
     if np.isfinite(before).any():
         judged = [j for j in range(len(runs)) if candidates[0].held_back(j)]
         given, refined = (_geometric_mean(scores[judged] if judged else scores) for scores in (after[0], after[-1]))
-        best = int((NO_WORSE if judged else 1.0) * refined < given)
+        best = int((EQUAL_SCORE_RATIO if judged else 1.0) * refined < given)
     outcome = candidates[best].outcome(before, after[best], left_out)
-    if outcome.score_after > NO_WORSE * outcome.score_before:
+    if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before:
         raise UserError(_worse_replays(outcome))
     return outcome
 
@@ -222,7 +222,7 @@ def initial_soc(load: CleanCapture, cell: CellModel) -> float:
 
 
 class _Candidate:
-    """One variant of the fit: with a corrected or with the given OCV."""
+    """Variant of the fit, with a corrected or with the given OCV."""
 
     def __init__(self, runs: list[Run], moments_of_runs: list[Moments], cell: CellModel, *, refine_ocv: bool) -> None:
         self._runs, self._moments, self._cell, self._refine = runs, moments_of_runs, cell, refine_ocv
@@ -243,9 +243,9 @@ class _Candidate:
         return np.array([interval_score(self._cell_for(j), run.load, run.soc) for j, run in enumerate(self._runs)])
 
     def held_back(self, j: int) -> bool:
-        """Return True if another capture within ``SPAN_K`` of the temperature of capture ``j`` was given."""
+        """Return True if another capture within ``MIN_SPAN_K`` of the temperature of capture ``j`` was given."""
         mean_c = [run.mean_c for run in self._runs]
-        return any(k != j and abs(mean_c[k] - mean_c[j]) < SPAN_K for k in range(len(mean_c)))
+        return any(k != j and abs(mean_c[k] - mean_c[j]) < MIN_SPAN_K for k in range(len(mean_c)))
 
     def outcome(self, before: Floats, after: Floats, left_out: tuple[str, ...]) -> Identification:
         """Return the identification with this variant's cell.
@@ -294,7 +294,7 @@ class _Candidate:
         """Fit the resistances to the captures ``which``."""
         low_c, high_c = _temperature_range([self._runs[k] for k in which])
         given = self._cell.ladder
-        spans_temperature = high_c - low_c >= SPAN_K
+        spans_temperature = high_c - low_c >= MIN_SPAN_K
         series = self._cell.cell.series_count
         entropy_v = PER_KELVIN_STD_V if _per_kelvin(self._cell) is None else MEASURED_PER_KELVIN_STD_V
         prior = Prior(
@@ -312,7 +312,7 @@ class _Candidate:
         runs = [self._runs[k] for k in which]
         low_c, high_c = _temperature_range(runs)
         given = self._cell.ladder
-        spans_temperature = high_c - low_c >= SPAN_K
+        spans_temperature = high_c - low_c >= MIN_SPAN_K
         if not spans_temperature and given is not None and given.std < GENERIC_STD:
             low_c, high_c = min(low_c, given.temperature_c[0]), max(high_c, given.temperature_c[1])
         ohm, ohm_std = fit.branches(0.5, 0, RESISTANCES)
@@ -349,6 +349,7 @@ class _Candidate:
 
 
 def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
+    """Return a capture with its SOC by coulomb counting from ``soc``, or from its first rest if ``soc`` is None."""
     if temperature_c is not None:
         load = replace(load, temperature_c=temperature_of(load, temperature_c))
     temperature = temperature_of(load)
@@ -367,7 +368,7 @@ def _resistance_scale(runs: list[Run], cell: CellModel) -> float:
 
 
 def _moments(runs: list[Run], cell: CellModel) -> list[Moments]:
-    """Return the moments of the regression over each capture."""
+    """Return the normal equations of the regression over each capture."""
     scale_ohm = _resistance_scale(runs, cell)
     grid_v, grid_slope_v = ocv_grid(cell)
     grid = np.linspace(0.0, 1.0, grid_v.size)
@@ -403,6 +404,7 @@ def _wrong_temperature(load: CleanCapture, temperature_c: float | None) -> list[
 
 
 def _temperature_range(runs: list[Run]) -> tuple[float, float]:
+    """Return the ``PERCENTILES`` of the temperatures of captures [C]."""
     low_c, high_c = np.percentile(np.concatenate([run.temperature_c for run in runs]), PERCENTILES)
     return round(float(low_c), 1), round(float(high_c), 1)
 
@@ -483,6 +485,7 @@ def _geometric_mean(scores: Floats) -> float:
 
 
 def _worse_replays(outcome: Identification) -> str:
+    """Return the message on replays that get worse, with the scores of each capture."""
     lines = [
         f"{c.name}: {c.score_before:.2f} before, {c.score_after:.2f} after"
         for c in outcome.captures

@@ -1,7 +1,7 @@
-"""Initial elements of a cell from the rests of a relaxation test: one value of each element for all SOC.
+"""Initial circuit elements of a cell from the rests of a relaxation test: one value of each element for all SOC.
 
 A fit of a whole capture starts from these values. At the end of a load the voltage steps by i R_s and then rises in two
-exponentials, which give the two RC pairs: (2.2), (2.3) with i = 0.
+exponentials, which give the two RC pairs: (2.2) and (2.3) of the thesis with i = 0.
 """
 
 from dataclasses import dataclass
@@ -80,13 +80,15 @@ def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: fl
         last = int(np.searchsorted(good["time_s"], rest.start_s + rest.duration_s, side="right"))
         current_a = float(good["current_a"][first - 1]) if first else 0.0
         if drawn_as > 0.0 and current_a > 0.0 and rest.soc > MIN_SOC:
-            found.append(_of_rest(good[first:last], float(good["voltage_v"][first - 1]), current_a, drawn_as))
+            found.append(
+                _elements_from_rest(good[first:last], float(good["voltage_v"][first - 1]), current_a, drawn_as)
+            )
     if not found:
         raise UserError(f"{test.name}: none of its {len(test.rests)} rests follows a discharge above SOC {MIN_SOC}")
     return InitialElements(*(float(x) for x in np.median(np.array(found), axis=0)))
 
 
-def _of_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: float) -> tuple[float, ...]:
+def _elements_from_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: float) -> tuple[float, ...]:
     """Fit R_s, R_ts, tau_ts, R_tl and tau_tl to one rest after a load of ``current_a``."""
     rest = rest[:: -(-rest.size // MAX_SAMPLES)]
     time_s = rest["time_s"] - rest["time_s"][0]
@@ -95,22 +97,22 @@ def _of_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: flo
     for fast in SHORT_TAUS * duration_s:
         for slow in LONG_TAUS * duration_s:
             basis = np.column_stack([np.ones_like(time_s), -np.exp(-time_s / fast), -np.exp(-time_s / slow)])
-            sizes, norm = nnls(basis, rest["voltage_v"])
-            fits.append((float(norm), fast, slow, sizes))
+            coefficients, norm = nnls(basis, rest["voltage_v"])
+            fits.append((float(norm), fast, slow, coefficients))
     _, fast, slow, (end_v, short_v, long_v) = min(fits, key=lambda fit: fit[0])
     load_s = drawn_as / current_a
     return (
         max((end_v - short_v - long_v - loaded_v) / current_a, MIN_OHM),
-        _loaded_ohm(short_v, current_a, load_s, fast),
+        _rc_resistance(short_v, current_a, load_s, fast),
         fast,
-        _loaded_ohm(long_v, current_a, load_s, slow),
+        _rc_resistance(long_v, current_a, load_s, slow),
         slow,
     )
 
 
-def _loaded_ohm(size_v: float, current_a: float, load_s: float, tau_s: float) -> float:
-    """Return the resistance of an RC pair that a load of ``load_s`` charged to ``size_v`` [ohm]; (2.2) solved for R."""
-    return max(size_v / (current_a * -float(np.expm1(-load_s / tau_s))), MIN_OHM)
+def _rc_resistance(voltage_v: float, current_a: float, load_s: float, tau_s: float) -> float:
+    """Return the resistance of an RC pair that a load of ``load_s`` charged to ``voltage_v`` [ohm]: (2.2) solved for R."""
+    return max(voltage_v / (current_a * -float(np.expm1(-load_s / tau_s))), MIN_OHM)
 
 
 def _resistance(ohm: float) -> Resistance:

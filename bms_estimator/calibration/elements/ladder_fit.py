@@ -75,8 +75,8 @@ ERROR_J = 22e3
 SOC_STD = 0.01
 """Std of the SOC after a change of 1; the variance grows with the change. At a knee far from the start a cell
 deviates from its curve, and that voltage error must not become a resistance."""
-RELATIVE = 0.1
-"""Std relative to a voltage drop: the largest filtered current of x_0..x_3 times the scale of the resistances."""
+RELATIVE_STD = 0.1
+"""Std of a row relative to its voltage drop, which is the largest current of x_0..x_3 times the scale of the resistances."""
 STEP_ROWS = 30.0
 """Weight of all voltage jumps of a capture at clean current steps, in rows. Jumps determine R_0 and do not drift."""
 STEP_V = 1e-3
@@ -100,7 +100,7 @@ LONG_REST_S = 500.0
 """Minimum duration of a long rest [s]."""
 REST_FRACTION = 0.01
 """Maximum current of a rest, as a fraction of the largest current."""
-ROW_S = 0.5
+ROW_INTERVAL_S = 0.5
 """Minimum time between two rows [s]."""
 MIN_SOC = 0.02
 """Minimum SOC of the rows."""
@@ -110,14 +110,16 @@ MAX_SOC = 1.01
 
 @dataclass(frozen=True)
 class Moments:
-    """Normal equations of one capture. y is the measured voltage less the given OCV.
+    """Normal equations of one capture, with y the measured voltage less the given OCV.
+
+    X are the rows of the model, W their weights. The miscount is the relative error of the counted charge.
 
     Attributes:
         information: X'WX with the miscount of the charge marginalised.
         information_vector: X'Wy with the miscount marginalised.
         miscount_cross: X'Wc, where c is the voltage change by a miscount of 1.
         miscount_information: c'Wc plus the inverse prior variance of the miscount.
-        miscount_vector: c'Wy plus the prior's part.
+        miscount_vector: c'Wy plus the part of the miscount's prior.
     """
 
     information: Floats
@@ -231,32 +233,34 @@ def moments(
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
     weight, last = _weights(load)
     inside = (soc > MIN_SOC) & (soc < MAX_SOC)
-    kept = (_first_of_each_slot(load.time_s) | last) & inside
-    if not kept.any():
+    selected = (_first_of_each_slot(load.time_s) | last) & inside
+    if not selected.any():
         raise UserError(
             f"{load.name}: no sample between SOC {MIN_SOC:g} and {MAX_SOC:g} [--soc], so that resistances are undetermined"
         )
     load_a = np.abs(currents[:, :4]).max(axis=1)
-    std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE * scale_ohm * load_a)
+    std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * load_a)
     std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)
-    weight = np.where(kept, weight, 0.0)
-    root = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[kept, None]
+    weight = np.where(selected, weight, 0.0)
+    root = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected, None]
     first_root = root[:, 0]
     residual_v = load.voltage_v - given_v
-    rows = _rows(soc[kept], temperature_c[kept], currents[kept]) * root
-    target = residual_v[kept] * root[:, 0]
+    rows = _rows(soc[selected], temperature_c[selected], currents[selected]) * root
+    target = residual_v[selected] * root[:, 0]
     after = _clean_steps(load) & inside
     before = np.r_[after[1:], False]
     if after.any():
         change_a = np.abs(load.current_a[after] - load.current_a[before])
-        std_v = np.hypot(STEP_V * series, RELATIVE * scale_ohm * change_a) * arrhenius(ERROR_J, temperature_c[after])
+        std_v = np.hypot(STEP_V * series, RELATIVE_STD * scale_ohm * change_a) * arrhenius(
+            ERROR_J, temperature_c[after]
+        )
         root = (np.sqrt(STEP_ROWS / after.sum()) / std_v)[:, None]
         jump = _rows(soc[after], temperature_c[after], currents[after])
         jump -= _rows(soc[before], temperature_c[before], currents[before])
         rows = np.vstack([rows, jump * root])
         target = np.r_[target, (residual_v[after] - residual_v[before]) * root[:, 0]]
     by_miscount = np.zeros(target.size)  # weighted voltage change by a relative miscount of 1
-    by_miscount[: kept.sum()] = slope_v[kept] * (soc[kept] - soc[0]) * first_root
+    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * first_root
     cross, own = rows.T @ by_miscount, float(by_miscount @ by_miscount + 1.0 / COUNT_STD**2)
     vector = float(by_miscount @ target - miscount / COUNT_STD**2)
     return Moments(
@@ -307,6 +311,7 @@ def fit_ladder(captures: list[Moments], prior: Prior) -> LadderFit:
 
 
 def _prior_information(prior: Prior) -> Floats:
+    """Return the information matrix of the prior of all unknowns."""
     table = np.zeros((UNBOUNDED + 2 * PART_SIZE, UNBOUNDED + 2 * PART_SIZE))
     spline = correction_at(EVEN_SOC)
     near = spline / prior.ocv_error_v[:, None] * np.sqrt(OCV_INTERVALS / EVEN_SOC.size)
@@ -331,8 +336,8 @@ def _rough_rows() -> Floats:
 
 
 def _first_of_each_slot(time_s: Floats) -> NDArray[np.bool_]:
-    """Return a mask of the first sample in each slot of ``ROW_S``."""
-    slot = np.floor(time_s / ROW_S)
+    """Return a mask of the first sample in each slot of ``ROW_INTERVAL_S``."""
+    slot = np.floor(time_s / ROW_INTERVAL_S)
     return np.asarray(np.r_[True, np.diff(slot) > 0.0], dtype=np.bool_)
 
 

@@ -42,7 +42,7 @@ def interval_score(cell: CellModel, load: CleanCapture, soc: Floats) -> float:
 
 
 def _replay_score(cell: CellModel, load: CleanCapture, soc: Floats, start: int, soc_error: float) -> float:
-    """Return the score of one replay that starts at sample ``start`` with an initial SOC off by ``soc_error`` [%]."""
+    """Return the score of one replay [%]. It starts at sample ``start`` with an initial SOC error of ``soc_error``."""
     samples = np.zeros(load.time_s.size - start, dtype=SAMPLE)
     for name in ("time_s", "current_a", "voltage_v", "temperature_c"):
         samples[name] = getattr(load, name)[start:]

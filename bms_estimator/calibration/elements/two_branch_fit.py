@@ -1,4 +1,7 @@
-"""a1..a15 of two RC pairs that are equivalent to an RC ladder at 25 C, (2.5)-(2.9)."""
+"""Parameters a1..a15 of two RC pairs that are equivalent to an RC ladder at 25 C.
+
+The elements are (2.5)-(2.9) of the thesis, and delta1 and delta2 are (2.11) and (2.12).
+"""
 
 import numpy as np
 from scipy.optimize import nnls
@@ -16,13 +19,13 @@ EXPONENTS = np.geomspace(1.0, 60.0, 60)
 NEGLIGIBLE = 1e-4
 """Relative amplitude that replaces a fitted amplitude of 0. A cell file requires an amplitude above 0."""
 MAX_DELTA = 0.01
-"""Maximum delta1 and delta2: capacitances are positive down to this SOC, (2.11), (2.12)."""
+"""Maximum delta1 and delta2. The capacitances are positive down to this SOC."""
 SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT), "r_tl": (1 + SHORT, RESISTANCES)}
-"""Section of the cell file -> first and end index of the ladder's resistances whose sum it holds."""
+"""First index, and index after the last, of the ladder's resistances whose sum is in a section of the cell file."""
 
 
 def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
-    """Return the five sections of a cell file that hold a1..a15."""
+    """Return the five sections of a cell file that contain a1..a15."""
     total = (
         linear_interpolation_matrix(SOC, np.array(ladder.soc))
         @ (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).T
@@ -33,7 +36,7 @@ def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
         amplitude, exponent, offset = _exponential(ohm, 1.0)
         sections[name] = Resistance(amplitude_ohm=amplitude, exponent=exponent, offset_ohm=offset)
         if name != "r_s":
-            # a lower limit of each resistance: equal shares where all are 0
+            # the lower limit gives equal fractions where all resistances are 0
             share = np.maximum(total[:, first:end], 1e-6 * total.sum(axis=1, keepdims=True))
             share /= share.sum(axis=1, keepdims=True)
             farad = np.exp(share @ LN_TAUS[first - 1 : end - 1]) / ohm

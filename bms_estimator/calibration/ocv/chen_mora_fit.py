@@ -14,6 +14,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import ChenMoraOcv
 
 NAMES = ("a16", "a17", "a18", "a19", "a20", "a21")
+"""Names of the parameters of (2.10)."""
 LOWER = np.array([1e-6, 5.0, 1e-6, -np.inf, -np.inf, -np.inf])
 """Lower bounds of a16..a21. In the thesis all are positive. a19..a21 are unbounded here, because the cubic of a real cell
 may have negative coefficients: the NCR18650 points fit to 9.6 mV RMS, and to 10.6 mV with positive coefficients. Below an

@@ -1,4 +1,7 @@
-"""Overpotential of a cell under a measured current, by its RC ladder or by (2.2)-(2.9), with frozen parameters."""
+"""Overpotential of a cell under a measured current, with constant parameters.
+
+The model is the RC ladder of the cell, or (2.2)-(2.9) of the thesis.
+"""
 
 import numpy as np
 
@@ -10,7 +13,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 
 KELVIN = 273.15
-"""0 C [K]."""
+"""Temperature of 0 C [K]."""
 
 
 def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:

@@ -1,4 +1,7 @@
-"""Points of the open-circuit voltage from one or more sources."""
+"""Points of the open-circuit voltage from one or more sources.
+
+(2.10) is an equation of the thesis.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

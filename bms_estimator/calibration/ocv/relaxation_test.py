@@ -1,4 +1,4 @@
-"""Voltage relaxation test (5.2.1): points of the open-circuit voltage from a capture of loads and rests.
+"""Voltage relaxation test, section 5.2.1 of the thesis: points of the open-circuit voltage from a capture of loads and rests.
 
 A cell is discharged in steps with a rest after each. At the end of a rest its voltage is near the open-circuit voltage.
 The remaining relaxation is extrapolated with an exponential, and the standard deviation of the point contains the error
@@ -27,13 +27,15 @@ MIN_REST_S = 30.0
 MAX_STD_V = 0.02
 """Maximum standard deviation of an extrapolated voltage, per cell in series [V]."""
 FIT_FROM = 0.5
-"""Fraction of a rest's duration from which on the exponential is fitted, because the fast RC pair has decayed by then."""
+"""Fraction of a rest's duration after which the exponential is fitted. The fast RC pair has decayed by then."""
+END_FROM = 0.98
+"""Fraction of a rest's duration after which the voltages are averaged as the voltage at its end."""
 MIN_TAU = 0.05
 """Minimum candidate time constant, as a fraction of the rest's duration."""
 MAX_TAU = 0.7
 """Maximum candidate time constant, as a fraction of the rest's duration. A slower exponential cannot be distinguished
 from a drift, so that its extrapolation diverges."""
-TAU_GRID = 40
+TAU_COUNT = 40
 """Number of candidate time constants."""
 EXTRAPOLATION_ERROR = 0.6
 """Std of the extrapolated change, as a fraction of the change, because relaxation is no pure exponential. Half-hour rests
@@ -53,7 +55,7 @@ NEAR_FULL = 0.995
 NEAR_EMPTY = 0.02
 """SOC below which the last sample counts as empty."""
 MIN_POINTS = 6
-"""Minimum number of points: the number of parameters of (2.10)."""
+"""Minimum number of points, the number of parameters of (2.10) of the thesis."""
 
 
 @dataclass(frozen=True)
@@ -254,8 +256,10 @@ def _extrapolated_rest(rest: SampleBlock, soc: float, *, after_charge: bool) -> 
     duration_s = float(time_s[-1])
     late = time_s >= FIT_FROM * duration_s
     ocv_v, spread_v = _extrapolate(time_s[late], rest["voltage_v"][late], duration_s)
-    voltage_v = float(rest["voltage_v"][time_s >= 0.98 * duration_s].mean())
-    slow, _, _ = _with_tau(time_s[late], rest["voltage_v"][late], SLOW_TAU_S)  # a short rest cannot rule it out
+    voltage_v = float(rest["voltage_v"][time_s >= END_FROM * duration_s].mean())
+    slow, _, _ = _with_tau(
+        time_s[late], rest["voltage_v"][late], SLOW_TAU_S
+    )  # a short rest cannot exclude this time constant
     slow_std_v = SLOW_TAU_FRACTION * (float(slow[0]) - ocv_v) if duration_s < SLOW_TAU_S else 0.0
     return Rest(
         start_s=float(rest["time_s"][0]),
@@ -278,7 +282,7 @@ def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[
     by likelihood, so that the standard deviation contains the uncertainty of tau.
     """
     elapsed = time_s - time_s[0]
-    taus = np.geomspace(MIN_TAU * duration_s, MAX_TAU * duration_s, TAU_GRID)
+    taus = np.geomspace(MIN_TAU * duration_s, MAX_TAU * duration_s, TAU_COUNT)
     fits = [_with_tau(elapsed, voltage_v, tau) for tau in taus]
     v_inf = np.array([coefficients[0] for coefficients, _, _ in fits])
     squares = np.array([s for _, _, s in fits])

@@ -17,18 +17,17 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-MIN_S = 7.0 * 3600.0
-"""Minimum duration of a low-rate curve [s], that of a full one at C/7. At C/10 half of the difference between discharge
+MIN_DURATION_S = 7.0 * 3600.0
+"""Minimum duration of a low-rate curve, that of a full curve at C/7 [s]. At C/10 half of the difference between discharge
 and charge is some 20 mV."""
-CONSTANT_CURRENT = 0.05
-"""Maximum deviation of a constant current from its median, relative, beyond a standard deviation of its noise."""
+MAX_CURRENT_DEVIATION = 0.05
+"""Maximum relative deviation of a constant current from its median, in addition to a standard deviation of its noise."""
 SMOOTH_SAMPLES = 31
 """Length of the median filter [samples]. It removes faults and divides the noise by about five."""
 STD_PER_MEDIAN_STEP = 1.05
 """Standard deviation of white noise over the median absolute difference between its samples."""
 EMPTY_FALL = 0.01
-"""Minimum fall of the voltage over the last hundredth of the charge, relative, by which a discharge counts as full, that
-is down to empty."""
+"""Minimum relative fall of the voltage over the last hundredth of the charge for a discharge that ends empty."""
 PAIR_K = 5.0
 """Maximum temperature difference between discharge and charge of a pair [K]."""
 PAIR_CURRENT = 0.3
@@ -54,7 +53,7 @@ POINT_SOC = 0.002
 PAIR_V = 1.5e-3
 """Constant part of the systematic error of the mean of a pair, per cell in series [V]."""
 PAIR_FRACTION = 0.1
-"""Part of the systematic error of the mean of a pair, as a fraction of the half difference."""
+"""Variable part of the systematic error of the mean of a pair, as a fraction of the half difference."""
 UNPAIRED_FRACTION = 0.5
 """Systematic error as a fraction of the half difference, at SOCs where only one curve of a pair has data."""
 END_TRANSIENT_SOC = 0.03
@@ -134,8 +133,8 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
     for first, last in true_runs(~resting):
         current_a = smooth["current_a"][first:last]
         middle_a = float(np.median(current_a))
-        for a, b in true_runs(np.abs(current_a - middle_a) <= CONSTANT_CURRENT * abs(middle_a) + noise_a):
-            if good["time_s"][first + b - 1] - good["time_s"][first + a] >= MIN_S:
+        for a, b in true_runs(np.abs(current_a - middle_a) <= MAX_CURRENT_DEVIATION * abs(middle_a) + noise_a):
+            if good["time_s"][first + b - 1] - good["time_s"][first + a] >= MIN_DURATION_S:
                 found.append(_branch(good, moved_ah, resting, first + a, first + b, name))
     return found
 
@@ -143,6 +142,11 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
 def _branch(
     good: SampleBlock, moved_ah: Floats, resting: NDArray[np.bool_], first: int, last: int, name: str
 ) -> SlowBranch:
+    """Return the low-rate discharge or charge in the samples ``first`` to ``last`` - 1.
+
+    Raises:
+        UserError: The voltage changes in the wrong direction for the current.
+    """
     part = good[first:last]
     charge = bool(np.median(part["current_a"]) < 0.0)
     ah = np.abs(moved_ah[first:last] - moved_ah[first])
@@ -228,17 +232,20 @@ def slow_curves(
 
 
 def _are_pair(discharge: SlowBranch, charge: SlowBranch) -> bool:
+    """Return True if temperatures and currents are nearly equal."""
     warmer = charge.temperature_c - discharge.temperature_c
     near = np.isnan(warmer) or abs(warmer) <= PAIR_K
     return bool(near) and abs(charge.current_a / discharge.current_a - 1.0) <= PAIR_CURRENT
 
 
 def _pair(down: SlowBranch, soc: Floats, up: SlowBranch, up_soc: Floats, series_count: int) -> SlowCurve:
-    """Return the mean of discharge and charge. Where one has no data, shift the other by half of the median difference."""
+    """Return the mean of discharge and charge.
+
+    At SOCs where one of both has no data, the other is shifted by half of the median difference.
+    """
     low, high = max(soc[-1], up_soc[0]), min(soc[0], up_soc[-1])
-    high = (
-        high if high > HYSTERESIS_SOC[1] else high - END_TRANSIENT_SOC
-    )  # a charge that stops early rises before its end
+    if high <= HYSTERESIS_SOC[1]:  # the voltage of a charge that stops early rises before its end
+        high -= END_TRANSIENT_SOC
     both = GRID[(low <= GRID) & (high >= GRID)]
     differ_v = 0.5 * (_voltage_at(both, up_soc, up.voltage_v) - _voltage_at(both, soc, down.voltage_v))
     middle_v = float(np.median(differ_v))
@@ -264,6 +271,7 @@ def _pair(down: SlowBranch, soc: Floats, up: SlowBranch, up_soc: Floats, series_
 
 
 def _unpaired(branch: SlowBranch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
+    """Return the curve of an unpaired discharge or charge, without its ohmic drop."""
     grid = GRID[(soc.min() <= GRID) & (soc.max() >= GRID)]
     sign = -1.0 if branch.charge else 1.0
     ohmic_v = float(np.nan_to_num(branch.step_v))
@@ -284,6 +292,16 @@ def _voltage_at(grid: Floats, soc: Floats, voltage_v: Floats) -> Floats:
 def _points(
     grid: Floats, ocv_v: Floats, common_v: float, cold_fraction: float, temperature_c: float, series_count: int
 ) -> Points:
+    """Return the points of a low-rate curve at the SOCs ``grid``.
+
+    Args:
+        grid: SOC of the points.
+        ocv_v: Open-circuit voltage [V].
+        common_v: Std of the systematic error [V].
+        cold_fraction: Fraction of the cold-relaxation error that remains.
+        temperature_c: Temperature [C]; NaN if unknown.
+        series_count: Cells in series.
+    """
     std_v = np.hypot(POINT_V * series_count, POINT_SOC * np.gradient(ocv_v, grid))
     everywhere = np.ones(grid.size)
     cold_v = cold_fraction * COLD_V * series_count * coldness(temperature_c * everywhere)

@@ -37,22 +37,22 @@ remainder is polarisation. Measured fractions are 0.4 and 0.5 for an NCA cell, 1
 REST_SHARE_STD = 0.3
 """Std of ``REST_SHARE``."""
 PLATEAU_SHARE = 0.9
-"""Fraction that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the hysteresis (Dreyer et
+"""Fraction of the hysteresis that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the hysteresis (Dreyer et
 al., Nature Materials 9, 2010, 448). Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
 PLATEAU_V = 0.15
 """Maximum slope dOCV/dSOC of a plateau, per cell [V]."""
 PLATEAU_SOC = 0.05
 """SOC interval over which the slope of a plateau is computed."""
 TYPICAL_HYSTERESIS_STD = 0.6
-"""Relative std of a hysteresis taken from typical cells."""
+"""Relative std of a hysteresis that is that of typical cells."""
 MIN_SHARE = 0.1
-"""Lower limit of a fraction that rests show."""
+"""Lower limit of the remaining fraction that is measured by rests."""
 SHARE_POINTS = 6
-"""Minimum number of rests that determine the fraction."""
+"""Minimum number of rests that determine the remaining fraction."""
 SHARE_K = 10.0
-"""Maximum distance of these rests from 25 C beyond that of the low-rate curves [K]."""
+"""Maximum distance from 25 C of rests that determine the remaining fraction, beyond that of the low-rate curves [K]."""
 SHARE_SOC = (0.1, 0.95)
-"""SOC range of these rests, and of a plateau."""
+"""SOC range of rests that determine the remaining fraction, and of a plateau."""
 MAX_CAPACITY_DIFFERENCE = 0.05
 """Relative difference between the given and the measured capacity above which a source has a remark."""
 
@@ -167,7 +167,9 @@ def find_sources(
         )
     slow_ah = measured_ah if np.isfinite(measured_ah) else known_ah
     slow = slow_curves(every, slow_ah, initial_soc=initial_soc, series_count=series_count)
-    sources = [_of_slow(curve, slow_ah, known_ah) for curve in slow] + [_of_given(one, series_count) for one in curves]
+    sources = [_slow_curve_source(curve, slow_ah, known_ah) for curve in slow] + [
+        _given_curve_source(one, series_count) for one in curves
+    ]
     rests = [one for one in recordings if not branches[one.name]]
     found = _rests(rests, sources, every, known_ah, initial_soc, series_count)
     hysteresis_source = _hysteresis_source(sources)
@@ -190,12 +192,19 @@ def find_sources(
                 else one
                 for one in sources
             ]
-    of_rests = [_of_test(test, points) for test, points in found]
+    of_rests = [_relaxation_source(test, points) for test, points in found]
     tests = tuple(test for test, _ in found)
     return OcvSources(known_ah, measured_ah, (*sources, *of_rests), tests, hysteresis_v, hysteresis_std_v)
 
 
-def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
+def _slow_curve_source(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
+    """Return a low-rate curve as a source.
+
+    Args:
+        curve: Paired or unpaired low-rate curve.
+        slow_ah: Capacity that the curve's SOC is counted against [Ah].
+        capacity_ah: Given capacity [Ah].
+    """
     first, *others = curve.branches
     kind = f"{first.label(slow_ah)}, {first.ah[-1]:.3f} Ah"
     name = first.name
@@ -209,7 +218,8 @@ def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
     return Source(name, kind, curve.points, first.temperature_c, curve.hysteresis_v, notes, unpaired)
 
 
-def _of_given(curve: ExternalCurve, series_count: int) -> Source:
+def _given_curve_source(curve: ExternalCurve, series_count: int) -> Source:
+    """Return a given curve as a source."""
     everywhere = np.full(curve.soc.size, float(series_count))
     points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, common_v=GIVEN_COMMON_V * everywhere)
     hysteresis_v = None
@@ -331,12 +341,11 @@ def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
 
 
 def _without_branches(source: Source, ladder: Ladder) -> Source:
+    """Return the source without the steady voltage drop of the RC pairs, if its curve is unpaired."""
     if source.unpaired is None:
         return source
-    points, first = (
-        source.points,
-        1 if np.isfinite(source.unpaired.step_v) else 0,
-    )  # a measured jump was already subtracted
+    points = source.points
+    first = 1 if np.isfinite(source.unpaired.step_v) else 0  # a measured ohmic jump was already subtracted
     temperature_c = np.nan_to_num(points.temperature_c, nan=REFERENCE_C)
     drop_v = steady_drop(ladder, source.unpaired.current_a, points.soc, temperature_c, first)
     points = replace(
@@ -372,6 +381,6 @@ def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSourc
     )
 
 
-def _of_test(test: RelaxationTest, points: Points) -> Source:
+def _relaxation_source(test: RelaxationTest, points: Points) -> Source:
     notes = () if test.start_soc > 0.9995 else (f"starts at SOC {test.start_soc:.3f}",)
     return Source(test.name, f"{len(test.rests)} rests", points, test.temperature_c, None, notes)

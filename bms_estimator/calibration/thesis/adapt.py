@@ -8,7 +8,7 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.cleaning.rests import remove_glitches
-from bms_estimator.calibration.elements.identify import NO_WORSE, initial_soc
+from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO, initial_soc
 from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.thesis.adapt_steps import AdaptedElements, Start, steps_2_and_3
 from bms_estimator.calibration.thesis.prediction import predict
@@ -91,7 +91,7 @@ def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = N
     steps, adapted = _adapted_cell(cell, starts)
     scored = tuple(_scored_capture(cell, adapted, loads, starts, j) for j in range(len(starts)))
     before, after = (_geometric_mean([getattr(c, name) for c in scored]) for name in ("score_before", "score_after"))
-    if after > NO_WORSE * before:
+    if after > EQUAL_SCORE_RATIO * before:
         raise UserError(
             f"nothing is written: replays started in mid-load get worse, their interval score (smaller is better) goes "
             f"from {before:.2f} to {after:.2f} % of SOC; use `identify`, or give captures of more currents"

@@ -1,4 +1,6 @@
-"""Step 2: adaptive estimation of a1..a15 over a capture, Algorithm 1 and schemes 1 to 3.
+"""Step 2 of the thesis: adaptive estimation of a1..a15 over a capture, Algorithm 1 and schemes 1 to 3.
+
+Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
 
 The observer runs over the whole capture and stops adapting at the stability conditions (Fig. 19). The result contains
 "converged" or the reason for a failure.
@@ -21,6 +23,8 @@ SNAPSHOTS = 3000
 """Maximum number of equidistant snapshots of a_i(t) over a run, in addition to ``FIRST_SAMPLES``."""
 FIRST_SAMPLES = 200
 """Number of first samples that are all recorded, because a_i(t) moves from its initial value to its limit there."""
+CONVERGED_SHARE = 0.95
+"""Minimum fraction of the samples between t_int and t_unst whose error is within eps2."""
 
 SNAPSHOT_FIELDS = (
     "time_s",
@@ -32,7 +36,7 @@ SNAPSHOT_FIELDS = (
     "nussbaum_gain",
     "stability_margin",
 )
-"""Fields of the trace that each snapshot holds."""
+"""Fields of the trace that each snapshot contains."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Crossing:
     Attributes:
         parameter: "a8" or "a11".
         soc: delta1 or delta2 of the parameters at the end of adaptation.
-        time_s: Time at which SOC reached ``soc`` [s]; None when the capture ends above.
+        time_s: Time at which SOC reached ``soc`` [s]; None if the capture ends above ``soc``.
     """
 
     parameter: str
@@ -52,7 +56,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class AdaptiveRun:
-    """One run of the observer. Arrays over time have shape (n,), n the number of snapshots.
+    """Run of the observer over a capture. Arrays over time have shape (n,), where n is the number of snapshots.
 
     Attributes:
         time_s: Time of the snapshots [s].
@@ -175,7 +179,7 @@ def _outcome(window: AveragingWindow, time_s: Floats, error_v: Floats, epsilon_v
         worst = float(np.abs(error_v[time_s <= window.t_unst_s]).max(initial=0.0))
         return f"not converged: {window.start_reason}; largest |e| {1e3 * worst:.2f} mV until {window.t_unst_s:.0f} s"
     share = float((np.abs(error_v[inside]) <= epsilon_v).mean())
-    if share < 0.95:
+    if share < CONVERGED_SHARE:
         return f"not converged: |e| is within {1e3 * epsilon_v:.2f} mV for {100 * share:.1f} % of the samples only"
     if lock_losses:
         return f"not converged: lock was lost {lock_losses} times"

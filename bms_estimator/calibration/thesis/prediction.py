@@ -1,6 +1,7 @@
-"""Terminal voltage of a model with frozen parameters under a measured current: validation (5.3), chapter 6.
+"""Terminal voltage of a model with constant parameters under a measured current.
 
-The dynamic model has elements that depend on SOC. The static model has constant elements, those at one SOC. In both,
+Section 5.3 and chapter 6 of the thesis validate the parameters in this way. Numbers in parentheses are equations of the
+thesis. The dynamic model has elements that depend on SOC. The static model has constant elements, those at one SOC. In both,
 E_o depends on SOC.
 """
 
@@ -21,8 +22,12 @@ GRID = np.linspace(0.0, 1.0, 4001)
 """SOC grid on which E_o(SOC) is inverted."""
 EMPTY_SOC = 0.0
 """SOC at which a prediction ends. The curves of the model are undefined below."""
+DELTA_FACTOR = 1.05
+"""Relative margin of the end of a prediction above delta1 and delta2, where a capacitance vanishes."""
+DELTA_MARGIN = 1e-4
+"""Additional margin in SOC of the end of a prediction above delta1 and delta2."""
 JUMP_FRACTION = 0.1
-"""Minimum change of current between two samples of a jump, as a fraction of the largest current."""
+"""Minimum change of the current between two samples of a current jump, as a fraction of the largest current."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ def predict(
         cell: Capacity and OCV, and the elements without ``a``.
         samples: Raw samples, dtype ``SAMPLE``.
         initial_soc: SOC 0..1 at the first sample.
-        a: a1..a15 at index 1..15; None: the cell's.
+        a: a1..a15 at index 1..15; None: those of ``cell``.
         lowest_soc: SOC below which the prediction ends. It also ends at the model's delta1 or delta2.
 
     Raises:
@@ -135,9 +140,9 @@ def static_elements(a: Floats, soc: float) -> Floats:
 
 
 def _unstable_below(a: Floats) -> float:
-    """Return the SOC below which a capacitance is negative, (2.11), (2.12), with a margin of 5 %; 0 if none is."""
+    """Return the SOC below which a capacitance is negative, (2.11), (2.12), with a margin; 0 if no capacitance is negative."""
     worst = max(delta(a[i + 1], a[i + 2], a[i]) for i in (7, 10))
-    return 1.05 * worst + 1e-4 if worst > 0.0 else 0.0
+    return DELTA_FACTOR * worst + DELTA_MARGIN if worst > 0.0 else 0.0
 
 
 def soc_by_interpolation(cell: CellModel, run: Prediction) -> tuple[Floats, Floats]:

@@ -1,11 +1,13 @@
-"""Step 3: R_s by (4.2) from several currents, and a13..a15 fitted to R_s.
+"""Step 3 of the thesis: R_s by (4.2) from several currents, and a13..a15 fitted to R_s.
 
-(4.2) is printed with the opposite sign: solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive. x2 and
+Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
+
+The thesis prints (4.2) with the opposite sign. Solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive. x2 and
 x3 are those of the model with frozen a1..a12. The observer's x2 and x3 would absorb i R_s, because (4.1) drives the
 estimated voltage to y.
 
 (4.2) as printed divides by the current: an error of the open-circuit voltage of 10 mV becomes 65 mohm at C/20 and 2 mohm
-at 1.5C. A plain mean over currents weights both equally (erratum 19). Here R_s is fitted to i R_s by least squares, so
+at 1.5C. A plain mean over the currents has equal weights for both values (erratum 19). Here R_s is fitted to i R_s by least squares, so
 that each value of (4.2) has its squared current as weight.
 """
 

@@ -8,8 +8,8 @@ from bms_estimator.numba_cache import njit
 
 FLOW_SUMS = np.dtype(
     [
-        ("charge_as", "f8"),  # charge since the last reading of the sums, positive on discharge [A s]
-        ("energy_ws", "f8"),  # energy since the last reading of the sums, positive on discharge [W s]
+        ("charge_as", "f8"),  # charge since the last update of the totals, positive on discharge [A s]
+        ("energy_ws", "f8"),  # energy since the last update of the totals, positive on discharge [W s]
         ("last_s", "f8"),  # time stamp of the last sample [s]
         ("last_a", "f8"),  # current of the last sample [A]
         ("last_w", "f8"),  # power of the last sample [W]
@@ -18,7 +18,7 @@ FLOW_SUMS = np.dtype(
     ],
     align=True,
 )
-"""Running sums. A record of zeros has had no sample."""
+"""Running sums of charge and energy. All fields are 0 before the first sample."""
 
 
 @njit(cache=True)
@@ -28,7 +28,7 @@ def accumulate_charge_energy(sums: Records, trace: Records, gap_s: float) -> Non
     Args:
         sums: Shape (1,), dtype FLOW_SUMS; updated in place.
         trace: Shape (n,), dtype TRACE.
-        gap_s: Minimum duration of a gap, unless the previous step was about as long [s]; as in ``kernels.step.is_gap``.
+        gap_s: Minimum duration of a gap, unless the previous step was about as long [s]. ``kernels.step.is_gap`` has an equal condition.
     """
     s = sums[0]
     for j in range(trace.shape[0]):

@@ -10,7 +10,7 @@ from bms_estimator.numba_cache import njit
 
 HOUR_SUMS = np.dtype(
     [
-        ("store", "u8"),  # store of the last block, because each store has its own clock; 0: no block yet
+        ("store", "u8"),  # creation time of the edge's store that sent the last block [ns since 1970]; 0: no block yet
         ("last_s", "f8"),  # time stamp of the last sample [s]
         ("last_a", "f8"),  # current of the last sample [A]
         ("last_w", "f8"),  # power of the last sample [W]
@@ -43,14 +43,14 @@ HOUR_SUMS = np.dtype(
     ],
     align=True,
 )
-"""Running sums. A record of zeros has had no sample."""
+"""Running sums of an hour. All fields are 0 before the first sample."""
 OF_HOUR = tuple(HOUR_SUMS.names or ())[(HOUR_SUMS.names or ()).index("samples") :]
 """Fields that restart with each hour."""
 
 
 @njit(cache=True)
 def accumulate_hour(sums: Records, trace: Records, new_clock: bool, gap_s: float, rest_a: float) -> None:
-    """Add accepted samples.
+    """Add accepted samples to the sums of an hour.
 
     Args:
         sums: Shape (1,), dtype HOUR_SUMS; updated in place.
@@ -70,14 +70,14 @@ def accumulate_hour(sums: Records, trace: Records, new_clock: bool, gap_s: float
 
 @njit(cache=True)
 def add_step(h: Record, x: Record, has_previous: bool, gap_s: float, rest_a: float) -> None:
-    """Add charge, energy and time since the previous sample by a trapezoid; over a gap only count the gap.
+    """Add charge, energy and time since the previous sample by a trapezoid. Over a gap, count only the gap.
 
     Args:
         h: Record of HOUR_SUMS.
         x: Record of TRACE.
         has_previous: True if a previous sample with an equal time base exists.
-        gap_s: As in ``accumulate_hour``.
-        rest_a: As in ``accumulate_hour``.
+        gap_s: Minimum duration of a gap, unless the previous step was about as long [s].
+        rest_a: Maximum current that counts as zero [A].
     """
     power_w, dt_s = x.voltage_v * x.current_a, x.time_s - h.last_s
     measured = has_previous and 0.0 < dt_s <= max(gap_s, GAP_RATIO * h.step_s)
@@ -97,7 +97,7 @@ def add_step(h: Record, x: Record, has_previous: bool, gap_s: float, rest_a: flo
 
 @njit(cache=True)
 def add_values(h: Record, x: Record) -> None:
-    """Add a sample to the sums and extremes. Records as in ``add_step``."""
+    """Add sample ``x``, a record of TRACE, to the sums and extremes of ``h``, a record of HOUR_SUMS."""
     first = h.samples == 0
     h.samples += 1
     h.sum_v += x.voltage_v

@@ -11,20 +11,20 @@ WINDOW_SUMS = np.dtype(
     [
         ("samples", "i8"),
         ("first_s", "f8"),  # time stamp of the first sample [s]
-        ("voltage_v", "f8"),
-        ("current_a", "f8"),
-        ("power_w", "f8"),
+        ("voltage_v", "f8"),  # sum of the voltages [V]
+        ("current_a", "f8"),  # sum of the currents [A]
+        ("power_w", "f8"),  # sum of the powers [W]
         ("temperatures", "i8"),  # samples with a temperature
-        ("temperature_c", "f8"),
+        ("temperature_c", "f8"),  # sum of the temperatures [C]
     ],
     align=True,
 )
-"""Running sums. A record of zeros has had no sample."""
+"""Running sums of a publish window. All fields are 0 before the first sample."""
 
 
 @njit(cache=True)
 def accumulate_window(sums: Records, trace: Records) -> None:
-    """Add accepted samples.
+    """Add accepted samples to the sums of a publish window.
 
     Args:
         sums: Shape (1,), dtype WINDOW_SUMS; updated in place.

@@ -1,5 +1,7 @@
 """Cell model of Chen and Mora: elements over SOC, and exact response to a constant current.
 
+Numbers in parentheses are equations of the thesis.
+
 Parameters have their own index: ``a[1]`` is a1, ``a[0]`` is unused. Voltages in V, currents in A
 (positive on discharge), resistances in ohm, capacitances in F, SOC 0..1.
 """
@@ -85,7 +87,7 @@ def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
 
 @njit(cache=True)
 def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
-    """Return the SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of ``ocv``, thesis 7.1.
+    """Return the SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of ``ocv``, section 7.1 of the thesis.
 
     The search bisects the nodes and uses false position (Illinois) between two nodes. It converges for every increasing
     curve. Outside the curve's range the result is the nearest end.
@@ -190,13 +192,13 @@ def simulate_cell(x: State, time_s: Floats, current_a: Floats, capacity_as: floa
 def delta(exponent: float, offset: float, amplitude: float) -> float:
     """Return the SOC below which a capacitance -amplitude e^(-exponent SOC) + offset is negative: (2.11), (2.12).
 
-    delta1 = delta(a8, a9, a7), delta2 = delta(a11, a12, a10). Negative when the capacitance is
-    positive over the whole of 0..1.
+    delta1 = delta(a8, a9, a7), delta2 = delta(a11, a12, a10). The result is negative if the capacitance is positive over
+    the whole of 0..1.
     """
     return -math.log(offset / amplitude) / exponent  # (2.11), (2.12)
 
 
 @njit(cache=True)
 def crossing(soc: float, offset: float, amplitude: float) -> float:
-    """Return the bound of a8 or a11 at ``soc``: the right side of the condition in Lemma 4.1.1, Fig. 19."""
+    """Return the bound of a8 or a11 at ``soc``: the right side of the condition in Lemma 4.1.1 of the thesis, as in its Fig. 19."""
     return -math.log(offset / amplitude) / soc

@@ -1,4 +1,4 @@
-"""Fuel cell model of section 7.3: Nernst voltage with Tafel, ohmic and concentration losses, and a double layer.
+"""Fuel cell model after section 7.3 of the thesis: Nernst voltage with Tafel, ohmic and concentration losses, and a double layer.
 
 A stack of n cells is one two-terminal object with the current i, positive when the stack delivers power::
 

@@ -40,7 +40,10 @@ def open_loop(
 
 @njit(cache=True)
 def polarisation(file: Floats, theta: Floats, current_a: Floats, temperature_c: Floats) -> tuple[Floats, Floats]:
-    """Return the steady-state voltage under each current. Arguments and result are those of ``open_loop``."""
+    """Return the steady-state voltage under each current [V], and its derivatives by theta.
+
+    The arguments are those of ``open_loop``.
+    """
     n = current_a.size
     voltage_v, psi = np.empty(n), np.zeros((n, theta.size))
     x, dx, given = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)

@@ -1,5 +1,7 @@
 """Open-loop response of a cell's RC pairs to a measured current, from rest.
 
+Numbers in parentheses are equations of the thesis.
+
 The current between two samples is interpolated as in the filter (``interpolated_current``, ``ramp_correction``) for a
 source with a period of at most a minute.
 """

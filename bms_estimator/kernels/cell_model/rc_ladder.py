@@ -46,7 +46,7 @@ TREND = 3
 """Index of the RC pair whose filtered current decides between charge and discharge: that of 120 s."""
 
 TAUS = np.array(TAU_S)
-"""Time constants of the RC pairs as an array [s]."""
+"""Time constants of the RC pairs as an array for the kernels [s]."""
 
 
 def weak_share(soc: Floats) -> Floats:

@@ -40,7 +40,8 @@ MINUTE_S = 60.0
 TEN_MINUTES_S = 600.0
 """Averaging time of the mean innovation that shows a persistent error within tens of minutes [s]."""
 INFLATION_AVERAGING = 5.0, 3.0
-"""Averaging times of the fast and the slow inflation, in multiples of ``MINUTE_S`` and ``TEN_MINUTES_S``."""
+"""Averaging times of two inflations: of the fast one in multiples of ``MINUTE_S``, of the slow one in multiples of
+``TEN_MINUTES_S``."""
 CONVERGED_SOC = 0.01
 """Change of the SOC below which the relinearization about the posterior has converged."""
 MAX_ITERATIONS = 8
@@ -57,7 +58,8 @@ MAX_LN_Q = math.log(1.3)
 """Upper limit of ln of the learned over the declared capacity. New cells exceed their declared capacity only
 slightly."""
 HOLD_NOTHING, HOLD_CAPACITY, HOLD_CELL, HOLD_CELL_AND_CURVE = range(4)
-"""Sets of states that an update does not change: none; LN_Q; LN_Q, OFFSET and the OCV nodes; these and CURVE."""
+"""Sets of states that an update does not change. ``HOLD_NOTHING`` is empty, and ``HOLD_CAPACITY`` contains LN_Q.
+``HOLD_CELL`` contains LN_Q, OFFSET and the OCV nodes. ``HOLD_CELL_AND_CURVE`` also contains CURVE."""
 INDEPENDENT_R_STD = 0.5
 """Maximum std of LN_R0 and LN_R that is independent between both. A larger std is common to both, as the unknown size of
 the cell. Only cell files of cells that were not measured have a larger std."""
@@ -74,7 +76,7 @@ CHARGE = TREND + 1
 CHARGE_C = 0.04
 """Minimum filtered current of a charge, as a C-rate. Regeneration is shorter and has a smaller one."""
 VARYING_C = 0.2
-"""Minimum standard deviation over 10 min of a load that distinguishes resistance from capacity [C]."""
+"""Minimum standard deviation over 10 min of a load that distinguishes resistance from capacity, as a C-rate."""
 
 
 @njit(cache=True)
@@ -106,7 +108,7 @@ def hysteresis_charge(s: Record, p: Record) -> float:
 def predict(s: Record, p: Record, q: int) -> None:
     """Propagate mean and covariance over the window: x = f(x), P = F P F' + Q.
 
-    F is diagonal except for the elements of the SOC by offset and capacity, and of the RC pairs by the offset.
+    F is diagonal, except that SOC depends on offset and capacity, and that the RC pairs depend on the offset.
     """
     x, cov, f, w = s.mean[q], s.covariance[q], s.f, s.window
     bias_v2 = bias_variance(s, p, q)
@@ -119,7 +121,7 @@ def predict(s: Record, p: Record, q: int) -> None:
         factor, row = f[j], cov[j]
         for k in range(STATES if j < NODE else NODE):
             row[k] *= factor * f[k]
-    x[SOC] -= moved  # (2.1)
+    x[SOC] -= moved  # (2.1) of the thesis
     x[HYST] -= math.copysign(1.0 - f[HYST], hysteresis_charge(s, p))
     for k in range(X, X + BRANCHES):
         x[k] -= (1.0 - f[k]) * x[OFFSET]
@@ -138,7 +140,7 @@ def apply_offdiagonal_transition(cov: Floats, f: Floats, by_offset: float, moved
         cov[k, SOC] += by_offset * cov[k, OFFSET] + moved * cov[k, LN_Q]
         for j in range(X, X + BRANCHES):
             cov[k, j] -= (1.0 - f[j]) * cov[k, OFFSET]
-    for j in range(SOC, X + BRANCHES):  # the rounding above is not symmetric
+    for j in range(SOC, X + BRANCHES):  # rounding makes the rows and columns differ
         for k in range(j):
             cov[j, k] = cov[k, j]
         for k in range(X + BRANCHES, STATES):
@@ -184,7 +186,7 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
 def compute_innovation(
     s: Record, p: Record, q: int, variance_v2: float, about_soc: float, about_variance: float
 ) -> tuple[float, float, float]:
-    """Return innovation, S and S without the linearization error about an SOC; write P H' to ``s.ph``."""
+    """Return the innovation, S, and S without the linearization error, linearized about an SOC. Write P H' to ``s.ph``."""
     cov, h, ph = s.covariance[q], s.h, s.ph
     predicted_v, nonlinear_v = linearise(s, p, q, about_soc, about_variance)
     innovation_v = s.window.sum_v / s.window.samples - predicted_v
@@ -214,7 +216,11 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
     The model is linearized about ``about_soc`` over the width given by ``about_variance``, and evaluated at the filter's
     SOC.
 
-    v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. H excludes the
+    The model is (2.4) of the thesis with the ladder in place of two RC pairs:
+
+        v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast
+
+    H excludes the
     derivatives of the resistances and of the learned OCV by SOC, because errors of these would change the SOC.
     """
     x, h, ohm, w = s.mean[q], s.h, s.ohm, s.window

@@ -1,4 +1,4 @@
-"""Map of the identified elements over SOC, and fit of the thesis's functions to the map.
+"""Map of the identified elements over SOC, and fit of the thesis's functions (2.5)-(2.9) to the map.
 
 The identifier estimates the elements at the present SOC. The map stores the information-weighted mean of these estimates
 for each SOC bin. (2.5)-(2.9) are fitted to the map by a search over the nonlinear exponent and linear least squares for
@@ -47,6 +47,7 @@ ELEMENT_MAP = np.dtype(
     ],
     align=True,
 )
+"""Information-weighted sums of the logarithm of each element, by SOC bin."""
 
 ELEMENT_FIT = np.dtype(
     [
@@ -59,6 +60,7 @@ ELEMENT_FIT = np.dtype(
     ],
     align=True,
 )
+"""Parameters of (2.5)-(2.9) fitted to the map."""
 
 
 @njit(cache=True)
@@ -90,7 +92,7 @@ def decay_weights(m: Record, e: int, factor: float) -> None:
 
 @njit(cache=True)
 def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
-    """Fit the function of one element, (2.5)-(2.9), to its row of the map.
+    """Fit the function of one element, one of (2.5)-(2.9), to its row of the map.
 
     Args:
         m: Record of ELEMENT_MAP.
@@ -122,8 +124,8 @@ def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float
     Args:
         fit: Record of ELEMENT_FIT after ``fit_element`` for this element.
         e: Row of the map, 0..4.
-        lower: Bounds of a1..a15 at index 1..15.
-        upper: Upper bounds.
+        lower: Lower bounds of a1..a15 at index 1..15.
+        upper: Upper bounds of a1..a15 at index 1..15.
     """
     i = 3 * e + 1
     amplitude, exponent, offset = fit.a[i], fit.a[i + 1], fit.a[i + 2]
@@ -178,7 +180,7 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
 
 @njit(cache=True)
 def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -> float:
-    """Return the exponent of least cost by a logarithmic search and golden section around its best point."""
+    """Return the exponent of least cost by a logarithmic search, followed by a golden section around its best point."""
     ratio = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
     lowest, highest = math.log(EXPONENT_MIN), math.log(EXPONENT_MAX)
     best = min(max(math.log(start), lowest), highest)

@@ -1,4 +1,4 @@
-"""Two RC pairs of (2.2)-(2.3) that are equivalent to the filter's ladder at the present SOC and temperature.
+"""Two RC pairs, (2.2)-(2.3) of the thesis, that are equivalent to the filter's ladder at the present SOC and temperature.
 
 Ladder resistances with time constants up to ``SHORT_S`` add to R_ts, the slower ones to R_tl. Each time constant is the
 geometric mean of the ladder's time constants, weighted by resistance.
@@ -26,7 +26,7 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
-"""Indices into ``value`` and ``ln_variance``."""
+"""Indices of the circuit elements in ``value`` and ``ln_variance`` of a record of EQUIVALENT."""
 SHORT_S = 60.0
 """Limit between the time constants published as R_ts C_ts and as R_tl C_tl [s]."""
 SHORT = sum(tau_s < SHORT_S for tau_s in TAU_S)
@@ -48,6 +48,7 @@ EQUIVALENT = np.dtype(
     ],
     align=True,
 )
+"""Circuit equivalent to the ladder at the present SOC and temperature."""
 
 
 @njit(cache=True)
@@ -128,7 +129,7 @@ def r_s_identified_by_steps(f: Record, p: Record) -> bool:
 
 @njit(cache=True)
 def open_circuit(f: Record, p: Record, e: Record, current_a: float, voltage_v: float) -> float:
-    """Return E_o on the cell file's curve at 25 C by the measured voltage, (2.4) [V].
+    """Return E_o on the cell file's curve at 25 C by the measured voltage, (2.4) of the thesis [V].
 
     Overpotential, hysteresis, learned correction and temperature dependence of the OCV are subtracted.
     """

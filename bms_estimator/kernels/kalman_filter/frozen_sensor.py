@@ -65,7 +65,7 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
         c.same_soc, c.same_soc_std = f.soc, f.soc_std
     elif moved or (fast and abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > max(SWING_V * p.series, resolved_v)):
         c.frozen_a_s += counted_s
-    elif c.frozen_a_s < FROZEN_S:  # single glitches at rest are forgotten
+    elif c.frozen_a_s < FROZEN_S:  # discount single glitches at rest
         c.frozen_a_s -= c.frozen_a_s * min(1.0, counted_s / OUTLIERS_S)
     c.last_v, c.last_a = voltage_v, current_a
     return not stuck or c.frozen_v_s <= SUSPECT_S or c.frozen_v_s > FROZEN_S

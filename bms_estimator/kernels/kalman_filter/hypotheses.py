@@ -73,20 +73,21 @@ SPREAD_STDS = 2.25
 OVERLAP = 0.62
 """Std of a hypothesis, as a fraction of the distance between neighbours."""
 BEYOND_STD = 0.03
-"""Std of the prior weight of hypotheses whose SOC was limited to ``MIN_SOC`` or ``MAX_SOC``."""
+"""Std in SOC of the prior weight of a hypothesis beyond ``MIN_SOC`` or ``MAX_SOC``, whose SOC is limited."""
 MIN_STD = 0.005
 """Minimum std of the published SOC, because full and empty of a cell are not defined better."""
 UNKNOWN_FULL = 0.03
-"""Minimum std of the published SOC over that of ln R. A cell that was not measured is full at another point of the curve."""
+"""Minimum std of the published SOC, as a fraction of the std of ln R. A cell that was not measured is full at another point of
+the curve."""
 HYST_STD = 0.7
 """Initial std of the hysteresis state h."""
 HISTORY_S = 1800.0
 """Time constant with which effects of the unknown load before switch-on decay [s]."""
 REINITIALIZE_STDS = 4.0
-"""Bias in std above which the SOC is re-initialized, because a wrong SOC is more likely than such a model error."""
+"""Bias above which the SOC is re-initialized, in standard deviations. A wrong SOC is more likely than such a model error."""
 INCONSISTENT_STDS = 2.0
-"""Bias in std above which a hypothesis loses weight. Its biases absorb its errors, so that its innovations alone are
-small."""
+"""Bias above which a hypothesis loses weight, in standard deviations. The biases of a wrong hypothesis absorb its errors, so
+that its innovations alone are small."""
 REINITIALIZED_STD = 0.2
 """Std of the SOC after a re-initialization, equal to the default at switch-on."""
 USER_SOC_STD = 0.03
@@ -186,7 +187,8 @@ def update_hypotheses(s: Record, p: Record) -> None:
             predict(s, p, q)
         innovation_v, total_v2, linear_v2 = update(s, p, q, variance_v2)
         u = innovation_v / math.sqrt(total_v2)
-        # S without the linearization error, which is constant at rest: repeated each second, it would reject a SOC at a knee
+        # S excludes the linearization error, because that error is constant at rest: repeated each second, it would reject
+        # an SOC at a knee of the OCV
         s.ln_weight[q] -= p.half_likelihood_exponent * (
             innovation_v * innovation_v / (scale * linear_v2) + math.log(linear_v2)
         )

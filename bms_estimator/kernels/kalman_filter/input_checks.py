@@ -42,7 +42,7 @@ MAX_SOC_STD = 0.4
 SIGN_S = 300.0
 """Averaging time of the relation between voltage and current changes, counted while the current changes [s]."""
 MIN_EVIDENCE = 0.1
-"""Minimum filled fraction of that average for a fault of the sign."""
+"""Minimum filled fraction of the average over ``SIGN_S`` for a fault of the sign."""
 MAX_CHANGE_RATIO = 5.0
 """Limit of a voltage change, in multiples of the change that the resistances explain, so that a glitch to zero does not
 dominate the average."""
@@ -55,7 +55,7 @@ OFFSET_STDS = 4.0
 CAPACITY_STDS = 2.0
 """Limit of the capacity for the fault CAPACITY, in multiples of its initial std."""
 PRESENT_STDS = 3.0
-"""Minimum offset or LN_Q of these faults, in multiples of its present std."""
+"""Minimum offset or LN_Q for the faults OFFSET and CAPACITY, in multiples of its present std."""
 CLEAR_FRACTION = 0.7
 """Fraction of its limit below which a fault ends (hysteresis)."""
 WRONG_V = 0.12
@@ -83,7 +83,7 @@ CHECKS = np.dtype(
         ("slow_a", "f8"),  # running mean of the current [A]
         ("slower_v", "f8"),  # running mean of slow_v [V]
         ("slower_a", "f8"),  # running mean of slow_a [A]
-        ("sign_evidence", "f8"),  # filled fraction of the two averages below, 0..1
+        ("sign_evidence", "f8"),  # filled fraction of the averages change_v_a and change_a2, 0..1
         ("change_v_a", "f8"),  # running mean of fast voltage change times fast current change [V A]
         ("change_a2", "f8"),  # running mean of the squared fast current change [A^2]
         ("last_v", "f8"),  # voltage of the previous sample [V]; 0: none
@@ -110,6 +110,7 @@ CHECKS = np.dtype(
     ],
     align=True,
 )
+"""State of the input checks."""
 
 COUNTERS = np.dtype(
     [
@@ -119,6 +120,7 @@ COUNTERS = np.dtype(
     ],
     align=True,
 )
+"""Counters of the input checks."""
 
 
 @njit(cache=True)
@@ -133,7 +135,7 @@ def passes_innovation_gate(
     current_a: float,
     voltage_v: float,
 ) -> bool:
-    """Return True if the filter may use a sample: its voltage is within the gate, or many successive ones are beyond.
+    """Return True if the filter may use a sample: its voltage is within the gate, or many successive samples are beyond.
 
     Args:
         c: Record of CHECKS.
@@ -217,11 +219,11 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
 
 @njit(cache=True)
 def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
-    """Average fast changes of the voltage over fast changes of the current; their ratio is -R_s if the sign is right.
+    """Average fast changes of the voltage over fast changes of the current. Their ratio is -R_s if the sign is right.
 
     A ramp does not count as a change, because the voltage has ramps of its own at the ends of the OCV curve.
     """
-    if dt_s > FAST_S or c.slow_v == 0.0:  # too long a step for a fast change, or the first sample
+    if dt_s > FAST_S or c.slow_v == 0.0:  # the step is too long for a fast change, or this is the first sample
         c.slow_v = c.slower_v = voltage_v
         c.slow_a = c.slower_a = current_a
         return
@@ -251,7 +253,7 @@ def unusable_input_bits(c: Record, p: Record) -> int:
 
 @njit(cache=True)
 def sign_is_wrong(c: Record, p: Record) -> bool:
-    """Return True if the voltage rises with a reported discharge; a present fault ends only when the voltage falls."""
+    """Return True if the voltage rises with a reported discharge. A present fault ends only when the voltage falls."""
     steep = 0.25 * reference_series_resistance(p) * c.change_a2
     return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > MIN_EVIDENCE
 

@@ -34,20 +34,21 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 MIN_LOAD_C = 0.1
-"""Minimum load in the variance of the biases [C], because the model has errors in an idle cell, too."""
+"""Minimum load in the variance of the biases, as a C-rate. The model has errors in an idle cell, too."""
 INDEPENDENT_S = 30.0
 """Time after which the errors of successive windows count as independent [s]. R decreases with the window's duration up to
 this time."""
 UNSENSED_R_STD = 0.25
 """Std of ln of the resistances without a temperature sensor, as of a deviation of 10 K."""
 WARMED_R_STD = 0.015
-"""Increase of that std for each kelvin of modelled self-heating [1/K], as of an error of half of the heating."""
+"""Additional std of ln of the resistances for each kelvin of modelled self-heating [1/K], as of an error of half of the
+heating."""
 AGED_SOC = 400.0
 """Charge throughput over which aging changes the OCV curve of a cell [SOC]: 200 full cycles."""
 HYST_STEADY_STD = 0.17
 """Std of the hysteresis state h after a long charge or discharge."""
 EARLY_EMPTY_SOC = 0.5
-"""SOC below which the model includes that a cold cell is empty early."""
+"""SOC below which the model includes the early end of discharge of a cold cell."""
 KNEE_SLOPE_V = 1.0
 """Minimum slope of the OCV of one cell at its knee near empty [V]. On flatter parts ``curve_error_v`` covers the error of
 the curve."""
@@ -121,7 +122,7 @@ def bias_variance(s: Record, p: Record, q: int) -> float:
 
 @njit(cache=True)
 def total_resistance(s: Record, p: Record, soc: float) -> float:
-    """Return the sum of the resistances at ``soc`` [ohm], above ``max_known_temperature`` that at this temperature."""
+    """Return the sum of the resistances at ``soc`` [ohm]. The temperature is limited to ``max_known_temperature``."""
     weak, strong, limit_c = s.weak, s.strong, max_known_temperature(p)
     if s.temperature_c > limit_c:
         weak, strong = arrhenius(WEAK_J, limit_c), arrhenius(STRONG_J, limit_c)

@@ -27,15 +27,22 @@ from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANCES
 
 SOC, X = 0, 1
+"""Index of the SOC, and first index of the RC pairs' currents, in the state vector."""
 LN_R0, LN_R, B_SLOW, B_FAST, OFFSET, LN_Q, HYST, CURVE = range(X + BRANCHES, X + BRANCHES + 8)
 NODE, NODES = CURVE + 1, 21
+"""First index of the OCV nodes in the state vector, and number of these nodes."""
 STATES = NODE + NODES
+"""Number of states."""
 HYPOTHESES = 7
+"""Maximum number of hypotheses."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Uncertainties of one cell. 1 C is the current that empties the cell in an hour."""
+    """Uncertainties of one cell, the values of Q, R and P(0) of the filter.
+
+    A C-rate is the current relative to the current that empties the cell in an hour.
+    """
 
     model_v: float = 0.05
     """R: std of the ladder's error in the mean voltage of one second at 25 C [V]."""
@@ -44,7 +51,7 @@ class Noise:
     bias_relative: float = 0.03
     """Bias: std relative to the sum of the resistances times the RMS current of 10 min."""
     bias_grown: float = 0.11
-    """Bias: std relative to the growth of the resistances in the cold and near empty over those at 25 C and SOC 0.5."""
+    """Bias: std relative to the increase of the resistances over their values at 25 C and SOC 0.5, in the cold and near empty."""
     bias_soc: float = 0.035
     """Bias: shift of the resistances and of the OCV's knee near empty along SOC at 25 C; it grows with ``WEAK_J``."""
     slow_s: float = 3600.0
@@ -60,11 +67,11 @@ class Noise:
     unsensed_s: float = 3600.0
     """Q: time constant of the resistances' changes with an unmeasured temperature [s]."""
     offset_c: float = 0.007
-    """P(0): std of the current sensor's offset [C]."""
+    """P(0): std of the current sensor's offset, as a C-rate."""
     offset_s: float = 10.0 * 86400.0
     """Q: time in which the offset drifts by its initial std [s]."""
     zero_std_c: float = 0.001
-    """Std of the offset of a sensor that reports no current at rest [C]."""
+    """Std of the offset of a sensor that reports no current at rest, as a C-rate."""
     capacity_std: float = 0.08
     """P(0): relative std of the capacity."""
     aged_soc: float = 1000.0
@@ -75,11 +82,11 @@ class Noise:
     soc_std: float = 0.2
     """P(0): std of the SOC at switch-on."""
     load_c: float = 1.2
-    """P(0): std of the varying part of the unknown load before switch-on [C]."""
+    """P(0): std of the varying part of the unknown load before switch-on, as a C-rate."""
     load_mean_c: float = 0.3
-    """P(0): mean of the unknown load before switch-on [C]."""
+    """P(0): mean of the unknown load before switch-on, as a C-rate."""
     load_level_c: float = 0.35
-    """P(0): std of the part of the unknown load that is constant for hours [C]."""
+    """P(0): std of the part of the unknown load that is constant for hours, as a C-rate."""
     load_s: float = 20.0
     """P(0): correlation time of the varying part of the unknown load [s]."""
     half_likelihood_exponent: float = 0.17
@@ -109,7 +116,7 @@ EKF_SETTINGS = np.dtype(
         ("strong_ohm", "f8", (GRID, RESISTANCES)),  # resistances with activation energy STRONG_J, at 25 C [ohm]
         ("middle_ohm", "f8"),  # sum of all resistances at SOC 0.5 and 25 C [ohm]
         ("low_c", "f8"),  # temperature range of the resistances, lower end [C]
-        ("high_c", "f8"),  # upper end [C]
+        ("high_c", "f8"),  # temperature range of the resistances, upper end [C]
         ("sensor_v2", "f8"),  # variance of one voltage sample: noise and rounding [V^2]
         ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
         ("current_step_a", "f8"),  # resolution of the reported current [A]; 0: not rounded
@@ -118,6 +125,7 @@ EKF_SETTINGS = np.dtype(
     ],
     align=True,
 )
+"""Settings of the Kalman filter."""
 
 WINDOW = np.dtype(
     [
@@ -176,7 +184,7 @@ EKF_STATE = np.dtype(
         ("decay", "f8", BRANCHES),  # decay of the RC pairs over ``decay_s``
         ("decay_s", "f8"),
         ("mean_a", "f8"),  # mean current over 10 min [A]
-        ("rms_a2", "f8"),  # mean squared current over 10 min [A^2]
+        ("rms_a2", "f8"),  # mean square of the current over 10 min, not its root [A^2]
         ("usual_a", "f8"),  # mean current over hours [A]
         ("usual_a2", "f8"),  # mean squared current over hours [A^2]
         ("temperature_c", "f8"),  # temperature of the cell, measured or modelled [C]
@@ -196,3 +204,4 @@ EKF_STATE = np.dtype(
     ],
     align=True,
 )
+"""State of the Kalman filter."""

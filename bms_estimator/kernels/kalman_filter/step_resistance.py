@@ -19,7 +19,7 @@ from bms_estimator.numba_cache import njit
 UNHELD, HELD, STEPPED = range(3)
 """Phases of ``detect_current_step``: the current changes; is constant; has stepped after it was constant."""
 MIN_C = 0.2
-"""Minimum change of the current between two samples of a current step [C]."""
+"""Minimum change of the current between two samples of a current step, as a C-rate."""
 HELD_SHARE = 0.1
 """Maximum change of a constant current, as a fraction of the step."""
 STEP_STD = 0.05

@@ -1,5 +1,7 @@
 """Chen and Mora's cell model for the learning law: output, sensitivities, and constants of the cell file.
 
+Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
+
 theta is the logarithm of an element relative to the cell file's at the present SOC, so that the shape over SOC remains
 that of the file. ``x`` contains v_ts and v_tl of (2.2), (2.3) [V], and ``dx`` their derivatives by theta.
 """

@@ -1,5 +1,7 @@
 """Learning law: least squares with discounting over sensitivities, for any model of ``learning_model``.
 
+(3.13) is an equation of the thesis, and erratum 2 is described in docs/theory/thesis.md.
+
 ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS. ``m`` and ``q`` are their fields ``learning``, ``o`` is
 the field ``observer`` of ``s``.
 """
@@ -15,9 +17,9 @@ from bms_estimator.numba_cache import njit
 LEARN_EVERY_S = 0.999
 """Minimum interval between two steps of theta [s]. Samples between them only add information."""
 MAX_RATE_HZ = 0.1
-"""Maximum of gamma k [1/s], because k only grows and a theta faster than some 10 s follows noise."""
+"""Maximum of gamma k [1/s]. The state k never decreases, and a theta that is faster than some 10 s follows noise."""
 RESTING_C = 0.02
-"""Maximum current of a first sample of a cell at rest [C]."""
+"""Maximum current at which the first sample counts as one of a cell at rest, as a C-rate."""
 
 
 @njit(cache=True)

@@ -1,4 +1,7 @@
-"""Records of the learning law, fields of the estimator's records."""
+"""Records of the learning law, fields of the estimator's records.
+
+Erratum 14 is described in docs/theory/thesis.md.
+"""
 
 import numpy as np
 
@@ -22,12 +25,13 @@ LEARNING_SETTINGS = np.dtype(
         ("settle_s", "f8"),  # time after which effects of unknown initial states have decayed [s]
         ("rate", "f8"),  # gamma: rate at which theta follows the data, at k = 1 [1/s]
         ("cells", "f8"),  # cells in series: k is that of one cell
-        ("told_v", "f8"),  # a sensitivity of this size gives information on the parameters [V]
+        ("told_v", "f8"),  # size above which a sensitivity gives information on the parameters [V]
         ("reach", "f8"),  # trust region of theta: maximum step for which the sensitivities are valid
         ("soc_floor", "f8"),  # SOC below which learning is disabled (erratum 14)
     ],
     align=True,
 )
+"""Settings of the learning law."""
 
 LEARNING_STATE = np.dtype(
     [
@@ -48,3 +52,4 @@ LEARNING_STATE = np.dtype(
     ],
     align=True,
 )
+"""State of the learning law."""

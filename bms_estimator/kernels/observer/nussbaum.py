@@ -1,4 +1,4 @@
-"""Nussbaum gains N(k) of section 2.2.2 and (3.10)."""
+"""Nussbaum gains N(k) of section 2.2.2 and (3.10) of the thesis."""
 
 import math
 from enum import IntEnum

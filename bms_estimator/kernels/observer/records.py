@@ -1,6 +1,7 @@
 """Settings and state records of the observer.
 
 The state record contains all values that a step changes. A checkpoint stores it, and tests compare it bit by bit.
+Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
 """
 
 import numpy as np
@@ -16,22 +17,22 @@ OBSERVER_SETTINGS = np.dtype(
         ("a_initial", "f8", PARAMETERS),  # a_i(t0)
         ("target", "f8", PARAMETERS),  # (lx au + ly al) / (lx + ly), limit of Lemma 4.1.3
         ("rate", "f8", PARAMETERS),  # lx + ly of (3.18), lambda of (3.17) [1/s]
-        ("drive", "f8", PARAMETERS),  # 1 where e^2 drives the parameter, 0 where it is held
-        ("output_r_s", "f8"),  # 1: output (3.14) with u R_s; 0: output (4.1)
+        ("drive", "f8", PARAMETERS),  # 1: e^2 drives the parameter; 0: the parameter is constant
+        ("output_r_s", "f8"),  # not a resistance: 1 selects the output (3.14) with u R_s, 0 the output (4.1)
         ("nussbaum", "i8"),  # kernels.observer.nussbaum.Nussbaum
         ("alpha", "f8"),  # a of (3.10), in (2, 3]
         ("gain_scale", "f8"),  # lambda^(1/a) of (3.10) [1/(V^2 s)]
-        ("ml_series", "f8", SERIES_TERMS),  # kernels.observer.mittag_leffler tables
+        ("ml_series", "f8", SERIES_TERMS),  # coefficients and tables of kernels.observer.mittag_leffler
         ("ml_decay", "f8", TABLE_POINTS),
         ("ml_decay_slope", "f8", TABLE_POINTS),
         ("k0", "f8"),  # k(t0) [V^2 s]
         ("gain_limit", "f8"),  # clamp of |N|
-        ("rearm_gain", "f8"),  # below this N, in lock, k starts again from k0; -inf, or above N(k0): never
+        ("rearm_gain", "f8"),  # while in lock, a gain N below this value resets k to k0; -inf, or above N(k0): no reset
         ("dead_zone_v", "f8"),  # e_dead of erratum 2 [V]; 0 gives the printed (3.13)
         ("epsilon_v", "f8"),  # eps2 of Algorithm 1 [V]
         ("lock_error_v", "f8"),  # |e| beyond which the observer does not track [V]
         ("lock_time_s", "f8"),  # time with |e| beyond or within lock_error_v until the lock is lost or regained [s]
-        ("margin_guard", "f8"),  # adaptation stops this far above max(delta1, delta2)
+        ("margin_guard", "f8"),  # SOC distance above max(delta1, delta2) at which adaptation stops
         ("soc_initial", "f8"),  # 0..1; NaN: from the first sample's voltage through the OCV
         ("voltage_min_v", "f8"),  # minimum voltage of an accepted sample [V]
         ("voltage_max_v", "f8"),  # maximum voltage of an accepted sample [V]
@@ -59,13 +60,13 @@ OBSERVER_STATE = np.dtype(
         ("settle", "f8", PARAMETERS),  # (1 - decay) / rate for ``decay_dt_s`` [s]
         ("decay_dt_s", "f8"),
         ("innovation_v", "f8"),  # e = y - y^ before the sample corrected the states (3.15)
-        ("voltage_estimate_v", "f8"),  # y^ after it (4.1)
+        ("voltage_estimate_v", "f8"),  # y^ after the sample corrected the states (4.1)
         ("delta_1", "f8"),  # (2.11)
         ("delta_2", "f8"),  # (2.12)
         ("unlocked_s", "f8"),  # time with |e| beyond (in lock) or within (out of lock) lock_error_v [s]
         ("started", "i8"),  # 1: initialized by a first sample
         ("lock", "i8"),  # 1 while the observer tracks
-        ("adapting", "i8"),  # 0 below the margins
+        ("adapting", "i8"),  # 1 while the parameters adapt; 0 at an SOC below the stability floor
         ("samples", "i8"),  # number of accepted samples
         ("dropped_not_finite", "i8"),
         ("dropped_range", "i8"),
@@ -73,8 +74,9 @@ OBSERVER_STATE = np.dtype(
         ("dropped_saturated", "i8"),  # voltage or current at the end of the converter's range
         ("time_steps_back", "i8"),  # times that the clock was set back; the sample is accepted, but not the step to it
         ("gaps", "i8"),  # number of gaps (``kernels.step.is_gap``)
-        ("lock_losses", "i8"),
-        ("gain_rearms", "i8"),
+        ("lock_losses", "i8"),  # number of times that the lock was lost
+        ("gain_rearms", "i8"),  # number of resets of k before the gain changed its sign
     ],
     align=True,
 )
+"""State of the observer."""

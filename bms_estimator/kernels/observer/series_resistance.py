@@ -1,4 +1,4 @@
-"""Step 3 of the thesis, sample by sample: R_s by (4.2), least squares in each bin of 1 % SOC.
+"""Step 3 of the thesis, sample by sample: R_s by (4.2) of the thesis, least squares in each bin of 1 % SOC.
 
 x2 and x3 of (4.2) are those of the model with the present a1..a12 under the measured current. The observer's own x2 and x3
 absorb every error of the voltage, including i R_s.
@@ -31,6 +31,7 @@ SERIES_RESISTANCE = np.dtype(
     ],
     align=True,
 )
+"""Sums of the least squares for R_s."""
 
 
 @njit(cache=True)
