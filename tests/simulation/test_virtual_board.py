@@ -176,7 +176,7 @@ async def test_commands_are_obeyed_and_answered() -> None:
                     with contextlib.suppress(BlockingIOError):
                         chunk = os.read(host, 1 << 16)
                         decoder.feed(0.0, chunk)
-                    if acks := decoder.take_acks():
+                    if acks := decoder.pop_acks():
                         return acks[0].result, acks[0].value
                     await asyncio.sleep(0.005)
 
@@ -272,7 +272,7 @@ async def test_the_relay_goes_where_it_was_told_to_once_the_host_is_silent_and_l
     acks = FrameDecoder()
     acks.feed(0.0, b"\0" + await received(one, 400, plan))
     assert seen == {20: True, 200: True, 240: False, 300: False, 360: True, 380: False}
-    assert [ack.result for ack in acks.take_acks()] == [AckResult.OK] * 3
+    assert [ack.result for ack in acks.pop_acks()] == [AckResult.OK] * 3
 
 
 async def test_a_relay_command_that_is_none_changes_nothing() -> None:
@@ -280,5 +280,5 @@ async def test_a_relay_command_that_is_none_changes_nothing() -> None:
     one = board()
     acks = FrameDecoder()
     acks.feed(0.0, b"\0" + await received(one, 20, {10: lambda b: b._handle_command(unseal(bad))}))
-    assert [(ack.result, ack.value) for ack in acks.take_acks()] == [(AckResult.BAD_VALUE, 0)]
+    assert [(ack.result, ack.value) for ack in acks.pop_acks()] == [(AckResult.BAD_VALUE, 0)]
     assert not one.relay_high

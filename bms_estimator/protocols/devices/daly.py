@@ -27,7 +27,10 @@ PACKS = range(0x01, 0x40)
 ZERO_CURRENT = 30000
 ZERO_C = 40
 """Value at 0 degC; the value 0 is an absent probe."""
-CELLS_A_FRAME, PROBES_A_FRAME, MAX_FRAMES = 3, 7, 16
+CELLS_A_FRAME, PROBES_A_FRAME = 3, 7
+"""Number of values in a frame of cells, and in a frame of probes."""
+MAX_FRAMES = 16
+"""Maximum number of frames of cells or probes."""
 
 
 def with_checksum(frame: bytes) -> bytes:
@@ -52,9 +55,9 @@ class DalyProtocol(PolledProtocol):
         super().__init__("Daly BMS", re.compile(b"\xa5"), current_sign, address)
         self._cells: int | None = None
         self._probes: int | None = None
-        self._has_sample = self._known = False  # sample received; number of cells received since the port was opened
+        self._has_sample = self._known = False  # a sample was received; a status was received since the port was opened
         self._first = 1  # number of the frame with cell 1
-        self._cells_v: dict[int, Sequence[float]] = {}  # by the frame's number
+        self._cells_v: dict[int, Sequence[float]] = {}  # voltages by frame number [V]
         self._probes_c: dict[int, Sequence[float]] = {}
         self._cells_s = self._probes_s = -math.inf
 
@@ -105,8 +108,8 @@ class DalyProtocol(PolledProtocol):
     def _pack(self, arrival_s: float, data: bytes) -> Reading:
         decivolts, _, deciamperes, _ = struct.unpack(">4H", data)
         cells_v = self._joined(self._cells_v, CELLS_A_FRAME, self._cells) if arrival_s - self._cells_s < FRESH_S else []
-        fresh = arrival_s - self._probes_s < FRESH_S
-        probes_c = self._joined(self._probes_c, PROBES_A_FRAME, self._probes) if fresh else []
+        has_recent_probes = arrival_s - self._probes_s < FRESH_S
+        probes_c = self._joined(self._probes_c, PROBES_A_FRAME, self._probes) if has_recent_probes else []
         self._cells_v, self._has_sample = {}, True
         present_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
         return Reading(decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, self._mean_c(present_c), tuple(cells_v))

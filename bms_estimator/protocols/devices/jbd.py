@@ -21,8 +21,10 @@ REFUSED = 0x80
 """Status of a response that rejects the request; 0 is success."""
 HEAD, TAIL = 4, 3
 """Bytes of a frame before and after its data."""
-MIN_BASIC, MAX_DATA = 23, 128
-"""Minimum length of basic information, without a probe, and maximum length of any data, more than 32 cells [bytes]."""
+MIN_BASIC = 23
+"""Minimum length of the basic information, without a probe [bytes]."""
+MAX_DATA = 128
+"""Maximum length of the data of a frame [bytes]. 32 cells need 64 bytes."""
 ZERO_C = 2731
 """Value at 0 degC [0.1 K]."""
 

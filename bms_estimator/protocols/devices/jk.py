@@ -21,8 +21,10 @@ from bms_estimator.protocols.base.polled_protocol import ParseResult, PolledProt
 from bms_estimator.protocols.base.reading import Reading
 
 OLD_START, START = b"\x4e\x57", b"\x55\xaa\xeb\x90"
-OLD_HEAD, OLD_TAIL, OLD_MAX_BYTES = 11, 9, 512
-"""Bytes of an older frame before its registers, after them, and in total at most."""
+OLD_HEAD, OLD_TAIL = 11, 9
+"""Number of bytes of an older frame before its registers, and after them."""
+OLD_MAX_BYTES = 512
+"""Maximum length of an older frame [bytes]."""
 READ_ALL, FROM_BMS, ANSWER, OLD_END = 0x06, 0x00, 0x01, 0x68
 REGISTER_BYTES: Mapping[int, int] = {
     **dict.fromkeys(range(0x80, 0xC1), 2),
@@ -38,11 +40,14 @@ CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOFTWARE, VERSION = 0x79, 0x81, 0x82,
 ABSENT_C = 140
 """Value of an absent probe in an older frame: the lower end of the scale, -40 degC."""
 CHARGING = 0x8000
+"""Bit of the current in an older frame of protocol version 1 that is set on charge."""
 
 FRAME_BYTES, RECORD_BYTES = 300, 8
+"""Length of a newer frame, and of the Modbus record after it [bytes]."""
 REALTIME, KINDS = 0x02, (0x01, 0x02, 0x03)
 MODBUS_WRITE, REALTIME_REGISTER = 0x10, 0x1620
 ABSENT_DECI_C = -2000
+"""Value of an absent probe in a newer frame [0.1 degC]."""
 LISTEN_S = 10.0
 """Time without queries after unsolicited frames [s]. Another master polls every 6 s."""
 

@@ -37,7 +37,7 @@ class VeDirectProtocol(ReadingProtocol):
 
     @property
     def description(self) -> str | None:
-        """Product and the last values."""
+        """Product and last values; None before the first reading."""
         if self._last_reading is None:
             return None
         return f"VE.Direct battery monitor {self._product}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"

@@ -208,5 +208,5 @@ def _client(settings: ModbusSource) -> Client:
 
 def producer(settings: Settings) -> ModbusProducer:
     """Make the line producer of ``[source]``."""
-    assert isinstance(settings.source, ModbusSource)  # noqa: S101 - as KINDS has it
+    assert isinstance(settings.source, ModbusSource)  # noqa: S101 - KINDS: kind = "modbus" is a ModbusSource
     return ModbusProducer(settings.source)

@@ -94,6 +94,6 @@ def test_the_decoder_takes_every_message(vector: Vector) -> None:
     if vector["message"] == "hello":
         assert decoder.hello == message(vector)
     if vector["message"] == "ack":
-        assert decoder.take_acks() == [message(vector)]
+        assert decoder.pop_acks() == [message(vector)]
     counters = decoder.counters
     assert counters.crc_errors + counters.cobs_errors + counters.length_errors + counters.type_errors == 0
