@@ -54,13 +54,14 @@ async def serve_edge(
             notifier.ready(name)
             try:
                 await until_first_ends(
-                    _take(source, edge), _keep_alive(source, edge, notifier, name), _report(edge), stop.wait()
+                    _send_samples(source, edge), _keep_alive(source, edge, notifier, name), _report(edge), stop.wait()
                 )
             finally:
                 notifier.stopping(name)
 
 
-async def _take(source: Source, edge: BlockSender) -> None:
+async def _send_samples(source: Source, edge: BlockSender) -> None:
+    """Pass all samples of the source to the block sender."""
     async for samples in source:
         edge.take(samples)
         await asyncio.sleep(0)  # a source that always has samples must not starve the sender

@@ -136,7 +136,14 @@ class DalyProtocol(PolledProtocol):
 DEVICE = Device(
     "daly",
     lambda sign, address: DalyProtocol(current_sign=sign, address=address),
-    Resolution(9600, None, 1.0, 0.1, 0.1, 2.5),
+    Resolution(
+        baud=9600,
+        current_sign=None,
+        period_s=1.0,
+        voltage_resolution_v=0.1,
+        current_resolution_a=0.1,
+        current_dead_band_a=2.5,
+    ),
     has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 0.1 V and 0.1 A. Users found its parameter DfilterCur at 2 A and at 2.5 A

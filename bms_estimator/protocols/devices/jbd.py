@@ -105,7 +105,14 @@ class JbdProtocol(PolledProtocol):
 DEVICE = Device(
     "jbd",
     lambda sign, _: JbdProtocol(current_sign=sign),
-    Resolution(9600, "charge_positive", 1.0, 0.01, 0.01, 0.5),
+    Resolution(
+        baud=9600,
+        current_sign="charge_positive",
+        period_s=1.0,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+        current_dead_band_a=0.5,
+    ),
     has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. Users saw nothing below 0.2 A, and nothing below 0.5 A on one of

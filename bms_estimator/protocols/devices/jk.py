@@ -207,7 +207,14 @@ def _number(content: bytes) -> int:
 DEVICE = Device(
     "jk",
     lambda sign, address: JkProtocol(current_sign=sign, address=address),
-    Resolution(115_200, "charge_positive", 1.0, 0.01, 0.01, 0.7),
+    Resolution(
+        baud=115_200,
+        current_sign="charge_positive",
+        period_s=1.0,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+        current_dead_band_a=0.7,
+    ),
     has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. One board showed nothing below 0.7 A

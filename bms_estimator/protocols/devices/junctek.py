@@ -117,6 +117,12 @@ class JunctekProtocol(ReadingProtocol):
 DEVICE = Device(
     "junctek",
     lambda sign, _: JunctekProtocol(current_sign=sign),
-    Resolution(115_200, "charge_positive", 1.0, 0.01, 0.1),
+    Resolution(
+        baud=115_200,
+        current_sign="charge_positive",
+        period_s=1.0,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.1,
+    ),
 )
 """The protocol has steps of 10 mV and 10 mA; the makers specify 0.1 A."""

@@ -175,6 +175,13 @@ def _mean(values: Sequence[float]) -> float:
 DEVICE = Device(
     "pylontech",
     lambda sign, _: PylontechProtocol(current_sign=sign),
-    Resolution(115_200, "charge_positive", 2.0, 0.001, 0.01, 0.1),
+    Resolution(
+        baud=115_200,
+        current_sign="charge_positive",
+        period_s=2.0,
+        voltage_resolution_v=0.001,
+        current_resolution_a=0.01,
+        current_dead_band_a=0.1,
+    ),
 )
 """The table has steps of 1 mV and 1 mA. In public captures the smallest nonzero current is 149 mA, next to many zeros."""

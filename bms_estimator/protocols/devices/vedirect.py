@@ -95,6 +95,12 @@ class VeDirectProtocol(ReadingProtocol):
 DEVICE = Device(
     "vedirect",
     lambda sign, _: VeDirectProtocol(current_sign=sign),
-    Resolution(19_200, "charge_positive", 1.0, 0.01, 0.01),
+    Resolution(
+        baud=19_200,
+        current_sign="charge_positive",
+        period_s=1.0,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+    ),
 )
 """The text has steps of 1 mV and 1 mA; the data sheets of BMV and SmartShunt specify 10 mV and 10 mA."""
