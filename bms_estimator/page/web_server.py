@@ -58,7 +58,7 @@ class _Stream(NamedTuple):
 
 
 class WebServer:
-    """HTTP server while the context lasts.
+    """HTTP server of a page; a context manager.
 
     Args:
         settings: Address and access of the page.
@@ -152,7 +152,7 @@ class WebServer:
             await asyncio.sleep(RETRY_S)
             try:
                 return await self._listen(runner)
-            except OSError:  # already reported
+            except OSError:  # the first failure was logged
                 continue
 
     @web.middleware

@@ -55,7 +55,9 @@ Signal = Callable[[float], Reading] | Iterable[Reading]
 """Readings as a function of time [s], or one reading for each sample. The board stops after the last one."""
 
 FIRMWARE = (0, 2, 0)
+"""Simulated version of the firmware."""
 RATE_HZ_AT_RESET = 100
+"""Sample rate after a reset [Hz]."""
 _MAX_UNSENT_BYTES = 2048
 """Maximum number of unsent bytes. Further samples are dropped, as on a board whose host does not read."""
 _MIN_SLEEP_S = 0.002

@@ -19,14 +19,21 @@ from bms_estimator.protocols.base.polled_protocol import FRESH_S, ParseResult, P
 from bms_estimator.protocols.base.reading import Reading
 
 PACK, STATUS, CELLS, PROBES = 0x90, 0x94, 0x95, 0x96
+"""Commands for voltage and current of the pack, numbers of cells and probes, cell voltages, and temperatures."""
 COMMANDS = range(0x90, 0x99)
-START, DATA_BYTES, FRAME_BYTES = 0xA5, 8, 13
+"""Valid commands of responses."""
+START = 0xA5
+"""First byte of a frame."""
+DATA_BYTES, FRAME_BYTES = 8, 13
+"""Number of data bytes of a frame, and of all its bytes."""
 HOSTS = (0x40, 0x80)
+"""Addresses of the host on RS485 or USB, and on UART."""
 PACKS = range(0x01, 0x40)
 """Addresses of responses."""
 ZERO_CURRENT = 30000
+"""Value at 0 A [0.1 A]."""
 ZERO_C = 40
-"""Value at 0 degC; the value 0 is an absent probe."""
+"""Value at 0 degC [degC]. The value 0 means an absent probe."""
 CELLS_A_FRAME, PROBES_A_FRAME = 3, 7
 """Number of values in a frame of cells, and in a frame of probes."""
 MAX_FRAMES = 16

@@ -16,11 +16,15 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import RecentCellVoltages
 
 BASIC, CELLS, NAME = 0x03, 0x04, 0x05
-START, END, READ = 0xDD, 0x77, 0xA5
+"""Registers of basic information, cell voltages and device name."""
+START, END = 0xDD, 0x77
+"""First and last byte of a frame."""
+READ = 0xA5
+"""Second byte of a request that reads a register."""
 REFUSED = 0x80
 """Status of a response that rejects the request; 0 is success."""
 HEAD, TAIL = 4, 3
-"""Bytes of a frame before and after its data."""
+"""Number of bytes of a frame before its data, and after them."""
 MIN_BASIC = 23
 """Minimum length of the basic information, without a probe [bytes]."""
 MAX_DATA = 128

@@ -21,9 +21,11 @@ QUERY = b":R50=%d,2,1,\r\n" % ADDRESS
 POLL_INTERVAL_S = 1.0
 """Poll interval [s]."""
 MAX_LINE_BYTES = 256
+"""Maximum length of a line [bytes]."""
 VOLTAGE, CURRENT, TEMPERATURE, DIRECTION = 0, 1, 6, 9
 """Indices of the values in a response."""
 ZERO_C = 100
+"""Value at 0 degC [degC]."""
 MAX_VALUE_DIGITS = 12
 """Maximum number of digits of a value."""
 TOO_LONG = "bytes arrive that are no lines of a Junctek monitor: its baud rate is 115200"

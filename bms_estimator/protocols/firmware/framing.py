@@ -30,11 +30,15 @@ MESSAGE_SAMPLE = int(MessageType.SAMPLE)
 MESSAGE_HELLO = int(MessageType.HELLO)
 MESSAGE_ACK = int(MessageType.ACK)
 SAMPLE_BYTES = 24
+"""Length of a sample packet with its CRC [bytes]."""
 HELLO_BYTES = 62
+"""Length of a hello packet with its CRC [bytes]."""
 ACK_BYTES = 10
+"""Length of an acknowledgment packet with its CRC [bytes]."""
 PACKET_BYTES = 64
 """Maximum length of a packet [bytes]."""
 SAMPLE_FRAME_BYTES = SAMPLE_BYTES + 2
+"""Length of a sample frame: the packet, one byte of COBS and the delimiter [bytes]."""
 
 DECODER = np.dtype(
     [
