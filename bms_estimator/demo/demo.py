@@ -121,11 +121,11 @@ class DemoResult:
         self._started_s = time.monotonic()
 
     async def __aenter__(self) -> Self:
-        """Nothing to open."""
+        """Return the sink."""
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Nothing to close."""
+        """Do nothing, because the sink holds no resources."""
 
     def publish(self, snapshot: Snapshot) -> None:
         """Store the estimate of a snapshot."""

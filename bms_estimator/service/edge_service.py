@@ -37,7 +37,7 @@ async def serve_edge(
     Args:
         settings: The pack's settings, with ``[edge]``.
         folder: Folder of the blocks.
-        stop: Set by the caller to end, as a signal does.
+        stop: Event that ends the service; signals set it, too.
         notifier: Is notified that the loop is ready and alive.
 
     Raises:

@@ -44,7 +44,7 @@ class Request(NamedTuple):
 
     @property
     def described(self) -> str:
-        """Describe the request: ``source.voltage, source.current (holding registers 259 to 261)``."""
+        """Description as text, e.g. ``source.voltage, source.current (holding registers 259 to 261)``."""
         quantities = ", ".join(dict.fromkeys(f"source.{value.quantity}" for value in self.values))
         last = f" to {self.address + self.words - 1}" if self.words > 1 else ""
         return f"{quantities} ({self.table} register{'s' if last else ''} {self.address}{last})"
