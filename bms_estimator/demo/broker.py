@@ -1,4 +1,4 @@
-"""MQTT broker of the demo: a nats-server on loopback, without passwords, that forgets everything at its end."""
+"""MQTT broker of the demo: a nats-server on loopback without passwords, whose data are deleted at its end."""
 
 import asyncio
 import contextlib
@@ -23,10 +23,10 @@ START_S = 60.0
 
 
 class DemoBroker:
-    """A broker on loopback while the context lasts.
+    """Broker on loopback; a context manager.
 
     Args:
-        port: TCP port; None: 1883 when it is free, else any that is.
+        port: TCP port; None: 1883 if it is free, otherwise any free port.
 
     Raises:
         UserError: The requested port is in use, or nats-server is missing.
@@ -52,7 +52,7 @@ class DemoBroker:
         """Start the server.
 
         Raises:
-            UserError: It does not start.
+            UserError: The server does not start.
         """
         async with contextlib.AsyncExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bms-estimator-demo-")))
@@ -61,7 +61,7 @@ class DemoBroker:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """End the server, which first sends its clients what it has for them."""
+        """End the server, which first sends pending messages to its clients."""
         await self._stack.aclose()
 
     async def _start(self, folder: Path, stack: contextlib.AsyncExitStack) -> None:
@@ -75,7 +75,7 @@ class DemoBroker:
         stack.push_async_callback(_end, process)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(START_S):
-                while not _listens(folder) and process.returncode is None:  # noqa: ASYNC110 - a file is the only sign
+                while not _listens(folder) and process.returncode is None:  # noqa: ASYNC110 - the server reports its start only by a file
                     await asyncio.sleep(POLL_S)
         if not _listens(folder):
             reason = log.read_text(errors="replace").strip() if log.exists() else ""
@@ -83,7 +83,7 @@ class DemoBroker:
 
 
 def _listens(folder: Path) -> bool:
-    """Return True once the server has written the file with its ports, on all of which it then listens."""
+    """Return True once the server has written its ports file, which it does when it listens on all ports."""
     return any(folder.glob("*.ports"))
 
 
@@ -94,7 +94,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 
 
 def _configuration(folder: Path, mqtt_port: int) -> str:
-    """Return the server's settings. Its port for NATS clients is unused, so any free port will do (-1)."""
+    """Return the server's settings. Its port for NATS clients is unused. The port number -1 selects any free port."""
     return f"""
 server_name: demo
 listen: "{LOOPBACK}:-1"
@@ -104,7 +104,7 @@ mqtt {{ listen: "{LOOPBACK}:{mqtt_port}" }}
 
 
 def choose_port(port: int | None, usual: int) -> int:
-    """Return the port to listen on: the requested one, otherwise the usual one, otherwise a free one.
+    """Return the port to listen on: the requested port, otherwise the usual port, otherwise any free port.
 
     Raises:
         UserError: The requested port is in use.

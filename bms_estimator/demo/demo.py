@@ -25,15 +25,19 @@ from bms_estimator.sinks.terminal.sink import TerminalSink
 from bms_estimator.sinks.terminal.view_state import BAND_STDS
 
 CELL = "chen_mora"
+"""Cell file of the simulated pack and of the estimator."""
 LOAD_A = 0.5
 """Mean of the random load [A]. Its steps reach 2 C, so that the SOC falls by more than a percent in a minute."""
-TRUE_SOC, INITIAL_SOC = 0.9, 0.7
-"""True SOC at the start, and the wrong initial SOC of the estimator, which assumes a std of 0.2."""
+TRUE_SOC = 0.9
+"""True SOC at the start."""
+INITIAL_SOC = 0.7
+"""Wrong initial SOC of the estimator, which assumes a std of 0.2."""
 RESOLUTION_V = 5e-3
 """Resolution of the board's voltage [V]. It is a fifth of the converter's step, because the board averages noisy conversions."""
 PUBLISH_RATE_HZ = 4.0
+"""Publish rate [Hz]."""
 LAMBDA = 1e4
-"""Lambda of the gain (3.10). With the default of 1 the growth of k would become visible only after hours."""
+"""Lambda of the gain, (3.10) of the thesis. With the default of 1 the growth of k becomes visible only after hours."""
 
 
 async def run_demo(
@@ -74,7 +78,7 @@ async def run_demo(
         settings = _settings(board, broker.url, page, rate_hz)
         view = TerminalSink(log=log, hint=hint, true_soc=truth.soc)
         pages = Pages(opened)
-        # no state folder: start from the beginning each time
+        # without a state folder each run starts with the initial state
         await run_pack_service(settings, cell, sinks=[view, result], tap=truth, stop=stop, pages=pages)
     return result.summary()
 
@@ -117,11 +121,11 @@ class DemoResult:
         self._started_s = time.monotonic()
 
     async def __aenter__(self) -> Self:
-        """Nothing to open."""
+        """Return the sink."""
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Nothing to close."""
+        """Do nothing, because the sink holds no resources."""
 
     def publish(self, snapshot: Snapshot) -> None:
         """Store the estimate of a snapshot."""

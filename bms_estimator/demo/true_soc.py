@@ -21,7 +21,7 @@ class TrueSoc:
     """Signal of a simulated pack for a board, and a tap on the board's line that reads the board's clock in each frame.
 
     Args:
-        pack: Simulated pack. The board may read it ahead of time, so past SOCs are stored until their sample arrives.
+        pack: Simulated pack. The board may read the pack before its samples arrive. Therefore past SOCs are stored.
     """
 
     missed_reads = 0
@@ -40,7 +40,7 @@ class TrueSoc:
         return reading
 
     def write(self, _arrival_s: float, data: bytes) -> None:
-        """Take bytes of the board's line."""
+        """Store the last bytes of the board's line."""
         self._tail = (self._tail + data)[-TAIL_BYTES:]
 
     def soc(self) -> float:

@@ -44,11 +44,11 @@ class AccessControl:
 
     @property
     def cookie(self) -> str:
-        """Return the cookie that replaces the token in a browser."""
+        """Cookie that replaces the token in a browser."""
         return hashlib.sha256(b"bms-estimator page " + (self._token or b"")).hexdigest()
 
     def is_own_host(self, header: str) -> bool:
-        """Return True if a ``Host`` header names this server; an address always does, because DNS cannot redirect it."""
+        """Return True if a ``Host`` header names this server. Addresses are accepted, because DNS cannot redirect them."""
         try:
             host = urlsplit(f"//{header}").hostname or ""
         except ValueError:
@@ -81,7 +81,7 @@ def _token(settings: PageSettings) -> str | None:
         token = credential(name).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise UserError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:  # its text would show the bytes
+    except UnicodeDecodeError:  # the text of the error would show bytes of the token
         raise UserError(f"page.token_file = {name}: cannot be read: not UTF-8 text") from None
     if len(token) < MIN_TOKEN_CHARACTERS:
         raise UserError(

@@ -26,7 +26,7 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
         The page's address.
 
     Raises:
-        UserError: A setting cannot be used, or the address is taken.
+        UserError: A setting cannot be used, or the address is in use.
     """
     hub, history = PackTopics(), HistoryQuery()
     hub.set_link_state(f"{', '.join(broker.urls)}: not reached yet")
@@ -37,7 +37,7 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
         hub.put(*message)
         hub.hide(subscriber.hidden)
 
-    def left_out(device: str) -> None:
+    def on_hidden(device: str) -> None:
         hub.drop(device)
         history.drop(device)
         hub.hide(subscriber.hidden)
@@ -47,6 +47,6 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
         hub.set_link_state(subscriber.trouble or "the broker is lost" if lost else None)
 
     async with PageServer(settings, hub, history, patient=False) as server:
-        subscriber = Subscriber(broker, on_message, on_link_change, left_out=left_out)
+        subscriber = Subscriber(broker, on_message, on_link_change, left_out=on_hidden)
         async with subscriber:
             yield server.url

@@ -12,6 +12,7 @@ from bms_estimator.store.history_reader import HistoryFile
 from bms_estimator.store.minute import MINUTE_S
 
 MAX_EVENTS = 50
+"""Maximum number of events in a response; the latest are sent."""
 FIELDS = (
     "time_s",
     "voltage_v",
@@ -40,10 +41,10 @@ SPANS = {"hour": Span(3600, MINUTE_S), "day": Span(86_400, 5 * MINUTE_S), "month
 
 
 class HistoryQuery:
-    """Reader of histories, with a cache: a span is read at most every half minute.
+    """Reader of histories with a cache. Each span is read at most every half minute.
 
     Args:
-        clock: Seconds since 1970.
+        clock: Wall clock [s since 1970].
     """
 
     def __init__(self, clock: Callable[[], float] = time.time) -> None:

@@ -14,16 +14,18 @@ PACKS = "packs"
 """Key of the names of all packs and of the number of packs that are not shown."""
 STATE, PARAMETERS, RECENT, ELEMENTS = "state", "parameters", "recent", "elements"
 """Topics of state and parameters, and two keys that exist only here: recent states, and elements over SOC."""
-SHOWN = frozenset({STATE, PARAMETERS, "health", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY})
+SHOWN_TOPICS = frozenset({STATE, PARAMETERS, "health", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY})
 ALARM = "alarm/"
+"""Prefix of the topics of alarms."""
 ELEMENTS_OVER_SOC = frozenset({"r_s_ohm", "r_ts_ohm", "c_ts_farad", "r_tl_ohm", "c_tl_farad"})
 RECENT_STATES = 600
+"""Maximum number of stored states of a pack."""
 RECENT_STEP_S = 1.0
 """Minimum interval of the states that are stored for the curves of a new reader [s]."""
 MAX_AHEAD_S = 86_400.0
 """Maximum lead of a state's time over the wall clock [s]. A state with a larger lead is ignored."""
 SET_BACK_S = 60.0
-"""Lead over the wall clock and over the next state beyond which a stored state is removed [s]: its clock was wrong."""
+"""Maximum lead of a stored state over the wall clock and the next state [s]. With a larger lead its clock was wrong."""
 RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
 
 _Row = tuple[float, tuple[float | None, ...]]
@@ -57,7 +59,7 @@ class PackTopics(LatestValues):
             topic: Topic relative to that of the pack.
             value: Parsed JSON payload, or text; None: the topic was cleared.
         """
-        if topic not in SHOWN and not topic.startswith(ALARM):
+        if topic not in SHOWN_TOPICS and not topic.startswith(ALARM):
             return
         try:
             text = _json(value)

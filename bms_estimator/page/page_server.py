@@ -13,7 +13,9 @@ from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.settings.page import PageSettings
 
 HISTORY_TIMEOUT_S = 10.0
-"""Timeout of a history query [s]; after it the disk counts as hung."""
+"""Timeout of a history query [s]. A disk that needs longer counts as hung."""
+MAX_HISTORY_QUERIES = 4
+"""Maximum number of history queries that wait for the disk; further ones wait for these."""
 
 STATIC = Path(__file__).with_name("static")
 FILES = {
@@ -30,7 +32,7 @@ FILES = {
 
 
 class PageServer(WebServer):
-    """Server of a hub while the context lasts.
+    """Server of the live page of packs; a context manager.
 
     Args:
         settings: Address and access of the page.
@@ -54,7 +56,7 @@ class PageServer(WebServer):
     ) -> None:
         super().__init__(settings, FILES, hub, {"/history": self._history}, opened=opened, patient=patient)
         self._past = past
-        self._histories = asyncio.Semaphore(4)
+        self._histories = asyncio.Semaphore(MAX_HISTORY_QUERIES)
 
     async def _history(self, request: web.Request) -> web.StreamResponse:
         pack, span = request.query.get("pack", ""), request.query.get("span", "")

@@ -28,7 +28,7 @@ RETRY_S = 10.0
 SHUTDOWN_TIMEOUT_S = 1.0
 """Timeout of open connections at shutdown [s]."""
 
-ASK = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>bms_estimator</title><form action="/" method="get">
 <p><label>Token <input name="token" type="password" autofocus autocomplete="off"></label> <button>Open</button></p>
 <p>It is in the file token_file of the page's settings.</p></form></html>"""
@@ -58,7 +58,7 @@ class _Stream(NamedTuple):
 
 
 class WebServer:
-    """HTTP server while the context lasts.
+    """HTTP server of a page; a context manager.
 
     Args:
         settings: Address and access of the page.
@@ -100,7 +100,7 @@ class WebServer:
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
     async def __aenter__(self) -> Self:
-        """Listen.
+        """Start to listen on the address.
 
         Raises:
             UserError: The address cannot be listened on, and ``patient`` is False.
@@ -152,7 +152,7 @@ class WebServer:
             await asyncio.sleep(RETRY_S)
             try:
                 return await self._listen(runner)
-            except OSError:  # already reported
+            except OSError:  # the first failure was logged
                 continue
 
     @web.middleware
@@ -173,7 +173,7 @@ class WebServer:
             return await handler(request)
         if authorization.startswith("Bearer ") and self._access.is_valid_token(authorization.removeprefix("Bearer ")):
             return await handler(request)
-        raise web.HTTPUnauthorized(text=ASK, content_type="text/html", headers={"WWW-Authenticate": "Bearer"})
+        raise web.HTTPUnauthorized(text=LOGIN_PAGE, content_type="text/html", headers={"WWW-Authenticate": "Bearer"})
 
     @property
     def _cookie(self) -> str:

@@ -14,9 +14,12 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 
-ROOT = 0
-ATTEMPTS, PAUSE_S = 20, 0.01
-"""Number of attempts to bind a name whose holder does not listen, and the delay between them [s]."""
+ROOT_USER = 0
+"""User id of root."""
+ATTEMPTS = 20
+"""Number of attempts to bind a name whose holder does not listen."""
+ATTEMPT_DELAY_S = 0.01
+"""Delay between two attempts to bind a name [s]."""
 _CREDENTIALS = struct.Struct("3i")
 """Layout of ``struct ucred``: process, user, group."""
 
@@ -65,13 +68,13 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
         else:
             return
         try:
-            process, user = _holder(name)
+            process, user = _find_holder(name)
         except ConnectionRefusedError:  # the holder does not listen yet, or has just ended
-            time.sleep(PAUSE_S)
+            time.sleep(ATTEMPT_DELAY_S)
             continue
         except BlockingIOError:
             break
-        if user not in _writers(folder):
+        if user not in _find_writers(folder):
             log.warning("another user holds this pack's lock: cannot ensure that only one process serves it", user=user)
             return
         process_id = process
@@ -87,7 +90,7 @@ def _name(folder: Path, pack: str) -> str:
     return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{real_folder}/{pack}')).hexdigest()[:32]}"
 
 
-def _holder(name: str) -> tuple[int, int]:
+def _find_holder(name: str) -> tuple[int, int]:
     """Return process and user that hold a name.
 
     Raises:
@@ -103,9 +106,9 @@ def _holder(name: str) -> tuple[int, int]:
     return process, user
 
 
-def _writers(folder: Path) -> set[int]:
+def _find_writers(folder: Path) -> set[int]:
     """Return the users whose processes may serve the pack."""
-    users = {ROOT, os.geteuid()}
+    users = {ROOT_USER, os.geteuid()}
     with contextlib.suppress(OSError):
         users.add(folder.stat().st_uid)
     return users

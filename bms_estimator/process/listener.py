@@ -1,4 +1,4 @@
-"""A bounded TCP listener for HTTP servers: idle clients must not use up the descriptors that checkpoints and MQTT need."""
+"""TCP listener for HTTP servers with limits, because idle clients must not exhaust the descriptors of checkpoints and MQTT."""
 
 import asyncio
 import contextlib
@@ -21,6 +21,7 @@ DESCRIPTOR_FRACTION = 0.25
 ADDRESS_FRACTION = 0.5
 """Fraction of the connections that one client address may hold."""
 BACKLOG = 128
+"""Maximum number of connections that wait to be accepted."""
 LOG_S = 60.0
 """Minimum time between two log lines on failed accepts [s]."""
 RETRY_S = 1.0
@@ -55,7 +56,8 @@ class _Connection:
 class Connections:
     """Open connections, limited in total and for each address.
 
-    A new connection beyond a limit displaces the oldest one that has no request in progress. It is refused if all have one.
+    A new connection beyond a limit displaces the oldest connection without a request in progress. If all connections have a
+    request in progress, the new connection is refused.
 
     Args:
         limit: Maximum number of connections; None derives it from RLIMIT_NOFILE.
@@ -193,7 +195,7 @@ class Listener:
         """Accept one connection. The event loop calls this method again while others wait."""
         try:
             connected, address = listening.accept()
-        except (BlockingIOError, InterruptedError, ConnectionError):  # the client has gone meanwhile
+        except (BlockingIOError, InterruptedError, ConnectionError):  # the client has closed the connection meanwhile
             return
         except OSError as error:
             self._log(error)

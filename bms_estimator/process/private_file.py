@@ -41,7 +41,7 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
         OSError: The disk cannot be written. The old file is unchanged.
     """
     new = path.with_suffix(".new")
-    new.unlink(missing_ok=True)  # left by a power failure, or an unexpected symbolic link
+    new.unlink(missing_ok=True)  # a power failure may have left it, or it is an unexpected symbolic link
     with open(new, "xb", opener=_private) as file:
         if os.geteuid() == 0:
             owner = path.parent.stat()

@@ -28,7 +28,7 @@ def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
 
 @contextlib.contextmanager
 def startup_signals() -> Iterator[None]:
-    """Exit with code 0 on SIGTERM or SIGHUP until an event loop handles them: there is nothing to save yet.
+    """Exit with code 0 on SIGTERM or SIGHUP until an event loop handles them. There is no state to save yet.
 
     An ignored SIGHUP stays ignored, as under nohup.
     """
@@ -44,7 +44,7 @@ def startup_signals() -> Iterator[None]:
 def _end(*_: object) -> None:
     """End the process without an exception, because one may be lost in the compiler.
 
-    This is done in a thread, because the interrupted code may hold the lock of the log.
+    The end runs in a thread, because the interrupted code may hold the lock of the log.
     """
 
     def end() -> None:

@@ -6,10 +6,11 @@ import threading
 import time
 
 MAX_QUEUED_LINES = 1000
-"""Maximum number of log lines waiting for the reader; further lines are lost and counted."""
+"""Maximum number of queued log lines. Further lines are lost and counted."""
 DRAIN_TIMEOUT_S = 1.0
 """Maximum time that the process waits for the reader before it ends [s]."""
 STDERR = 2
+"""File descriptor of stderr."""
 
 
 class Stderr:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 CREDENTIALS = Path("/run/credentials")
-"""Folder in which systemd keeps the credentials of all units."""
+"""Folder with the credentials of all systemd units."""
 
 
 class SystemdNotifier:

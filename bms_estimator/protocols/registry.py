@@ -14,7 +14,7 @@ from bms_estimator.protocols.base.device import Device
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 
 BOARD = "binary"
-"""Name of the firmware's protocol. It is no ``Device``, because its decoder imports numba, which other devices do not need."""
+"""Name of the firmware's protocol. It is not a ``Device``, because its decoder imports numba, which other devices do not need."""
 
 
 def _find_devices() -> dict[str, Device]:

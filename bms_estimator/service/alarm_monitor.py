@@ -1,4 +1,4 @@
-"""Evaluates alarms while samples arrive, and while none do; changes are logged, and passed to a callback."""
+"""Monitor that evaluates the alarms of a pack with and without samples, and reports their changes."""
 
 import math
 from collections.abc import Callable
@@ -22,20 +22,21 @@ from bms_estimator.telemetry.health import sample_counters, suspicions
 
 UNUSABLE = "not_finite", "range", "saturated"
 """Kinds of dropped samples that indicate a sensor fault."""
-EVALUATION_S, EVALUATION_ROWS = 0.1, 1024
-"""Interval [s] and number of samples after which samples are checked; a check of each block would take as long as the
-estimate."""
+EVALUATION_S = 0.1
+"""Interval between two evaluations [s]. An evaluation of each block would take as long as the estimate."""
+EVALUATION_ROWS = 1024
+"""Number of samples after which the alarms are evaluated before ``EVALUATION_S`` has elapsed."""
 
 log = structlog.get_logger(__name__)
 
 
 class AlarmMonitor:
-    """The alarms of one pack as the service has them.
+    """Monitor of the alarms of one pack. Changes are logged, and passed to a callback.
 
     Args:
         settings: The pack's settings.
         cell: The pack as one object.
-        estimator: Read only.
+        estimator: Estimator; read only.
         source: Supplies counters, cells and message.
         clock: The clocks.
         on_alarm: Called with each change of an alarm, as soon as it occurs.
@@ -45,7 +46,7 @@ class AlarmMonitor:
         alarms: The monitored alarms and their states.
 
     Raises:
-        UserError: As ``watched``.
+        UserError: A setting of the alarms is not valid for the pack (``watched``).
     """
 
     def __init__(
@@ -63,30 +64,43 @@ class AlarmMonitor:
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
         self.alarms = AlarmEvaluator(watched(settings, cell), charging_a(cell), gap_s, inputs, silent_limit_s(settings))
-        self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()  # of the last sample, accepted or not
+        self._last_sample_s, self._arrival_s = (
+            clock.monotonic(),
+            clock.wall(),
+        )  # times of the last sample, accepted or not
         self._evaluated_s = -math.inf
 
     def add(self, block: SampleBlock, trace: TraceBlock, now_s: float) -> None:
-        """Take a block and what the estimator made of it at ``now_s`` of the monotonic clock [s]."""
+        """Add a block of samples and its estimates.
+
+        Args:
+            block: Samples.
+            trace: Estimates of the accepted samples.
+            now_s: Monotonic clock [s].
+        """
         self.alarms.add(block, trace, self._source.cells)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
         if now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS:
             self.evaluate(now_s)
 
     def evaluate(self, now_s: float) -> None:
-        """Judge the samples since the last call, or their absence, at ``now_s`` of the monotonic clock [s]."""
-        passed_s, self._evaluated_s = now_s - self._evaluated_s, now_s
+        """Evaluate the alarms from the samples since the last call, or from their absence.
+
+        Args:
+            now_s: Monotonic clock [s].
+        """
+        elapsed_s, self._evaluated_s = now_s - self._evaluated_s, now_s
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts)
         self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.message or "")
         if (hooks := self._hooks()) is not None:
-            self.alarms.evaluate_hooks(hooks.failing, passed_s, self._clock.wall())
+            self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall())
         self._report_changes()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
-        """Acknowledge an alarm, or all with None. Return the acknowledged ones."""
+        """Acknowledge an alarm; None: all alarms. Return the acknowledged alarms."""
         acknowledged = self.alarms.acknowledge(name)
         self._report_changes()
         return acknowledged

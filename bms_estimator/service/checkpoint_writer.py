@@ -15,9 +15,9 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 
 SOC_CHANGE = 0.002
-"""Change of the SOC since the last save that triggers the next save; a kill therefore loses no more than this."""
+"""Change of the SOC that triggers a save. If the service is killed, no larger change is lost."""
 CHECK_S = 1.0
-"""Interval at which that change is checked [s]."""
+"""Interval of the check for a change of SOC or alarms [s]."""
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
 FINAL_SAVE_S = 5.0
@@ -54,7 +54,7 @@ class CheckpointWriter:
         self._saved_alarms = self._alarms.saved_state
         publisher.saved_flow = totals.flow
         self._saved: tuple[int, float] | None = None
-        """Progress (``_progress``) of the state that was saved last; None: this run has saved none."""
+        """Samples and SOC (``_progress``) of the last saved state; None: this run has not saved a state."""
 
     async def run(self) -> None:
         """Save at each interval, and earlier after the first sample, a change of the SOC, or a change of a latching alarm."""
@@ -64,7 +64,7 @@ class CheckpointWriter:
         tried_s, failed = -math.inf, False
         while True:
             await asyncio.sleep(min(CHECK_S, self._interval_s))
-            if loop.time() >= tried_s + self._interval_s or (self._has_news and not failed):
+            if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):
                 failed = not await self._save()
                 tried_s = loop.time()
 
@@ -85,7 +85,7 @@ class CheckpointWriter:
         return self._publisher.alarm_monitor.alarms
 
     @property
-    def _has_news(self) -> bool:
+    def _needs_save(self) -> bool:
         """True if the state has changed enough to be saved before the interval ends."""
         if self._saved is None or self._saved_alarms != self._alarms.saved_state:
             return True
@@ -93,7 +93,7 @@ class CheckpointWriter:
 
     @property
     def _progress(self) -> tuple[int, float]:
-        """Number of samples and SOC; the SOC of a fuel cell is NaN, replaced by 0 because NaN is equal to nothing."""
+        """Number of samples and SOC. A fuel cell has the SOC NaN, which is replaced by 0 because NaN is not equal to itself."""
         state = self._estimator.state[0]
         return int(state["samples"]), float(np.nan_to_num(state["soc"]))
 

@@ -37,7 +37,7 @@ async def serve_edge(
     Args:
         settings: The pack's settings, with ``[edge]``.
         folder: Folder of the blocks.
-        stop: Set by the caller to end, as a signal does.
+        stop: Event that ends the service; signals set it, too.
         notifier: Is notified that the loop is ready and alive.
 
     Raises:
@@ -54,13 +54,14 @@ async def serve_edge(
             notifier.ready(name)
             try:
                 await until_first_ends(
-                    _take(source, edge), _keep_alive(source, edge, notifier, name), _report(edge), stop.wait()
+                    _send_samples(source, edge), _keep_alive(source, edge, notifier, name), _report(edge), stop.wait()
                 )
             finally:
                 notifier.stopping(name)
 
 
-async def _take(source: Source, edge: BlockSender) -> None:
+async def _send_samples(source: Source, edge: BlockSender) -> None:
+    """Pass all samples of the source to the block sender."""
     async for samples in source:
         edge.take(samples)
         await asyncio.sleep(0)  # a source that always has samples must not starve the sender

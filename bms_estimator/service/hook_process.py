@@ -32,7 +32,7 @@ def environment(passed: Collection[str], fields: Mapping[str, str]) -> dict[str,
     """Return the environment of a program.
 
     Args:
-        passed: Names of further variables of the service that it inherits.
+        passed: Names of further variables of the service that the program inherits.
         fields: Fields of the alarm; each becomes a variable named ``BMS_`` and the name in capitals. A null character
             becomes a space, because no program can be started with it.
     """
@@ -86,7 +86,7 @@ async def _kill(process: asyncio.subprocess.Process, entry: bytes) -> None:
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(KILL_S):
             while (pids := await _find(process.pid, entry)) != []:
-                if pids is None and process.returncode is None:  # while the program runs, its id is that of its group
+                if pids is None and process.returncode is None:  # the process group exists while the program runs
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.killpg(process.pid, signal.SIGKILL)
                 for pid in pids or ():
@@ -97,10 +97,10 @@ async def _kill(process: asyncio.subprocess.Process, entry: bytes) -> None:
 
 
 async def _find(leader: int, entry: bytes) -> list[int] | None:
-    """Return the processes of a run; None if they cannot be listed at the moment."""
+    """Return the processes of a run; None if no list can be made at the moment."""
     try:
         return await asyncio.to_thread(_processes, leader, entry)
-    except (OSError, RuntimeError):  # no free descriptor, no further thread
+    except (OSError, RuntimeError):  # no file descriptor or thread is available
         return None
 
 
@@ -118,7 +118,7 @@ def _processes(leader: int, entry: bytes) -> list[int]:
         pid = int(folder.name)
         try:
             state, parent, _group, session = (folder / "stat").read_text().rpartition(")")[2].split()[:4]
-            if state in "ZX":  # ended
+            if state in "ZX":  # zombie or dead
                 continue
             parents[pid] = int(parent)
             if int(session) == leader or entry in (folder / "environ").read_bytes().split(b"\0"):

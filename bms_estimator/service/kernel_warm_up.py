@@ -15,7 +15,7 @@ from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 
 CELL = "chen_mora"
-"""Any cell file; the kernels are the same for all."""
+"""Cell file of the warm-up. Any file would do, because the kernels do not depend on the cell."""
 
 
 def load_kernels() -> None:

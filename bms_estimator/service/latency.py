@@ -5,12 +5,13 @@ import math
 MIN_S = 1e-5
 """Upper edge of the first bin [s]."""
 BINS_PER_OCTAVE = 4
+"""Number of bins per doubling of the latency, so that each bin is a fifth wider than the previous one."""
 BINS = 100
 """Number of bins; the last one begins at five minutes."""
 
 
 class Latency:
-    """Histogram of latencies in logarithmic bins, each a fifth wider than the one before, so that adding a value is cheap."""
+    """Histogram of latencies in logarithmic bins, so that adding a value is cheap."""
 
     def __init__(self) -> None:
         self._counts = [0] * BINS
@@ -36,9 +37,9 @@ class Latency:
 
 def _percentile(counts: list[int], fraction: float, max_s: float) -> float:
     """Return the upper edge of the percentile's bin, or the maximum [s]."""
-    wanted, seen = fraction * sum(counts), 0
+    rank, cumulative = fraction * sum(counts), 0
     for i, count in enumerate(counts):
-        seen += count
-        if seen >= wanted:
+        cumulative += count
+        if cumulative >= rank:
             return min(MIN_S * math.exp2(i / BINS_PER_OCTAVE), max_s)
     return max_s

@@ -1,4 +1,4 @@
-"""The live loop: source -> estimator -> window -> sinks."""
+"""Live loop that passes samples from the source to the estimator, and estimates to the sinks."""
 
 import asyncio
 import contextlib
@@ -30,9 +30,9 @@ from bms_estimator.sources.source import Source, SourceHealth
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
 
 LAG_STEP_S = 0.1
-"""Interval at which the loop's lag is measured [s]: any longer blocking is seen."""
+"""Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""
 STATUS_S = 60.0
-"""Interval between two SOC texts for systemd [s]; the start and end of samples are reported at once."""
+"""Interval between two SOC texts for systemd [s]. The start and end of samples are reported at once."""
 
 log = structlog.get_logger(__name__)
 
@@ -62,17 +62,17 @@ async def run_estimation_loop(
         cell: The pack as one object (``CellModel.pack``).
         source: Supplies samples; opened and closed here.
         sinks: Destinations of the snapshots; opened and closed here.
-        stop: Set to end cleanly.
+        stop: Event that ends the loop cleanly.
         checkpoint: File of the state; None: the state is not saved.
         requests: Dispatcher at which this loop registers its handlers.
         delivery: Counters of sent messages and received requests.
-        current_zero: Makes the board take the present current as zero; None: it cannot.
+        current_zero: Makes the board store the present current as zero; None: the source has no such command.
         notifier: Is notified that the loop is ready and alive.
         clock: The clocks.
         source_health: Returns the health of the source; None: not reported.
-        recording: Returns the state of a recording; None where nothing is recorded.
+        recording: Returns the state of a recording; None without a recording.
         hooks: Alarm hooks; opened and closed here.
-        edge: Also receives all samples; opened and closed by its owner. None: they are not sent.
+        edge: Sender that also receives all samples. Its owner opens and closes it. None: no sender.
 
     Returns:
         The estimator after the last sample.
@@ -130,7 +130,9 @@ async def run_estimation_loop(
             clean = True
         finally:  # an exception ends the loop, too
             notifier.stopping(name)
-            if writer:  # save before the sinks close: that may take seconds, and the service may be killed meanwhile
+            if (
+                writer
+            ):  # save before the sinks close, because closing may take seconds, and the service may be killed meanwhile
                 await writer.save_final(clean=clean)
         publisher.publish_last()
     return estimator
@@ -151,7 +153,7 @@ async def _estimate(
         estimator: Estimator.
         totals: Totals over restarts.
         publisher: Publisher.
-        edge: Receives all samples; None: they are not sent.
+        edge: Sender that receives all samples; None: no sender.
         restored_s: Time since boot at which the state was restored [s].
     """
     unseen_s = estimator.record["unseen_s"].copy()
@@ -168,7 +170,7 @@ async def _estimate(
 
 
 async def _keep_alive(publisher: Publisher, notifier: SystemdNotifier, name: str, clock: Clock) -> None:
-    """Publish missing samples, and notify the watchdog while samples arrive or the source still tries."""
+    """Publish snapshots while samples are missing, and notify the watchdog while the publisher is alive."""
     max_wait_s = notifier.watchdog_s / 3.0 or publisher.period_s
     sent_status, sent_online, sent_s = "", False, -math.inf
     while True:
@@ -185,7 +187,7 @@ async def _keep_alive(publisher: Publisher, notifier: SystemdNotifier, name: str
 
 
 async def _measure_lag(publisher: Publisher) -> None:
-    """Measure how late the loop wakes, which is how long samples and requests may wait."""
+    """Measure the delay of the event loop, by which samples and requests may be late."""
     loop = asyncio.get_running_loop()
     while True:
         due_s = loop.time() + LAG_STEP_S

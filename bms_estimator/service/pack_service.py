@@ -58,10 +58,10 @@ async def run_pack_service(
         cell: The pack as one object (``CellModel.pack``).
         sinks: Further sinks, such as the terminal.
         tap: Receives all bytes of the source with their arrival times.
-        stop: Set by the caller to end, as a signal does.
+        stop: Event that ends the service; signals set it, too.
         folder: State folder (``state_folder``); None: the state is not saved.
         notifier: Is notified that the loop is ready and alive.
-        pages: The live pages of this process.
+        pages: Page servers of this process; None: new ones.
 
     Returns:
         The estimator after the last sample.

@@ -1,4 +1,4 @@
-"""Snapshots at the publish rate: from window, estimator and source to all sinks."""
+"""Publisher of snapshots of window, estimator and source to all sinks, at the publish rate."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -41,9 +41,9 @@ from bms_estimator.telemetry.state import make_info_payload, make_state_payload
 log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
-"""Minimum interval of the payloads for parameters, health and info, at any publish rate [s]."""
+"""Minimum interval between two payloads of parameters, health or info, at any publish rate [s]."""
 SOURCE_HUNG_S = 20.0
-"""Time after which a source whose task has not run counts as hung [s]. It opens a missing port at least every 10 s."""
+"""Time after which a source whose task has not run counts as hung [s]. A missing port is retried at least every 10 s."""
 
 
 class Publisher:
@@ -106,7 +106,7 @@ class Publisher:
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
         self.saved_flow: ChargeEnergy | None = None
-        self._flow = ChargeEnergy()  # as last published
+        self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
         self.alarm_monitor = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks)
@@ -115,8 +115,8 @@ class Publisher:
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
-        self._drop_reason: str | None = None  # why the last sample was dropped; None: it was accepted
-        self._dropped_before = self._dropped()  # by kind, before the present series of dropped samples
+        self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
+        self._dropped_before = self._dropped()  # number of dropped samples by kind before the present series of them
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -133,7 +133,7 @@ class Publisher:
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
     def add(self, block: SampleBlock, trace: TraceBlock) -> None:
-        """Take a block of samples and its estimates; publish if that is due."""
+        """Add a block of samples and its estimates; publish if a snapshot is due."""
         if self._source_health:
             self._latency.add(self._source_health().block_age_s)
         now_s = self._clock.monotonic()
@@ -149,14 +149,14 @@ class Publisher:
             self.publish()
 
     def add_lag(self, lag_s: float) -> None:
-        """Take a delay of the event loop [s]."""
+        """Add a measured delay of the event loop [s]."""
         self._lag_s = max(self._lag_s, lag_s)
 
     def publish(self) -> None:
-        """Publish now."""
+        """Make a snapshot, and pass it to all sinks."""
         now_s = self._clock.monotonic()
         self._due_s += self.period_s
-        if self._due_s <= now_s:  # behind: do not catch up
+        if self._due_s <= now_s:  # a publisher that is late skips the missed publications
             self._due_s = now_s + self.period_s
         self.alarm_monitor.evaluate(now_s)
         self.snapshot = self._next_snapshot(now_s)
@@ -175,7 +175,7 @@ class Publisher:
 
     @property
     def alive(self) -> bool:
-        """True if samples flow, or if the source still tries and reports why they do not."""
+        """True while samples arrive or the task of the source runs."""
         fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
         return fresh or self._source_health is None or self._source_health().task_idle_s <= SOURCE_HUNG_S
 
@@ -204,16 +204,16 @@ class Publisher:
         )
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
-        """Return this window's estimate; recompute the other payloads that are old enough."""
+        """Return a snapshot with the estimate of this window. Other payloads are recomputed only when they are due."""
         _, parameters, health, info, _ = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
         estimate = self._estimate(summary, wall_s) if summary else None
         message = self._sensor_message(now_s)
-        old = now_s - self._slow_s >= SLOW_S
-        if old:
+        slow_due = now_s - self._slow_s >= SLOW_S
+        if slow_due:
             self._slow_s = now_s
             parameters, info = make_parameters_payload(self._estimator, wall_s), self._info()
-        if old or health.sensor_online != (message is None):
+        if slow_due or health.sensor_online != (message is None):
             health = self._health(now_s, message)
             self._log_input_faults(health)
         return Snapshot(estimate, parameters, health, info, self.alarm_monitor.alarms.report())
@@ -267,7 +267,7 @@ class Publisher:
         )
 
     def _info(self) -> Info:
-        self._board = self._source.board or self._board  # of a board that was unplugged, the last known properties
+        self._board = self._source.board or self._board  # properties of an unplugged board remain
         sensed = bool(self._estimator.record["filter"]["sensed"][0])
         return make_info_payload(
             self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed

@@ -21,7 +21,7 @@ class RequestHandlers:
     Args:
         estimator: Estimator of the pack.
         publisher: Publisher of the pack.
-        zero_board: Makes the board take the present current as zero; None: it cannot.
+        zero_board: Makes the board store the present current as zero; None: the source has no such command.
     """
 
     def __init__(
@@ -52,10 +52,10 @@ class RequestHandlers:
         return {"soc": soc, "before": before}
 
     async def current_zero(self, _: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Make the board take the present current as zero.
+        """Make the board store the present current as zero.
 
         Raises:
-            UserError: The pack is not at rest, or the source has no zero.
+            UserError: The pack is not at rest, or the source has no such command.
         """
         if self._zero_board is None:
             raise UserError("this source has no zero to be set")

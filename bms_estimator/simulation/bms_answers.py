@@ -9,7 +9,7 @@ from bms_estimator.protocols.devices import daly, jbd, jk
 
 NAME = b"SIMULATED"
 PACK = 1
-"""Address of the newer JK and the Daly."""
+"""Address of the simulated Daly and of the newer JK."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ def _daly_cells(measured: Measured) -> bytes:
 
 
 def _daly_probes(measured: Measured) -> bytes:
-    there = not math.isnan(measured.temperature_c)
-    return _daly(daly.PROBES, bytes((1, _steps(measured.temperature_c + daly.ZERO_C, 1, 1, 255) if there else 0)))
+    has_probe = not math.isnan(measured.temperature_c)
+    return _daly(daly.PROBES, bytes((1, _steps(measured.temperature_c + daly.ZERO_C, 1, 1, 255) if has_probe else 0)))
 
 
 def _daly_pack(measured: Measured) -> bytes:

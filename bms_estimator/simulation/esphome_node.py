@@ -27,8 +27,8 @@ class SimulatedNode:
     Args:
         signal: Readings of the pack as a function of time [s].
         cells: Number of cells in series.
-        mqtt: The broker.
-        prefix: Name of the node.
+        mqtt: Settings of the broker.
+        prefix: Name of the node, the first level of its topics.
         speed: Speed relative to real time.
         seed: Seed of the differences between the cells.
 
@@ -58,11 +58,11 @@ class SimulatedNode:
         self._link = ReconnectLoop(brokers(mqtt), options, BrokerConnector(mqtt), self._serve, DeliveryStats())
 
     def __enter__(self) -> Self:
-        """Nothing to open: ``run`` connects."""
+        """Return the node. ``run`` connects it."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing to close."""
+        """Do nothing. ``run`` closes the connection."""
 
     async def run(self, seconds: float) -> None:
         """Publish for a given simulated time."""
@@ -91,7 +91,7 @@ class SimulatedNode:
     def _states(self) -> Iterator[tuple[str, str]]:
         """Yield name and text of each sensor as in the examples of esphome-jk-bms; the current is positive on charge."""
         current_a, voltage_v, temperature_c = self._signal(self.time_s)
-        cells_v = [voltage_v / len(self._deviations_v) + deviations_v for deviations_v in self._deviations_v]
+        cells_v = [voltage_v / len(self._deviations_v) + deviation_v for deviation_v in self._deviations_v]
         yield "min_cell_voltage", f"{min(cells_v):.3f}"
         yield "max_cell_voltage", f"{max(cells_v):.3f}"
         yield from ((f"cell_voltage_{n}", f"{v:.3f}") for n, v in enumerate(cells_v, start=1))

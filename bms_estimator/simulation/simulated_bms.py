@@ -1,4 +1,4 @@
-"""A simulated BMS: responds to requests on a pseudo-terminal, with optional faults."""
+"""Simulated BMS that responds to requests on a pseudo-terminal, with optional faults."""
 
 import math
 import random
@@ -19,7 +19,7 @@ SPREAD_V = 0.004
 
 
 class BmsFault(Enum):
-    """Fault of a response."""
+    """Fault of a response; the value describes the response."""
 
     SILENCE = "never sent"
     CORRUPT = "one byte changed"
@@ -35,8 +35,8 @@ class SimulatedBms(SimulatedMeter):
         signal: The simulated pack.
         cells: Number of cells in series.
         speed: Speed relative to real time.
-        soc: SOC that it reports, 0..1.
-        capacity_ah: Capacity that it reports.
+        soc: Returns the SOC that the BMS reports, 0..1.
+        capacity_ah: Capacity that the BMS reports [Ah].
         seed: Seed of the differences between the cells, and of noise.
 
     Raises:

@@ -103,7 +103,7 @@ class SimulatedMeter(ABC):
             self.send(self.message(self._read(now_s)))
 
     def _read(self, now_s: float) -> Reading:
-        """Return the values at its sensors now."""
+        """Return the present values at the sensors, and count them."""
         self.time_s = now_s
         self.samples += 1
         self.last = self._signal(now_s)
@@ -159,8 +159,8 @@ class SimulatedJunctek(SimulatedMeter):
     def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
         """Respond to ``:R50=1,``."""
         *lines, rest = received.split(b"\n")
-        asked = sum(line.startswith(b":R50=1,") for line in lines)
-        return asked * self.message(reading), len(received) - len(rest)
+        requests = sum(line.startswith(b":R50=1,") for line in lines)
+        return requests * self.message(reading), len(received) - len(rest)
 
 
 class SimulatedPylontech(SimulatedMeter):

@@ -1,4 +1,4 @@
-"""Simulated pack under an endless load, with the cell model of Chen and Mora (2.1)-(2.4).
+"""Simulated pack under an endless load, with the cell model of Chen and Mora, (2.1) to (2.4) of the thesis.
 
 An empty pack is charged; a full one is not charged further.
 """
@@ -13,12 +13,16 @@ from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, r_s
 from bms_estimator.model.cell import CellModel
 from bms_estimator.simulation.virtual_adc import Reading
 
-EMPTY_SOC, FULL_SOC = 0.05, 0.95
-"""The load stops at ``EMPTY_SOC``, and the pack is charged up to ``FULL_SOC``. Above ``FULL_SOC`` no load charges it."""
+EMPTY_SOC = 0.05
+"""SOC at which the load stops and the pack is charged."""
+FULL_SOC = 0.95
+"""SOC up to which the pack is charged. Above this SOC the load does not charge it."""
 ROOM_C = 25.0
+"""Temperature of the pack [degC]."""
 PULSE_S = 10.0
 """Duration of a pulse, and of the pause after it [s]."""
 MIN_STEP_S, MAX_STEP_S = 1.0, 5.0
+"""Range of the duration of a random step [s]."""
 MAX_CHARGE_FRACTION = 0.25
 """Maximum charging current of random steps, as a fraction of the load current."""
 
@@ -74,7 +78,7 @@ class SimulatedPack:
     def __init__(self, cell: CellModel, load: Load, *, soc: float = 0.9) -> None:
         self._a, self._capacity_as = cell.a, cell.cell.capacity_ah * 3600.0
         self._ocv = ocv_grid(cell)
-        self._charge_a = -cell.cell.capacity_ah  # 1C
+        self._charge_a = -cell.cell.capacity_ah  # 1C; charging is negative
         self._load = load
         self._left_s, self._load_a = next(load)
         self._charging = False
@@ -94,7 +98,7 @@ class SimulatedPack:
         self._state = cell_step(self._state, self._current_a, dt_s, self._capacity_as, self._a)
         self._current_a = self._next_current(dt_s)
         soc, v_ts, v_tl = self._state
-        voltage_v = ocv(soc, *self._ocv) - v_ts - v_tl - self._current_a * r_s(soc, self._a)  # (2.4)
+        voltage_v = ocv(soc, *self._ocv) - v_ts - v_tl - self._current_a * r_s(soc, self._a)  # (2.4) of the thesis
         return Reading(self._current_a, float(voltage_v), ROOM_C)
 
     def _next_current(self, dt_s: float) -> float:

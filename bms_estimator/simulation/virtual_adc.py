@@ -8,14 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 FULL_SCALE = 1024
+"""Number of steps of the 10-bit converter."""
 CLOCK_HZ = 16_000_000
+"""Clock of the microcontroller [Hz]."""
 AUX_PER_S = 100
+"""NTC and bandgap readings of the firmware per second, if the sample rate allows."""
 AUX_MAX = 63
+"""Maximum number of NTC or bandgap readings in one window."""
 SLOTS_PER_S = 8000
 """Conversions of the firmware per second, alternately of voltage and current."""
 RATIOMETRIC_V = 5.0
 """Supply at which the data sheet of a ratiometric sensor gives its slope [V]."""
 _NOISE_POINTS = 1 << 16
+"""Number of noise values, which are reused in turn."""
 
 
 class Reading(NamedTuple):
@@ -47,9 +52,9 @@ class BoardParts:
     volts_per_ampere: float = 0.1
     """Slope of a ratiometric sensor at 5 V of supply [V/A]."""
     ratiometric: bool = True
-    """The current sensor is supplied with AVcc, and its slope is proportional to that."""
+    """True if the current sensor is supplied with AVcc, so that its slope is proportional to AVcc."""
     current_zero: float = 0.5
-    """Sensor's output without current, as a fraction of the supply."""
+    """Output of the current sensor without current, as a fraction of the supply."""
     ntc_series_ohm: int = 10_000
     ntc_r25_ohm: int = 10_000
     ntc_beta_k: int = 3950
@@ -119,5 +124,5 @@ def compute_window(rate_hz: int) -> tuple[int, int]:
 
 def compute_aux_count(rate_hz: int) -> int:
     """Return the number of NTC or bandgap readings in one window: odd, as in the firmware."""
-    wanted = AUX_PER_S // rate_hz
-    return 1 if wanted == 0 else min((wanted - 1) | 1, AUX_MAX)
+    readings = AUX_PER_S // rate_hz
+    return 1 if readings == 0 else min((readings - 1) | 1, AUX_MAX)

@@ -1,4 +1,4 @@
-"""Simulated sensor board: uses the firmware's protocol on a pseudo-terminal, with optional faults.
+"""Simulated sensor board with the firmware's protocol on a pseudo-terminal, and optional faults.
 
 ``bms-estimator simulate``, the demo without the firmware's simulator, and tests use it.
 """
@@ -55,9 +55,11 @@ Signal = Callable[[float], Reading] | Iterable[Reading]
 """Readings as a function of time [s], or one reading for each sample. The board stops after the last one."""
 
 FIRMWARE = (0, 2, 0)
+"""Simulated version of the firmware."""
 RATE_HZ_AT_RESET = 100
+"""Sample rate after a reset [Hz]."""
 _MAX_UNSENT_BYTES = 2048
-"""Maximum number of unsent bytes. If the host does not read, further samples are dropped, as on a board."""
+"""Maximum number of unsent bytes. Further samples are dropped, as on a board whose host does not read."""
 _MIN_SLEEP_S = 0.002
 """Minimum sleep [s]. Samples that are due within this time are sent together, as on USB."""
 _DRAIN_TIMEOUT_S = 1.0
@@ -67,12 +69,15 @@ _HOST_POLL_S = 0.01
 _BOOT_S = 0.2
 """Delay from the opening of the port to the first sample [s]. Opening resets a board, and the host discards old bytes."""
 _BURST = 256
+"""Maximum number of due samples that are sent before the event loop runs again."""
 _BOOT_READINGS = 256
+"""Number of bandgap conversions at a reset."""
 _MAX_ZERO_OFFSET = 0.1
+"""Maximum deviation of the sensor's output without current from half of the supply, as a fraction of the supply."""
 
 
-def _millionths(least: float, most: float) -> range:
-    return range(round(least * 1e6), round(most * 1e6) + 1)
+def _millionths(minimum: float, maximum: float) -> range:
+    return range(round(minimum * 1e6), round(maximum * 1e6) + 1)
 
 
 _RANGES = {
@@ -86,7 +91,7 @@ _RANGES = {
 
 
 class BoardFault(Enum):
-    """Fault of a sample's frame."""
+    """Fault of a sample's frame; the value describes the frame."""
 
     DROP = "never sent"
     CORRUPT = "one byte changed"
@@ -232,13 +237,9 @@ class VirtualBoard:
 
     def _boot(self, cause: ResetCause) -> None:
         self._cause = cause
-        self.relay_high, self._relay_fallback, self._relay_s, self._relay_word, self._relay_command_s = (
-            False,
-            RELAY_KEEP,
-            0,
-            0,
-            0.0,
-        )
+        self.relay_high, self._relay_fallback = False, RELAY_KEEP
+        self._relay_s = self._relay_word = 0
+        self._relay_command_s = 0.0
         self._boot_id = (self._boot_id + 1) % (1 << 16)
         self._sequence, self._ns, self._overrun, self._aux_is_ntc = 0, self._clock_us * 1000, False, False
         self._set_rate(self._first_rate_hz)
@@ -302,8 +303,8 @@ class VirtualBoard:
         parts = self._converter.parts
         volts_per_step = parts.supply_v / FULL_SCALE / message.count
         voltage_v = message.voltage_sum * volts_per_step * parts.divider
-        part = message.current_sum / message.count / FULL_SCALE
-        current_a = (part - parts.current_zero) / parts.fraction_per_ampere
+        fraction = message.current_sum / message.count / FULL_SCALE
+        current_a = (fraction - parts.current_zero) / parts.fraction_per_ampere
         if math.isnan(reading.temperature_c):
             return b"%.3f,%.3f\r\n" % (voltage_v, current_a)
         return b"%.3f,%.3f,%.1f\r\n" % (voltage_v, current_a, reading.temperature_c)
@@ -401,15 +402,15 @@ class VirtualBoard:
 
     def _set_relay(self, word: int) -> None:
         """Set the relay from the bits of ``relay_word``. A fallback level needs a delay."""
-        then, silent_s = word >> 8 & 0xFF, word >> 16
+        fallback, silent_s = word >> 8 & 0xFF, word >> 16
         is_valid = (
             word & 0xFE == 0
-            and then <= RELAY_HIGH
+            and fallback <= RELAY_HIGH
             and silent_s <= MAX_SILENT_S
-            and (then == RELAY_KEEP or silent_s > 0)
+            and (fallback == RELAY_KEEP or silent_s > 0)
         )
         if is_valid:
-            self.relay_high, self._relay_fallback, self._relay_s = bool(word & 1), then, silent_s
+            self.relay_high, self._relay_fallback, self._relay_s = bool(word & 1), fallback, silent_s
             self._relay_command_s = self.time_s
             self._relay_word = word
         self._answer(MessageType.COMMAND_SET_RELAY, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._relay_word)
@@ -421,10 +422,10 @@ class VirtualBoard:
 
     def _zero_current(self) -> None:
         """Store the present current as zero."""
-        count = compute_window(1)[0]
-        part = self._converter.window(self._reading, count).current / count / FULL_SCALE
-        is_valid = abs(part - 0.5) <= _MAX_ZERO_OFFSET
-        self._zero_ppm = round(part * 1e6) if is_valid else self._zero_ppm
+        count = compute_window(rate_hz=1)[0]  # the firmware also averages for a second
+        zero = self._converter.window(self._reading, count).current / count / FULL_SCALE
+        is_valid = abs(zero - 0.5) <= _MAX_ZERO_OFFSET
+        self._zero_ppm = round(zero * 1e6) if is_valid else self._zero_ppm
         result = AckResult.OK if is_valid else AckResult.BAD_VALUE
         self._answer(MessageType.COMMAND_ZERO_CURRENT, result, self._zero_ppm)
 

@@ -38,7 +38,8 @@ def open_line_source(settings: Settings, *, tap: ReadTap | None = None) -> LineS
     """Make the source that ``[source]`` selects; None without ``[source]``, for a serial port.
 
     Raises:
-        UserError, ModuleNotFoundError: As ``make_line_producer``.
+        UserError: A setting cannot be used.
+        ModuleNotFoundError: An optional package is missing.
     """
     producer = make_line_producer(settings)
     if producer is None:

@@ -32,7 +32,7 @@ class SourceUnavailableError(Exception):
 
 
 class LineProducer(ABC):
-    """I/O part of a source other than a serial line."""
+    """Producer of sample lines from a device that is not on a serial port. It does all I/O of the source."""
 
     @property
     @abstractmethod
@@ -78,7 +78,7 @@ class LineSource:
         tap: Receives a copy of each arrival time and line that the decoder is fed.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
-        first_retry_s: Delay before a missing or lost device is retried; doubles with each attempt [s].
+        first_retry_s: First delay before a missing or lost device is retried [s]. Each attempt doubles the delay.
         check_interval_s: Interval between two checks for silence and faults [s].
     """
 
@@ -198,7 +198,7 @@ class LineSource:
             self._report(f"{self._producer.name}: {reason}; trying again")
 
     async def _pause(self) -> None:
-        """Wait before the next attempt. Each wait is longer than the one before, until a sample arrives."""
+        """Wait before the next attempt. Each delay is longer than the previous one, until a sample arrives."""
         wait_s, self._retry_s = self._retry_s, min(max(2.0 * self._retry_s, self._first_retry_s), MAX_RETRY_S)
         await asyncio.sleep(wait_s)
 

@@ -186,7 +186,7 @@ async def test_commands_are_executed_and_acknowledged() -> None:
                     with contextlib.suppress(BlockingIOError):
                         chunk = os.read(host, 1 << 16)
                         decoder.feed(0.0, chunk)
-                    if acks := decoder.take_acks():
+                    if acks := decoder.pop_acks():
                         return acks[0].result, acks[0].value
                     await asyncio.sleep(0.005)
 
@@ -291,7 +291,7 @@ async def test_relay_changes_to_its_fallback_level_when_the_host_is_silent_and_t
     decoder = FrameDecoder()
     decoder.feed(0.0, b"\0" + await receive(make_board(), 400, events))
     assert levels == {20: True, 200: True, 240: False, 300: False, 360: True, 380: False}
-    assert [ack.result for ack in decoder.take_acks()] == [AckResult.OK] * 3
+    assert [ack.result for ack in decoder.pop_acks()] == [AckResult.OK] * 3
 
 
 async def test_invalid_relay_command_changes_nothing() -> None:
@@ -300,5 +300,5 @@ async def test_invalid_relay_command_changes_nothing() -> None:
     board = make_board()
     decoder = FrameDecoder()
     decoder.feed(0.0, b"\0" + await receive(board, 20, {10: lambda b: b._handle_command(unseal(invalid))}))
-    assert [(ack.result, ack.value) for ack in decoder.take_acks()] == [(AckResult.BAD_VALUE, 0)]
+    assert [(ack.result, ack.value) for ack in decoder.pop_acks()] == [(AckResult.BAD_VALUE, 0)]
     assert not board.relay_high

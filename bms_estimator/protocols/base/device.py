@@ -12,7 +12,7 @@ class Resolution:
     """Defaults of ``[sensor]`` for one kind of device. None: the default of the firmware's board."""
 
     baud: int | None = None
-    """Baud rate of its serial port."""
+    """Baud rate of the serial port [1/s]."""
     current_sign: CurrentSign | None = None
     """Direction of the current that the device reports as positive."""
     period_s: float | None = None
@@ -22,20 +22,20 @@ class Resolution:
     current_resolution_a: float | None = None
     """One step of the current [A]."""
     current_dead_band_a: float | None = None
-    """Currents below this are reported as 0 [A]."""
+    """Current below which the device reports 0 [A]."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """A kind of device.
+    """Kind of device.
 
-    Each module of ``protocols.devices`` has one as ``DEVICE``. This is the only place where a device is declared.
+    Each module of ``protocols.devices`` declares its device as the constant ``DEVICE``, and nowhere else.
 
     Attributes:
         name: Value of ``sensor.protocol``.
         make: Creates the protocol from the sign of the current and the address (None: the first device that responds).
         resolution: Defaults of ``[sensor]``.
-        has_binary_frames: True if its frames are not lines of text. A device search sends their queries last, because a device that
+        has_binary_frames: True if the frames are not lines of text. A device search sends binary queries last, because a device that
             reads lines would interpret them as the beginning of a line.
     """
 

@@ -8,8 +8,10 @@ MAX_CONSTANT_S = 10.0
 """Maximum time for which a timestamp may stay constant while samples arrive [s]. Then the timestamp is ignored."""
 MAX_SLOWNESS = 0.01
 """Maximum relative amount by which a device's clock is slower than the host's."""
-LAG_S, LAG_STEPS = 60.0, 3
-"""Lag [s] and number of successive slow steps after which a clock counts as slow.
+LAG_S = 60.0
+"""Minimum time that a slow clock has lost in successive slow steps [s]."""
+LAG_STEPS = 3
+"""Minimum number of successive slow steps of a slow clock.
 
 A step is slow if it is less than half of the elapsed time. Delayed samples do not look slow, because they arrive together.
 """
@@ -19,8 +21,8 @@ class DeviceClock:
     """Time since the first sample [s], which never decreases.
 
     Delayed samples arrive together, and the device's timestamps give their times. A timestamp that steps back, or leads the
-    arrival, shows that the clock was set or the device restarted; then the arrival time is used. The arrival time is also
-    used while the timestamp is constant. A slow clock, such as that of a sleeping device or of one that sends
+    arrival, shows that the clock was set or the device restarted. Then the arrival time is used. The arrival time is also
+    used after the timestamp has been constant for ``MAX_CONSTANT_S``. A slow clock, such as that of a sleeping device or of one that sends
     milliseconds in place of seconds, would lose charge. The lost time is added in one step, and arrival times are used
     from then on.
 

@@ -7,6 +7,7 @@ class Relay(NamedTuple):
     """Level of the relay pin, until the next reset."""
 
     high: bool
+    """Level now."""
     high_when_silent: bool | None
     """Level after ``silent_s`` without a relay command; None: unchanged."""
     silent_s: int = 0

@@ -19,15 +19,25 @@ from bms_estimator.protocols.base.polled_protocol import FRESH_S, ParseResult, P
 from bms_estimator.protocols.base.reading import Reading
 
 PACK, STATUS, CELLS, PROBES = 0x90, 0x94, 0x95, 0x96
+"""Commands for voltage and current of the pack, numbers of cells and probes, cell voltages, and temperatures."""
 COMMANDS = range(0x90, 0x99)
-START, DATA_BYTES, FRAME_BYTES = 0xA5, 8, 13
+"""Valid commands of responses."""
+START = 0xA5
+"""First byte of a frame."""
+DATA_BYTES, FRAME_BYTES = 8, 13
+"""Number of data bytes of a frame, and of all its bytes."""
 HOSTS = (0x40, 0x80)
+"""Addresses of the host on RS485 or USB, and on UART."""
 PACKS = range(0x01, 0x40)
 """Addresses of responses."""
 ZERO_CURRENT = 30000
+"""Value at 0 A [0.1 A]."""
 ZERO_C = 40
-"""Value at 0 degC; the value 0 is an absent probe."""
-CELLS_A_FRAME, PROBES_A_FRAME, MAX_FRAMES = 3, 7, 16
+"""Value at 0 degC [degC]. The value 0 means an absent probe."""
+CELLS_A_FRAME, PROBES_A_FRAME = 3, 7
+"""Number of values in a frame of cells, and in a frame of probes."""
+MAX_FRAMES = 16
+"""Maximum number of frames of cells or probes."""
 
 
 def with_checksum(frame: bytes) -> bytes:
@@ -52,9 +62,9 @@ class DalyProtocol(PolledProtocol):
         super().__init__("Daly BMS", re.compile(b"\xa5"), current_sign, address)
         self._cells: int | None = None
         self._probes: int | None = None
-        self._has_sample = self._known = False  # sample received; number of cells received since the port was opened
+        self._has_sample = self._known = False  # a sample was received; a status was received since the port was opened
         self._first = 1  # number of the frame with cell 1
-        self._cells_v: dict[int, Sequence[float]] = {}  # by the frame's number
+        self._cells_v: dict[int, Sequence[float]] = {}  # voltages by frame number [V]
         self._probes_c: dict[int, Sequence[float]] = {}
         self._cells_s = self._probes_s = -math.inf
 
@@ -105,8 +115,8 @@ class DalyProtocol(PolledProtocol):
     def _pack(self, arrival_s: float, data: bytes) -> Reading:
         decivolts, _, deciamperes, _ = struct.unpack(">4H", data)
         cells_v = self._joined(self._cells_v, CELLS_A_FRAME, self._cells) if arrival_s - self._cells_s < FRESH_S else []
-        fresh = arrival_s - self._probes_s < FRESH_S
-        probes_c = self._joined(self._probes_c, PROBES_A_FRAME, self._probes) if fresh else []
+        has_recent_probes = arrival_s - self._probes_s < FRESH_S
+        probes_c = self._joined(self._probes_c, PROBES_A_FRAME, self._probes) if has_recent_probes else []
         self._cells_v, self._has_sample = {}, True
         present_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
         return Reading(decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, self._mean_c(present_c), tuple(cells_v))
@@ -133,7 +143,14 @@ class DalyProtocol(PolledProtocol):
 DEVICE = Device(
     "daly",
     lambda sign, address: DalyProtocol(current_sign=sign, address=address),
-    Resolution(9600, None, 1.0, 0.1, 0.1, 2.5),
+    Resolution(
+        baud=9600,
+        current_sign=None,
+        period_s=1.0,
+        voltage_resolution_v=0.1,
+        current_resolution_a=0.1,
+        current_dead_band_a=2.5,
+    ),
     has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 0.1 V and 0.1 A. Users found its parameter DfilterCur at 2 A and at 2.5 A

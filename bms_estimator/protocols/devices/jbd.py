@@ -16,13 +16,19 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import RecentCellVoltages
 
 BASIC, CELLS, NAME = 0x03, 0x04, 0x05
-START, END, READ = 0xDD, 0x77, 0xA5
+"""Registers of basic information, cell voltages and device name."""
+START, END = 0xDD, 0x77
+"""First and last byte of a frame."""
+READ = 0xA5
+"""Second byte of a request that reads a register."""
 REFUSED = 0x80
 """Status of a response that rejects the request; 0 is success."""
 HEAD, TAIL = 4, 3
-"""Bytes of a frame before and after its data."""
-MIN_BASIC, MAX_DATA = 23, 128
-"""Minimum length of basic information, without a probe, and maximum length of any data, more than 32 cells [bytes]."""
+"""Number of bytes of a frame before its data, and after them."""
+MIN_BASIC = 23
+"""Minimum length of the basic information, without a probe [bytes]."""
+MAX_DATA = 128
+"""Maximum length of the data of a frame [bytes]. 32 cells need 64 bytes."""
 ZERO_C = 2731
 """Value at 0 degC [0.1 K]."""
 
@@ -103,7 +109,14 @@ class JbdProtocol(PolledProtocol):
 DEVICE = Device(
     "jbd",
     lambda sign, _: JbdProtocol(current_sign=sign),
-    Resolution(9600, "charge_positive", 1.0, 0.01, 0.01, 0.5),
+    Resolution(
+        baud=9600,
+        current_sign="charge_positive",
+        period_s=1.0,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+        current_dead_band_a=0.5,
+    ),
     has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. Users saw nothing below 0.2 A, and nothing below 0.5 A on one of

@@ -21,9 +21,13 @@ from bms_estimator.protocols.base.polled_protocol import ParseResult, PolledProt
 from bms_estimator.protocols.base.reading import Reading
 
 OLD_START, START = b"\x4e\x57", b"\x55\xaa\xeb\x90"
-OLD_HEAD, OLD_TAIL, OLD_MAX_BYTES = 11, 9, 512
-"""Bytes of an older frame before its registers, after them, and in total at most."""
+"""First bytes of an older and of a newer frame."""
+OLD_HEAD, OLD_TAIL = 11, 9
+"""Number of bytes of an older frame before its registers, and after them."""
+OLD_MAX_BYTES = 512
+"""Maximum length of an older frame [bytes]."""
 READ_ALL, FROM_BMS, ANSWER, OLD_END = 0x06, 0x00, 0x01, 0x68
+"""Command, source, type and end mark of an older response."""
 REGISTER_BYTES: Mapping[int, int] = {
     **dict.fromkeys(range(0x80, 0xC1), 2),
     **dict.fromkeys((0x85, 0x86, 0x9D, 0xA9, 0xAB, 0xAC, 0xAE, 0xAF, 0xB1, 0xB3, 0xB8, 0xC0), 1),
@@ -35,14 +39,24 @@ REGISTER_BYTES: Mapping[int, int] = {
 }
 """Length of each register [bytes], except that of the cells, which contains its own length."""
 CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOFTWARE, VERSION = 0x79, 0x81, 0x82, 0x83, 0x84, 0xB7, 0xC0
+"""Registers of an older frame."""
 ABSENT_C = 140
 """Value of an absent probe in an older frame: the lower end of the scale, -40 degC."""
 CHARGING = 0x8000
+"""Bit of the current in an older frame of protocol version 1 that is set on charge."""
 
 FRAME_BYTES, RECORD_BYTES = 300, 8
-REALTIME, KINDS = 0x02, (0x01, 0x02, 0x03)
-MODBUS_WRITE, REALTIME_REGISTER = 0x10, 0x1620
+"""Length of a newer frame, and of the Modbus record after it [bytes]."""
+REALTIME = 0x02
+"""Kind of a newer frame with measured values."""
+KINDS = (0x01, 0x02, 0x03)
+"""Valid kinds of newer frames."""
+MODBUS_WRITE = 0x10
+"""Modbus function that writes registers."""
+REALTIME_REGISTER = 0x1620
+"""Register whose write requests a real-time frame."""
 ABSENT_DECI_C = -2000
+"""Value of an absent probe in a newer frame [0.1 degC]."""
 LISTEN_S = 10.0
 """Time without queries after unsolicited frames [s]. Another master polls every 6 s."""
 
@@ -202,7 +216,14 @@ def _number(content: bytes) -> int:
 DEVICE = Device(
     "jk",
     lambda sign, address: JkProtocol(current_sign=sign, address=address),
-    Resolution(115_200, "charge_positive", 1.0, 0.01, 0.01, 0.7),
+    Resolution(
+        baud=115_200,
+        current_sign="charge_positive",
+        period_s=1.0,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+        current_dead_band_a=0.7,
+    ),
     has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. One board showed nothing below 0.7 A

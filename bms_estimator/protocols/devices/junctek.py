@@ -21,9 +21,11 @@ QUERY = b":R50=%d,2,1,\r\n" % ADDRESS
 POLL_INTERVAL_S = 1.0
 """Poll interval [s]."""
 MAX_LINE_BYTES = 256
+"""Maximum length of a line [bytes]."""
 VOLTAGE, CURRENT, TEMPERATURE, DIRECTION = 0, 1, 6, 9
 """Indices of the values in a response."""
 ZERO_C = 100
+"""Value at 0 degC [degC]."""
 MAX_VALUE_DIGITS = 12
 """Maximum number of digits of a value."""
 TOO_LONG = "bytes arrive that are no lines of a Junctek monitor: its baud rate is 115200"
@@ -117,6 +119,12 @@ class JunctekProtocol(ReadingProtocol):
 DEVICE = Device(
     "junctek",
     lambda sign, _: JunctekProtocol(current_sign=sign),
-    Resolution(115_200, "charge_positive", 1.0, 0.01, 0.1),
+    Resolution(
+        baud=115_200,
+        current_sign="charge_positive",
+        period_s=1.0,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.1,
+    ),
 )
 """The protocol has steps of 10 mV and 10 mA; the makers specify 0.1 A."""

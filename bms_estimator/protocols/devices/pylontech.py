@@ -23,14 +23,21 @@ RESPONSE_TIMEOUT_S = 5.0
 MAX_RESPONSE_BYTES = 16384
 """Maximum length of a response [bytes]: 16 rows of less than 200 bytes, with a margin."""
 PROMPT = re.compile(rb"pylon\w*>")
+"""Prompt of the console, which follows each response."""
 ECHO = re.compile(r"\bbat\s+([0-9]{1,2})\b")
+"""Echo of a query of cells, with the number of the battery."""
 SUCCESS = "Command completed"
+"""Beginning of the success message."""
 MAX_BATTERIES = 16
+"""Maximum number of batteries in parallel."""
 MAX_CELLS = 32
+"""Maximum number of cells of a battery."""
 MAX_CELLS_AGE_S = 90.0
 """Maximum age of cell voltages [s]: two cycles of 16 batteries, with some lost responses."""
 MAX_DIGITS = 9
+"""Maximum number of digits of a value."""
 ABSENT = "-"
+"""Value of a battery or cell that is absent."""
 
 
 class PylontechProtocol(ReadingProtocol):
@@ -161,7 +168,7 @@ def _parse_integer(text: str) -> int:
     """Parse an integer of the table.
 
     Raises:
-        ValueError: It is not an integer.
+        ValueError: The text is not an integer.
     """
     if not re.fullmatch(rf"-?[0-9]{{1,{MAX_DIGITS}}}", text):
         raise ValueError(text)
@@ -175,6 +182,13 @@ def _mean(values: Sequence[float]) -> float:
 DEVICE = Device(
     "pylontech",
     lambda sign, _: PylontechProtocol(current_sign=sign),
-    Resolution(115_200, "charge_positive", 2.0, 0.001, 0.01, 0.1),
+    Resolution(
+        baud=115_200,
+        current_sign="charge_positive",
+        period_s=2.0,
+        voltage_resolution_v=0.001,
+        current_resolution_a=0.01,
+        current_dead_band_a=0.1,
+    ),
 )
 """The table has steps of 1 mV and 1 mA. In public captures the smallest nonzero current is 149 mA, next to many zeros."""

@@ -37,7 +37,7 @@ class VeDirectProtocol(ReadingProtocol):
 
     @property
     def description(self) -> str | None:
-        """Product and the last values."""
+        """Product and last values; None before the first reading."""
         if self._last_reading is None:
             return None
         return f"VE.Direct battery monitor {self._product}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
@@ -95,6 +95,12 @@ class VeDirectProtocol(ReadingProtocol):
 DEVICE = Device(
     "vedirect",
     lambda sign, _: VeDirectProtocol(current_sign=sign),
-    Resolution(19_200, "charge_positive", 1.0, 0.01, 0.01),
+    Resolution(
+        baud=19_200,
+        current_sign="charge_positive",
+        period_s=1.0,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+    ),
 )
 """The text has steps of 1 mV and 1 mA; the data sheets of BMV and SmartShunt specify 10 mV and 10 mA."""

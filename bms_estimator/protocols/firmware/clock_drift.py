@@ -1,8 +1,8 @@
-"""Rate error of the board's clock relative to the host's, from a line below the arrival times of its samples.
+"""Rate error of the board's clock relative to the host's, from the smallest delays of its samples.
 
 Line, USB bridge and scheduler delay a sample, but never advance it. Therefore only the sample with the smallest delay in
-each ten seconds is used, and of those the lower convex hull (Moon, Skelly, Towsley 1999). Other delayed samples do not
-affect the result. The result does not change the samples' times.
+each ten seconds is used. The rate follows from the lower convex hull of these delays (Moon, Skelly, Towsley 1999). Other
+delayed samples do not affect the result. The result does not change the times of the samples.
 """
 
 import math
@@ -13,20 +13,22 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 CLOCK_WINDOWS = 60
-"""Number of windows of 10 s: ten minutes, because a resonator drifts with its temperature."""
+"""Number of windows of 10 s. They span only ten minutes, because a resonator drifts with its temperature."""
 _WINDOW_US = 10_000_000
-_MIN_US = 60_000_000  # the smallest delays differ by up to 1 ms, which is 17 ppm of a minute
+"""Length of a window [us]."""
+_MIN_US = 60_000_000
+"""Minimum time for an estimate [us]. The smallest delays differ by up to 1 ms, which is 17 ppm of a minute."""
 _US = 1e-6
 
 
 @njit(cache=True)
-def forget_clock(d: Record) -> None:
+def reset_clock_estimate(d: Record) -> None:
     """Reset the estimate of the board's clock."""
     d.clock_windows = 0
 
 
 @njit(cache=True)
-def take_arrival(d: Record, arrival_s: float) -> None:
+def add_arrival(d: Record, arrival_s: float) -> None:
     """Record the arrival of the sample at ``d.elapsed_us``."""
     if d.clock_windows == 0:
         d.clock_origin_s = arrival_s
@@ -62,7 +64,8 @@ def clock_ppm(d: Record) -> float:
             corners -= 1
         hull[corners] = i
         corners += 1
-    middle_s, corner = at_s.mean(), 1  # the hull's edge at the mean time has the smallest mean distance from all points
+    # of all edges of the hull, the one at the mean time has the smallest mean distance from all points
+    middle_s, corner = at_s.mean(), 1
     while at_s[hull[corner]] < middle_s:
         corner += 1
     begin, end = hull[corner - 1], hull[corner]

@@ -24,12 +24,13 @@ from bms_estimator.protocols.firmware.messages import (
 from bms_estimator.protocols.firmware.scaling import SCALING, reference
 
 MAX_BYTES_WITHOUT_FRAME = 512
-"""Number of bytes without a valid frame that is reported as a fault: eight times the longest frame."""
+"""Maximum number of bytes without a valid frame, eight times the longest frame. More is reported as a fault."""
 MAX_CLOCK_PPM = 20_000.0
-"""Maximum plausible rate error of a clock [1e-6]. More shows a suspended host or an accelerated simulation."""
+"""Maximum plausible rate error of a clock [1e-6]. A larger one shows a suspended host or an accelerated simulation."""
 HELLO_FRAME_BYTES = HELLO_BYTES + 1
 """Length of a COBS-encoded hello without its delimiter [bytes]."""
 _MESSAGES = 8
+"""Maximum number of messages of one call of the kernel, and of stored acknowledgments."""
 
 
 class FrameFault(Enum):
@@ -96,10 +97,9 @@ class FrameDecoder:
         self._hello: Hello | None = None
         self._acks: list[Ack] = []
         self._printable = 0
-        self._decode(
-            np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0
-        )  # compiles the kernel
-        clock_ppm(self._state[0])  # compiles the kernel
+        # numba compiles both kernels now, before bytes arrive
+        self._decode(np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0)
+        clock_ppm(self._state[0])
 
     @property
     def hello(self) -> Hello | None:
@@ -136,7 +136,7 @@ class FrameDecoder:
         None during the first minute, and if implausible. It does not change the samples' times.
         """
         ppm = clock_ppm(self._state[0])
-        return round(ppm, 1) if abs(ppm) < MAX_CLOCK_PPM else None
+        return round(ppm, 1) if abs(ppm) < MAX_CLOCK_PPM else None  # NaN compares false
 
     @property
     def counters(self) -> FrameCounters:
@@ -171,11 +171,11 @@ class FrameDecoder:
                     serial = _hexadecimal(Hello.decode(unseal(frame)).serial)
         return serial
 
-    def forget_hello(self) -> None:
+    def discard_hello(self) -> None:
         """Discard the hello. Samples use its scaling until the next one."""
         self._hello = None
 
-    def take_acks(self) -> list[Ack]:
+    def pop_acks(self) -> list[Ack]:
         """Return the acknowledgments received since the last call."""
         acks, self._acks = self._acks, []
         return acks
@@ -199,7 +199,7 @@ class FrameDecoder:
     def feed_reads(
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
     ) -> SampleBlock:
-        """Decode many reads of the line at once: the same samples as ``feed`` for each.
+        """Decode many reads of the line at once. The samples are those that ``feed`` would return for each read.
 
         Args:
             arrivals_s: Shape (reads,): arrival time of each read [s].

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.model.sample import MAX_C, MIN_C, SampleStatus
 from bms_estimator.numba_cache import njit
-from bms_estimator.protocols.firmware.clock_drift import CLOCK_WINDOWS, forget_clock, take_arrival
+from bms_estimator.protocols.firmware.clock_drift import CLOCK_WINDOWS, add_arrival, reset_clock_estimate
 from bms_estimator.protocols.firmware.messages import MODULUS, PROTOCOL_VERSION, BoardStatus, MessageType
 from bms_estimator.protocols.firmware.scaling import (
+    add_bandgap,
+    add_ntc,
     current,
-    forget_readings,
     reference,
-    take_bandgap,
-    take_ntc,
+    reset_readings,
     temperature,
     voltage,
 )
@@ -30,11 +30,15 @@ MESSAGE_SAMPLE = int(MessageType.SAMPLE)
 MESSAGE_HELLO = int(MessageType.HELLO)
 MESSAGE_ACK = int(MessageType.ACK)
 SAMPLE_BYTES = 24
+"""Length of a sample packet with its CRC [bytes]."""
 HELLO_BYTES = 62
+"""Length of a hello packet with its CRC [bytes]."""
 ACK_BYTES = 10
+"""Length of an acknowledgment packet with its CRC [bytes]."""
 PACKET_BYTES = 64
 """Maximum length of a packet [bytes]."""
 SAMPLE_FRAME_BYTES = SAMPLE_BYTES + 2
+"""Length of a sample frame: the packet, one byte of COBS and the delimiter [bytes]."""
 
 DECODER = np.dtype(
     [
@@ -45,23 +49,23 @@ DECODER = np.dtype(
         ("in_step", "i8"),  # 1 once a delimiter was received, because earlier bytes may be half a frame
         ("started", "i8"),  # 1 after the first sample
         ("expected", "i8"),  # sequence of the next sample
-        ("boot_id", "i8"),  # of the last hello; -1: none since a reset, or since another board may be there
-        ("serial", "i8"),  # of the last hello
-        ("period_us", "f8"),  # of the last hello: from sample to sample
-        ("doubted_s", "f8"),  # arrival at which boot_id became -1
-        ("withheld", "i8"),  # status bits of samples that were dropped since then
-        ("reset_pending", "i8"),  # a hello reported a reset
-        ("board_us", "i8"),  # of the last sample, 32 bit
-        ("elapsed_us", "i8"),  # board clock since the first sample or the reset
-        ("origin_s", "f8"),  # time at which elapsed_us was 0
-        ("time_s", "f8"),  # of the last sample
-        ("arrival_s", "f8"),  # of the last sample
-        ("least_late_s", "f8"),  # smallest recent delay: arrival minus origin_s and elapsed_us
-        ("clock_windows", "i8"),  # for the clock's rate, since the first sample or the reset
-        ("clock_begin_us", "i8"),  # elapsed_us at the begin of the last window
+        ("boot_id", "i8"),  # boot id of the last hello; -1: none since a reset, or since another board may be connected
+        ("serial", "i8"),  # serial number of the last hello
+        ("period_us", "f8"),  # sample period of the last hello [us]
+        ("doubted_s", "f8"),  # arrival time at which boot_id became -1 [s]
+        ("withheld", "i8"),  # status bits of samples that were dropped since doubted_s
+        ("reset_pending", "i8"),  # 1 from a hello that reported a reset until the next sample
+        ("board_us", "i8"),  # board clock of the last sample, 32 bit [us]
+        ("elapsed_us", "i8"),  # board clock since the first sample or the reset, without wraps [us]
+        ("origin_s", "f8"),  # sample time at which elapsed_us was 0 [s]
+        ("time_s", "f8"),  # time of the last sample since the first one [s]
+        ("arrival_s", "f8"),  # arrival time of the last sample [s]
+        ("least_late_s", "f8"),  # smallest recent delay: arrival time minus sample time [s]
+        ("clock_windows", "i8"),  # number of windows of the clock estimate since the first sample or the reset
+        ("clock_begin_us", "i8"),  # elapsed_us at the beginning of the last window
         ("clock_origin_s", "f8"),  # arrival time that is the origin of the delays
         ("clock_at_us", "i8", CLOCK_WINDOWS),  # elapsed_us of the sample with the smallest delay in each window
-        ("clock_late_s", "f8", CLOCK_WINDOWS),  # its delay
+        ("clock_late_s", "f8", CLOCK_WINDOWS),  # delay of the sample with the smallest delay in each window [s]
         ("current_sign", "f8"),  # 1 if the board's positive current is a discharge, otherwise -1
         ("bytes_received", "i8"),
         ("heard_at", "i8"),  # bytes_received at the end of the last frame with a right CRC
@@ -91,10 +95,9 @@ MAX_ADVANCE_S = 0.3
 """Maximum advance of the board's clock between two samples beyond arrival times and sequence numbers [s]."""
 MAX_SLOWNESS = 0.01
 """Maximum relative amount by which a board's clock is slower than the host's."""
-_REORDER_WINDOW = 64  # a sample further behind belongs to a board whose clock restarted
-_MAX_APART = (
-    0.1  # maximum relative difference between sequence and clock of one board; more shows another board or rate
-)
+_REORDER_WINDOW = 64  # in samples; a sample further behind belongs to a board whose clock restarted
+_MAX_MISMATCH = 0.1
+"""Maximum relative difference between the sequence and the clock of a board. More shows another board or sample rate."""
 MAX_DOUBT_S = 5.0
 """Maximum time for which samples are dropped until a hello identifies their board [s]. Then they are accepted."""
 _US = 1e-6
@@ -160,7 +163,7 @@ def read_unsigned(packet: Bytes, offset: int, size: int) -> int:
 
 @njit(cache=True)
 def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
-    """Unpack the buffered frame into ``packet``. Returns its message type, 0 when it is bad; faults are counted by kind."""
+    """Unpack the buffered frame into ``packet``. Return its message type, or 0 if it is invalid. Count faults by kind."""
     counted = d.in_step  # an incomplete frame before the first delimiter is no fault
     if d.overlong:
         d.length_errors += counted
@@ -197,7 +200,7 @@ def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
 
 
 @njit(cache=True)
-def take_hello(d: Record, s: Record) -> None:
+def apply_hello(d: Record, s: Record) -> None:
     """Store the board's scaling, and detect a reset or another board."""
     p = d.packet
     boot_id, serial = read_unsigned(p, 6, 2), read_unsigned(p, 8, 4)
@@ -206,7 +209,7 @@ def take_hello(d: Record, s: Record) -> None:
     if d.started and (behind or (d.boot_id >= 0 and is_new)):
         d.reset_pending = 1
     if is_new:
-        forget_readings(s)
+        reset_readings(s)
     d.boot_id, d.serial = boot_id, serial
     d.period_us = read_unsigned(p, 22, 4) * 1e-3
     s.full_scale = float(1 << min(read_unsigned(p, 26, 1), 24))
@@ -218,7 +221,7 @@ def take_hello(d: Record, s: Record) -> None:
     s.current_zero = read_unsigned(p, 36, 4) * 1e-6
     s.bandgap_v = read_unsigned(p, 40, 4) * 1e-6
     if s.bandgap_weight == 0.0 and read_unsigned(p, 48, 2) > 0:
-        take_bandgap(s, float(read_unsigned(p, 44, 4)), float(read_unsigned(p, 48, 2)), read_unsigned(p, 16, 4))
+        add_bandgap(s, float(read_unsigned(p, 44, 4)), float(read_unsigned(p, 48, 2)), read_unsigned(p, 16, 4))
     s.ntc_series_ohm = float(read_unsigned(p, 50, 4))
     s.ntc_r25_ohm = float(read_unsigned(p, 54, 4))
     s.ntc_beta_k = float(read_unsigned(p, 58, 2))
@@ -227,19 +230,19 @@ def take_hello(d: Record, s: Record) -> None:
 
 @njit(cache=True)
 def is_early(d: Record, arrival_s: float, time_s: float) -> bool:
-    """Return True if a sample of ``time_s`` arrived much earlier than the delays of earlier samples allow."""
+    """Return True if the sample of ``time_s`` arrived more than ``MAX_LEAD_S`` earlier than the smallest delay allows."""
     return bool(arrival_s - time_s < d.least_late_s - MAX_LEAD_S)
 
 
 @njit(cache=True)
 def is_consistent_with_clock(d: Record, samples: int, step_us: int) -> bool:
     """Return True if the number of samples fits the time step of the board's clock."""
-    apart_us = abs(samples * d.period_us - step_us)
-    return apart_us <= max(_MAX_APART * step_us, _REORDER_WINDOW * d.period_us)
+    mismatch_us = abs(samples * d.period_us - step_us)
+    return mismatch_us <= max(_MAX_MISMATCH * step_us, _REORDER_WINDOW * d.period_us)
 
 
 @njit(cache=True)
-def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
+def advance_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
     """Advance the time by the board's clock. The arrival time shows wraps of its 32 bits during an outage.
 
     Returns:
@@ -249,12 +252,12 @@ def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
     """
     step_us = (board_us - d.board_us) & _MASK
     if lost > 0:
-        turns = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
-        step_us += max(turns, 0) * MODULUS
+        wraps = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
+        step_us += max(wraps, 0) * MODULUS
     time_s = d.origin_s + (d.elapsed_us + step_us) * _US
-    haste_s = (step_us - (lost + 1) * d.period_us) * _US - (arrival_s - d.arrival_s)
+    excess_s = (step_us - (lost + 1) * d.period_us) * _US - (arrival_s - d.arrival_s)
     if (
-        haste_s > MAX_ADVANCE_S
+        excess_s > MAX_ADVANCE_S
         or is_early(d, arrival_s, time_s)
         or (lost > 0 and not is_consistent_with_clock(d, lost + 1, step_us))
     ):
@@ -272,7 +275,7 @@ def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
     d.time_s = d.origin_s
     d.elapsed_us = 0
     d.least_late_s = arrival_s - d.origin_s
-    forget_clock(d)
+    reset_clock_estimate(d)
 
 
 @njit(cache=True)
@@ -283,7 +286,7 @@ def require_new_hello(d: Record, arrival_s: float) -> None:
 
 
 @njit(cache=True)
-def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -> int:
+def check_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -> int:
     """Check the sequence number of a sample. Return bits of SampleStatus, or -1 if the sample must be dropped."""
     status = 0
     if not d.started:
@@ -295,11 +298,11 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
                 require_new_hello(d, arrival_s)  # the hello after the reset was lost; the next one is no further reset
-            run_s = board_us * _US  # since its reset
-            if is_early(d, arrival_s, d.time_s + run_s):
-                run_s = 0.0
+            uptime_s = board_us * _US  # time since the reset
+            if is_early(d, arrival_s, d.time_s + uptime_s):
+                uptime_s = 0.0
                 d.clock_jumps += 1
-            restart_clock(d, arrival_s, run_s)
+            restart_clock(d, arrival_s, uptime_s)
             d.reset_pending = 0
             d.resets += 1
             status = _RESET
@@ -310,7 +313,7 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
             d.out_of_order += 1
             return -1
         else:
-            if not follow_clock(d, board_us, arrival_s, ahead):
+            if not advance_clock(d, board_us, arrival_s, ahead):
                 restart_clock(d, arrival_s, 0.0)
                 d.clock_jumps += 1
                 require_new_hello(d, arrival_s)
@@ -319,34 +322,34 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
     d.expected = (sequence + 1) & _MASK
     d.board_us = board_us
     d.arrival_s = arrival_s
-    take_arrival(d, arrival_s)
+    add_arrival(d, arrival_s)
     return status
 
 
 @njit(cache=True)
-def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
+def decode_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     """Decode a sample packet into ``out``. Return 1, or 0 if the sample is dropped."""
     p = d.packet
     if not s.known:
         d.before_hello += 1
         return 0
-    place = follow_sequence(d, read_unsigned(p, 2, 4), read_unsigned(p, 6, 4), arrival_s)
-    if place < 0:
+    status = check_sequence(d, read_unsigned(p, 2, 4), read_unsigned(p, 6, 4), arrival_s)
+    if status < 0:
         return 0
     if d.boot_id < 0 and arrival_s - d.doubted_s < MAX_DOUBT_S:
-        d.withheld |= place
+        d.withheld |= status
         d.before_hello += 1
         return 0
-    place |= d.withheld
+    status |= d.withheld
     d.withheld = 0
     d.frames_received += 1
     bits = int(p[21])
     aux_count = float(p[20])
     if aux_count > 0.0:
         if bits & _AUX_IS_NTC:
-            take_ntc(s, float(read_unsigned(p, 18, 2)), aux_count, d.board_us)
+            add_ntc(s, float(read_unsigned(p, 18, 2)), aux_count, d.board_us)
         else:
-            take_bandgap(s, float(read_unsigned(p, 18, 2)), aux_count, d.board_us)
+            add_bandgap(s, float(read_unsigned(p, 18, 2)), aux_count, d.board_us)
     if bits & _OVERRUN:
         d.overruns += 1
     count = float(read_unsigned(p, 16, 2))
@@ -358,7 +361,7 @@ def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     if out.temperature_c < MIN_C or out.temperature_c > MAX_C:
         out.temperature_c = math.nan
         d.implausible += 1
-    out.status = place | (bits & _SATURATED_OR_OVERRUN)
+    out.status = status | (bits & _SATURATED_OR_OVERRUN)
     return 1
 
 
@@ -397,7 +400,7 @@ def decode(
     while i < data.size and n_samples < samples.size and n_messages < messages.shape[0]:
         byte = data[i]
         i += 1
-        if byte != 0:
+        if byte != 0:  # zero is the delimiter of COBS frames
             if length < buffer.size:
                 buffer[length] = byte
                 length += 1
@@ -412,10 +415,10 @@ def decode(
             if kind == MESSAGE_SAMPLE:
                 while ends[read] < i:
                     read += 1
-                n_samples += take_sample(d, s, arrivals_s[read], samples[n_samples])
+                n_samples += decode_sample(d, s, arrivals_s[read], samples[n_samples])
             elif kind != 0:
                 if kind == MESSAGE_HELLO:
-                    take_hello(d, s)
+                    apply_hello(d, s)
                 messages[n_messages, :] = d.packet[:PACKET_BYTES]
                 messages[n_messages, HELLO_BYTES if kind == MESSAGE_HELLO else ACK_BYTES :] = 0
                 n_messages += 1

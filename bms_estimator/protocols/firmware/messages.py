@@ -16,11 +16,15 @@ from bms_estimator.protocols.base.relay import Relay
 
 PROTOCOL_VERSION = 1
 BAUD = 500_000
+"""Baud rate of the firmware [1/s]."""
 RATE_HZ = range(1, 1001)
+"""Valid sample rates [Hz]."""
 MIN_BANDGAP_V, MAX_BANDGAP_V = 1.0, 1.2
 """Range of the internal reference of an ATmega328P by its data sheet [V]."""
 MIN_DIVIDER, MAX_DIVIDER = 1.0, 100.0
+"""Range of the voltage divider's ratio."""
 MIN_VOLTS_PER_AMPERE, MAX_VOLTS_PER_AMPERE = 0.001, 2.0
+"""Range of the slope of the current sensor [V/A]."""
 DELIMITER = b"\0"
 MODULUS = 1 << 32
 """Modulus of sequence numbers and microseconds."""
@@ -84,7 +88,7 @@ class ProtocolError(ValueError):
 
 
 def seal(packet: bytes) -> bytes:
-    """Return the frame of a packet; the CRC is appended here."""
+    """Return the COBS frame of a packet with its CRC and the delimiter."""
     return bytes(cobs.encode(packet + struct.pack("<H", binascii.crc_hqx(packet, 0xFFFF)))) + DELIMITER
 
 
@@ -159,6 +163,7 @@ def set_ratiometric_command(ratiometric: int) -> bytes:
 RELAY_KEEP, RELAY_LOW, RELAY_HIGH = range(3)
 """Fallback level of the relay when the host is silent."""
 MAX_SILENT_S = 3600
+"""Maximum delay of the fallback level [s]."""
 
 
 def set_relay_command(relay: Relay) -> bytes:
@@ -168,8 +173,8 @@ def set_relay_command(relay: Relay) -> bytes:
 
 def relay_word(relay: Relay) -> int:
     """Encode the relay command: bit 0 the level, bits 8 and 9 the fallback, the upper half its delay [s]."""
-    then = RELAY_KEEP if relay.high_when_silent is None else RELAY_HIGH if relay.high_when_silent else RELAY_LOW
-    return relay.high | then << 8 | relay.silent_s << 16
+    fallback = RELAY_KEEP if relay.high_when_silent is None else RELAY_HIGH if relay.high_when_silent else RELAY_LOW
+    return relay.high | fallback << 8 | relay.silent_s << 16
 
 
 @dataclass(frozen=True)

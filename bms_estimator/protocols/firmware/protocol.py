@@ -29,7 +29,7 @@ _HELLO = hello_command()
 
 @dataclass
 class _PendingCommand(Command):
-    """Pending command. It is done when it is acknowledged and, if it changes the hello, a new hello has arrived."""
+    """Pending command. It is done when it is acknowledged. A command that changes the hello also needs a new hello."""
 
     frame: bytes = b""
     retry_s: float = RETRY_S
@@ -97,7 +97,7 @@ class BoardProtocol(DeviceProtocol):
 
     def on_port_opened(self) -> None:
         """Discard the hello and a pending command. Samples use the last scaling until the next hello."""
-        self._decoder.forget_hello()
+        self._decoder.discard_hello()
         self._opened_at = self._decoder.heard_at
         if self._command is not None and not self._command.done:
             self._command.refusal = "the line was lost before the board answered, and another board may be there now"
@@ -118,11 +118,11 @@ class BoardProtocol(DeviceProtocol):
 
     def next_output(self, now_s: float) -> bytes:
         """Return a request of the hello, then the pending command, then the rate command. Each is repeated until answered."""
-        wanted, retry_s = self._wanted()
-        if wanted == self._last_output and now_s - self._output_s < retry_s:
+        output, retry_s = self._choose_output()
+        if output == self._last_output and now_s - self._output_s < retry_s:
             return b""
-        self._last_output, self._output_s = wanted, now_s
-        return wanted
+        self._last_output, self._output_s = output, now_s
+        return output
 
     def command(self, name: str) -> Command:
         """Queue ``current_zero``, which makes the board store the present current as zero.
@@ -133,9 +133,8 @@ class BoardProtocol(DeviceProtocol):
         if name != "current_zero":
             raise UserError(f"the board has no command {name}")
         hint = "; is the sensor connected, and no current flowing?"
-        return self._queue(
-            zero_current_command(), retry_s=math.inf, hint=hint
-        )  # not repeated, because the board measures for a second
+        # not repeated, because the board measures for a second before it answers
+        return self._queue(zero_current_command(), retry_s=math.inf, hint=hint)
 
     def relay(self, relay: Relay) -> Command:
         """Queue the command that sets the level of the relay pin."""
@@ -147,12 +146,12 @@ class BoardProtocol(DeviceProtocol):
         return self._queue(frame)
 
     def _queue(self, frame: bytes, *, retry_s: float = RETRY_S, hint: str = "", changes_hello: bool = True) -> Command:
-        self._decoder.take_acks()  # discards those of the previous command
+        self._decoder.pop_acks()  # discards acknowledgments of the previous command
         self._last_output = b""
         self._command = _PendingCommand(frame=frame, retry_s=retry_s, hint=hint, changes_hello=changes_hello)
         return self._command
 
-    def _wanted(self) -> tuple[bytes, float]:
+    def _choose_output(self) -> tuple[bytes, float]:
         """Return the next bytes to send, and their retry interval [s]."""
         hello = self._decoder.hello
         if hello is None:
@@ -165,14 +164,14 @@ class BoardProtocol(DeviceProtocol):
 
     def _update_command(self, command: _PendingCommand) -> None:
         """Update the pending command from received acknowledgments and hellos."""
-        for ack in self._decoder.take_acks():
+        for ack in self._decoder.pop_acks():
             if ack.command != unseal(command.frame)[1]:
                 continue
             if ack.result == AckResult.OK:
                 command.acknowledged = True
                 if not command.changes_hello:
                     continue
-                self._decoder.forget_hello()  # the next hello has the new values; if it is lost, it is requested again
+                self._decoder.discard_hello()  # the next hello has the new values; if it is lost, it is requested again
             else:
                 command.refusal = f"the board refuses: {ack.result.name.lower().replace('_', ' ')}{command.hint}"
                 command.done = True

@@ -14,26 +14,30 @@ SCALING = np.dtype(
         ("full_scale", "f8"),  # conversions at the reference: 2^bits
         ("divider", "f8"),  # pack voltage over voltage at the pin
         ("volts_per_ampere", "f8"),  # slope of the current sensor [V/A]
-        ("ratiometric", "i8"),  # 1: that slope holds at 5 V, and is proportional to the reference
-        ("current_zero", "f8"),  # its output without current, as a fraction of the reference
+        ("ratiometric", "i8"),  # 1: volts_per_ampere holds at 5 V, and is proportional to the reference
+        ("current_zero", "f8"),  # output of the current sensor without current, as a fraction of the reference
         ("bandgap_v", "f8"),  # the converter's internal reference [V]
-        ("ntc_series_ohm", "f8"),
-        ("ntc_r25_ohm", "f8"),
-        ("ntc_beta_k", "f8"),
-        ("ntc_fitted", "i8"),
+        ("ntc_series_ohm", "f8"),  # resistor in series with the NTC [ohm]
+        ("ntc_r25_ohm", "f8"),  # resistance of the NTC at 25 degC [ohm]
+        ("ntc_beta_k", "f8"),  # beta of the NTC [K]
+        ("ntc_fitted", "i8"),  # 1: the board has an NTC
         ("bandgap_mean", "f8"),  # filtered conversions of the bandgap
-        ("bandgap_weight", "f8"),  # conversions since the reset
-        ("bandgap_us", "i8"),  # board_us of the last
+        ("bandgap_weight", "f8"),  # number of bandgap conversions since the reset
+        ("bandgap_us", "i8"),  # board_us of the last bandgap reading
         ("ntc_mean", "f8"),  # filtered conversions of the NTC
-        ("ntc_weight", "f8"),
-        ("ntc_us", "i8"),
+        ("ntc_weight", "f8"),  # number of NTC conversions since the reset
+        ("ntc_us", "i8"),  # board_us of the last NTC reading
     ],
     align=True,
 )
 
-# At the firmware's own rate these are 512 and 32 readings: 0.5 LSB of noise becomes 0.02 LSB in the bandgap's mean.
-_BANDGAP_US = 5_120_000  # time constant; twice that if NTC and bandgap are read alternately
+_BANDGAP_US = 5_120_000
+"""Time constant of the bandgap's mean [us]; twice as long if NTC and bandgap are read alternately.
+
+At 100 readings per second it covers 512 readings, so that 0.5 LSB of noise becomes 0.02 LSB in the mean.
+"""
 _NTC_US = 640_000
+"""Time constant of the NTC's mean [us]."""
 _CLOCK_MASK = MODULUS - 1
 _RAIL = 0.01  # an NTC within this fraction of either end of the range is open or shorted
 _RATIOMETRIC_V = 5.0  # supply at which the data sheet of a ratiometric sensor gives its slope
@@ -42,38 +46,44 @@ _R25_K = 298.15
 
 
 @njit(cache=True)
-def running_mean(mean: float, weight: float, total: float, count: float, part: float) -> float:
-    """Return the mean after adding ``count`` readings of sum ``total`` to the ``weight`` readings before.
+def running_mean(mean: float, weight: float, total: float, count: float, elapsed_fraction: float) -> float:
+    """Return the mean of ``weight`` earlier readings and ``count`` new readings with the sum ``total``.
 
-    It is an arithmetic mean at first, and an exponential one later. ``part`` is the time since the last readings divided
-    by the time constant.
+    The mean is arithmetic at first, and exponential later.
+
+    Args:
+        mean: Mean of the earlier readings.
+        weight: Number of earlier readings.
+        total: Sum of the new readings.
+        count: Number of new readings.
+        elapsed_fraction: Time since the last readings divided by the time constant.
     """
     weight += count
-    if part * weight > count:
-        weight = max(count / part, count)
+    if elapsed_fraction * weight > count:
+        weight = max(count / elapsed_fraction, count)
     return mean + (total - mean * count) / weight
 
 
 @njit(cache=True)
-def take_bandgap(s: Record, total: float, count: float, board_us: int) -> None:
+def add_bandgap(s: Record, total: float, count: float, board_us: int) -> None:
     """Update the filtered mean of the bandgap."""
-    part = ((board_us - s.bandgap_us) & _CLOCK_MASK) / (_BANDGAP_US * (1 + s.ntc_fitted))
-    s.bandgap_mean = running_mean(s.bandgap_mean, s.bandgap_weight, total, count, part)
+    elapsed_fraction = ((board_us - s.bandgap_us) & _CLOCK_MASK) / (_BANDGAP_US * (1 + s.ntc_fitted))
+    s.bandgap_mean = running_mean(s.bandgap_mean, s.bandgap_weight, total, count, elapsed_fraction)
     s.bandgap_weight += count
     s.bandgap_us = board_us
 
 
 @njit(cache=True)
-def take_ntc(s: Record, total: float, count: float, board_us: int) -> None:
+def add_ntc(s: Record, total: float, count: float, board_us: int) -> None:
     """Update the filtered mean of the NTC."""
-    part = ((board_us - s.ntc_us) & _CLOCK_MASK) / _NTC_US
-    s.ntc_mean = running_mean(s.ntc_mean, s.ntc_weight, total, count, part)
+    elapsed_fraction = ((board_us - s.ntc_us) & _CLOCK_MASK) / _NTC_US
+    s.ntc_mean = running_mean(s.ntc_mean, s.ntc_weight, total, count, elapsed_fraction)
     s.ntc_weight += count
     s.ntc_us = board_us
 
 
 @njit(cache=True)
-def forget_readings(s: Record) -> None:
+def reset_readings(s: Record) -> None:
     """Reset reference and temperature after a reset or another board."""
     s.bandgap_mean = s.bandgap_weight = s.ntc_mean = s.ntc_weight = 0.0
 

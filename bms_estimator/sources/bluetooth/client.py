@@ -22,7 +22,7 @@ SCAN_S = 15.0
 
 
 class BleProducer(LineProducer):
-    """Line producer that polls a BMS. It stays connected, because most of them take seconds to connect.
+    """Line producer that polls a BMS. It stays connected, because most BMS need seconds to connect.
 
     Args:
         settings: Settings of the BMS.
@@ -75,7 +75,7 @@ class BleProducer(LineProducer):
             raise SourceUnavailableError("the BMS asks for a password; remove the password in its app") from None
         except TimeoutError:
             raise SourceUnavailableError("no response") from None
-        except FileNotFoundError:  # the socket of D-Bus
+        except FileNotFoundError:  # the socket of D-Bus does not exist
             raise SourceUnavailableError("no Bluetooth: are D-Bus and bluetoothd running?") from None
         except (BleakError, EOFError, OSError) as error:
             raise SourceUnavailableError(str(error) or type(error).__name__) from None

@@ -18,7 +18,7 @@ def producer(settings: Settings) -> LineProducer:
         UserError: This Python is too old, or aiobmsble does not support this BMS.
         ModuleNotFoundError: aiobmsble is not installed.
     """
-    assert isinstance(settings.source, BleSource)  # noqa: S101 - as KINDS has it
+    assert isinstance(settings.source, BleSource)  # noqa: S101 - KINDS maps kind = "ble" to BleSource
     if sys.hexversion < MIN_PYTHON_HEX:
         raise UserError(f'source.kind = "ble" needs Python 3.12 or newer; this is {sys.version.split()[0]}')
     from bms_estimator.sources.bluetooth.client import BleProducer  # noqa: PLC0415 - needs Python 3.12 and an extra

@@ -7,10 +7,15 @@ from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.framing import Bytes, crc16, read_unsigned
 
 ARRIVAL_BYTES = 8
+"""Length of the arrival time of a record [bytes]."""
 LENGTH_BYTES = 4
+"""Length of the length field of a record [bytes]."""
 CRC_BYTES = 2
+"""Length of the CRC of a record [bytes]."""
 HEAD_BYTES = ARRIVAL_BYTES + LENGTH_BYTES
+"""Length of a record before its payload [bytes]."""
 RECORD_OVERHEAD_BYTES = HEAD_BYTES + CRC_BYTES
+"""Length of a record without its payload [bytes]."""
 
 
 @njit(cache=True)

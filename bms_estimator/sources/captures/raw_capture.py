@@ -40,7 +40,9 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES, split_records
 
 MAGIC = b"BMSRAW1\n"
+"""First bytes of a raw capture."""
 VERSION = 1
+"""Version of the file format."""
 MAX_READ_BYTES = 1 << 20
 """Maximum length of the bytes in a record."""
 CHUNK_BYTES = 1 << 20
@@ -49,6 +51,7 @@ _HEAD = struct.Struct("<dI")
 _LENGTH = struct.Struct("<I")
 _CRC = struct.Struct("<H")
 _MAX_HEADER_BYTES = 1 << 20
+"""Maximum length of the JSON in the header [bytes]."""
 
 
 @dataclass(config=ConfigDict(strict=True, extra="ignore", frozen=True))
@@ -150,8 +153,8 @@ class CaptureWriter:
             data: The bytes, at most ``MAX_READ_BYTES``.
 
         Raises:
-            ValueError: ``data`` is longer.
-            OSError: The disk is full or gone.
+            ValueError: ``data`` is longer than ``MAX_READ_BYTES``.
+            OSError: The disk is full or was removed.
         """
         if len(data) > MAX_READ_BYTES:
             raise ValueError(f"a read of {len(data)} bytes: a record holds at most {MAX_READ_BYTES}")
@@ -176,7 +179,7 @@ class CaptureWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
+        """Close the file."""
         self.close()
 
     def _append(self, data: bytes) -> None:
@@ -244,7 +247,7 @@ def _split(raw: NDArray[np.uint8]) -> tuple[CaptureBatch, int]:
     arrival_bits, ends = np.empty(max_records, dtype=np.int64), np.empty(max_records, dtype=np.int64)
     payload = np.empty(raw.size, dtype=np.uint8)
     parsed_bytes, records, payload_bytes, damaged = split_records(raw, MAX_READ_BYTES, arrival_bits, ends, payload)
-    payload.setflags(write=False)  # as for live bytes, because the decoder is compiled for read-only arrays
+    payload.setflags(write=False)  # the decoder is compiled for the read-only arrays of live bytes
     arrivals_s = arrival_bits[:records].view(np.float64)
     return CaptureBatch(arrivals_s, ends[:records], payload[:payload_bytes], bool(damaged)), parsed_bytes
 

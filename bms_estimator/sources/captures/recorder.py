@@ -15,9 +15,9 @@ from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWri
 SYNC_S = 5.0
 """Interval between two syncs to disk [s]. A power failure loses at most the data since the last sync."""
 MAX_QUEUED_CHUNKS = 1 << 16
-"""Maximum number of chunks waiting for the disk: one minute at 1000 samples per second."""
+"""Maximum number of chunks that wait for the disk. They last about a minute at 1000 chunks per second."""
 SHUTDOWN_TIMEOUT_S = 5.0
-"""Timeout at shutdown [s]: the recorder waits for the disk as long as it writes a chunk within this time."""
+"""Timeout at shutdown [s]. The recorder waits while the disk completes at least one chunk within this time."""
 
 log = structlog.get_logger(__name__)
 

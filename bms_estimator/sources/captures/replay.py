@@ -36,7 +36,7 @@ class Capture(Protocol):
         """Number of implausible readings, which were replaced by NaN."""
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of samples.
+        """Yield blocks of samples.
 
         Raises:
             UserError: The file cannot be read.
@@ -77,7 +77,7 @@ class RawCapture:
 
     @property
     def fraction(self) -> float:
-        """Fraction that has been read, 0..1; too large for a compressed file."""
+        """Fraction that has been read, 0..1. It is too large for a compressed file, because it counts decompressed bytes."""
         return min(self._read_bytes / self._size, 1.0)
 
     @property

@@ -21,6 +21,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import MAX_C, MIN_C, SAMPLE, CurrentSign, SampleBlock, remove_implausible
 
 BLOCK_ROWS = 65_536
+"""Maximum number of rows of a block."""
 MAX_SHOWN_CHARACTERS = 40
 """Maximum number of characters of an invalid number that are shown."""
 
@@ -47,9 +48,9 @@ class Sign(NamedTuple):
     """Direction of positive current in a table."""
 
     given: CurrentSign | None = None
-    """Direction given for this very table; it takes precedence over column names."""
+    """Configured direction, which takes precedence over the column names; None: not configured."""
     otherwise: CurrentSign = "discharge_positive"
-    """Direction if neither ``given`` nor the column names define it."""
+    """Default direction if neither ``given`` nor the column names define one."""
 
     def factor(self, naming: ColumnNaming) -> float:
         """Return the factor, 1 or -1, that makes discharge positive."""
@@ -57,17 +58,17 @@ class Sign(NamedTuple):
 
 
 class ColumnTable(Protocol):
-    """A table in memory, such as a dict of arrays or a DataFrame."""
+    """Table in memory, such as a dict of arrays or a DataFrame."""
 
     def __iter__(self) -> Iterator[str]:
-        """Names of the columns."""
+        """Yield the names of the columns."""
 
     def __getitem__(self, name: str, /) -> ArrayLike:
         """Return a column."""
 
 
 class _Columns(NamedTuple):
-    """Positions of a sample's columns in a table."""
+    """Columns of a sample in a table."""
 
     indices: tuple[int, ...]
     """Column indices of time, current, voltage, and temperature if there is one."""
@@ -76,11 +77,11 @@ class _Columns(NamedTuple):
 
 
 class CsvTable:
-    """A CSV file, gzipped when its name ends in .gz; lines that start with # are comments.
+    """Reader of a CSV file, gzipped if its name ends in .gz. Lines that start with # are comments.
 
     Args:
         path: The file.
-        sign: Sign of its current.
+        sign: Direction of positive current.
     """
 
     def __init__(self, path: Path, sign: Sign) -> None:
@@ -97,7 +98,7 @@ class CsvTable:
         return 1.0 if self._raw.closed else self._raw.tell() / max(self._size, 1)
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of at most ``BLOCK_ROWS`` samples, current positive on discharge.
+        """Yield blocks of at most ``BLOCK_ROWS`` samples, with the current positive on discharge.
 
         Raises:
             UserError: The file cannot be read; the message names file, line and column.
@@ -165,11 +166,11 @@ class CsvTable:
 
 
 class ParquetTable:
-    """A Parquet file; needs pyarrow.
+    """Reader of a Parquet file with pyarrow.
 
     Args:
         path: The file.
-        sign: Sign of its current.
+        sign: Direction of positive current.
     """
 
     def __init__(self, path: Path, sign: Sign) -> None:
@@ -177,7 +178,7 @@ class ParquetTable:
         self.fraction, self.implausible = 0.0, 0
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of at most ``BLOCK_ROWS`` samples, current positive on discharge.
+        """Yield blocks of at most ``BLOCK_ROWS`` samples, with the current positive on discharge.
 
         Raises:
             UserError: The file cannot be read; the message names file, line and column.

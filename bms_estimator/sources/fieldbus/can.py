@@ -1,4 +1,4 @@
-"""A CAN bus, by any interface that python-can has. It is listened to; nothing is ever sent."""
+"""Line producer that listens to a CAN bus with any interface of python-can. It never sends."""
 
 import asyncio
 import contextlib
@@ -20,21 +20,22 @@ from bms_estimator.sources.line_source import LineProducer, SourceUnavailableErr
 LISTEN_S = 0.2
 """Interval at which the thread checks for its end [s]."""
 CLOSE_S = 5.0
-"""Timeout for opening or closing an adapter [s]; then it is abandoned."""
+"""Timeout of the thread at its end [s]. A thread whose adapter hangs is abandoned."""
 BUS_OFF = 0x40
 """Bit in the identifier of an error frame: CAN_ERR_BUSOFF of linux/can/error.h."""
 
 Deliver = Callable[[bytes | Exception], None]
+"""Passes a line, or the error that ended the thread, to the event loop."""
 
 
 class CanProducer(LineProducer):
-    """Listens to a bus in a thread of its own: most adapters can only be waited for.
+    """Line producer that listens to a bus in its own thread, because most adapters have only blocking calls.
 
     Args:
         settings: Settings of the bus.
 
     Raises:
-        UserError: There is no such interface, or the DBC file does not fit.
+        UserError: The interface is unknown, or the DBC file does not define the signals.
     """
 
     def __init__(self, settings: CanSource) -> None:
@@ -54,7 +55,7 @@ class CanProducer(LineProducer):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Since start: the map's, ``error_frames``, and ``junk`` that an adapter sent for a frame."""
+        """Counters of the decoder, number of ``error_frames``, and number of invalid frames of an adapter (``junk``)."""
         return {**self._map.counters, "error_frames": self._error_frames, "junk": self._junk}
 
     @property
@@ -66,18 +67,18 @@ class CanProducer(LineProducer):
         return missing and f"connected, but nothing comes of {missing}: are identifiers, bitrate and wiring right?"
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """One line for each voltage and current."""
+        """Yield one line for each pair of voltage and current."""
         loop, stop = asyncio.get_running_loop(), threading.Event()
-        heard: asyncio.Queue[bytes | Exception] = asyncio.Queue()
+        items: asyncio.Queue[bytes | Exception] = asyncio.Queue()
 
         def deliver(item: bytes | Exception) -> None:
             with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(heard.put_nowait, item)
+                loop.call_soon_threadsafe(items.put_nowait, item)
 
         thread = threading.Thread(target=self._listen, args=(deliver, stop), name=self.name, daemon=True)
         thread.start()
         try:
-            while not isinstance(item := await heard.get(), Exception):
+            while not isinstance(item := await items.get(), Exception):
                 yield item
             raise item
         finally:
@@ -85,7 +86,7 @@ class CanProducer(LineProducer):
             await asyncio.to_thread(thread.join, CLOSE_S)
 
     def _listen(self, deliver: Deliver, stop: threading.Event) -> None:
-        """Hand on lines until the bus is lost, and then why. In the thread."""
+        """Deliver lines until the bus is lost, and then the error. Runs in the thread."""
         try:
             bus = self._open()
             try:
@@ -93,20 +94,24 @@ class CanProducer(LineProducer):
                 while not stop.is_set():
                     self._take(self._next(bus), deliver)
             finally:
-                with contextlib.suppress(Exception):  # of an adapter that is gone
+                with contextlib.suppress(Exception):  # the adapter may have been removed
                     bus.shutdown()
-        except Exception as error:  # noqa: BLE001 - it belongs to who waits for lines
+        except Exception as error:  # noqa: BLE001 - ``iter_lines`` raises it
             deliver(error)
 
     def _open(self) -> can.BusABC:
-        """Open the bus; raises SourceUnavailableError if that fails."""
+        """Open the bus.
+
+        Raises:
+            SourceUnavailableError: The bus cannot be opened.
+        """
         settings = self._settings
-        further: dict[str, Any] = {**settings.options}
+        options: dict[str, Any] = {**settings.options}
         if settings.bitrate is not None:
-            further["bitrate"] = settings.bitrate
+            options["bitrate"] = settings.bitrate
         filters = [
-            {"can_id": place.id, "can_mask": 0x1FFF_FFFF if place.extended else 0x7FF, "extended": place.extended}
-            for place in self._map.places
+            {"can_id": frame.id, "can_mask": 0x1FFF_FFFF if frame.extended else 0x7FF, "extended": frame.extended}
+            for frame in self._map.frame_ids
         ]
         try:
             return can.Bus(
@@ -114,9 +119,9 @@ class CanProducer(LineProducer):
                 channel=settings.channel,
                 can_filters=filters,
                 ignore_config=True,
-                **further,
+                **options,
             )
-        except Exception as error:  # each interface raises what its library does
+        except Exception as error:  # each interface raises the errors of its library
             raise SourceUnavailableError(f"cannot be opened: {error}") from error
 
     def _next(self, bus: can.BusABC) -> can.Message | None:
@@ -127,10 +132,10 @@ class CanProducer(LineProducer):
         """
         try:
             return bus.recv(LISTEN_S)
-        except ValueError:  # slcan: a line that is no frame
+        except ValueError:  # slcan received a line that is not a frame
             self._junk += 1
             return None
-        except Exception as error:  # as of _open
+        except Exception as error:  # each interface raises the errors of its library
             raise SourceUnavailableError(f"lost: {error}") from error
 
     def _take(self, message: can.Message | None, deliver: Deliver) -> None:
@@ -139,7 +144,7 @@ class CanProducer(LineProducer):
         self._is_off = message.is_error_frame and bool(message.arbitration_id & BUS_OFF)
         if message.is_error_frame:
             self._error_frames += 1
-        elif message.dlc != len(message.data):  # slcan: a frame that has lost characters
+        elif message.dlc != len(message.data):  # slcan received a frame with lost characters
             self._junk += 1
         elif (line := self._line(message)) is not None:
             deliver(line)
@@ -157,7 +162,7 @@ def producer(settings: Settings) -> CanProducer:
     """Make the line producer of ``[source]``.
 
     Raises:
-        UserError: As ``CanProducer``.
+        UserError: The interface is unknown, or the DBC file does not define the signals.
     """
-    assert isinstance(settings.source, CanSource)  # noqa: S101 - as KINDS has it
+    assert isinstance(settings.source, CanSource)  # noqa: S101 - KINDS maps kind = "can" to CanSource
     return CanProducer(settings.source)

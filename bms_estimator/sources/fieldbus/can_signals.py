@@ -1,4 +1,4 @@
-"""Frames of a CAN bus to readings. Does no I/O but to read the DBC file."""
+"""Decoder from frames of a CAN bus to readings. Its only I/O is reading the DBC file."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,14 +15,13 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.can_source import CanSource, Signal
 
 DECIMALS = 5
-"""Decimals of V, A and C: 5234 times 0.01 is 52.34."""
-KEPT_S = 30.0
-"""Maximum age of a value in a reading [s]: batteries send temperatures and cells every few seconds."""
-APART_PERIODS = 3.0
-"""Maximum distance between voltage and current of one reading, in periods."""
-
-SHOWN = 20
-"""Maximum number of names of a DBC file that are shown."""
+"""Number of decimals of values in V, A and degC. Rounding removes errors of binary fractions: 5234 times 0.01 is 52.34."""
+MAX_AGE_S = 30.0
+"""Maximum age of a value in a reading [s]. Batteries send temperatures and cell voltages only every few seconds."""
+MAX_DISTANCE_PERIODS = 3.0
+"""Maximum time between voltage and current of one reading, in sample periods."""
+MAX_SHOWN_NAMES = 20
+"""Maximum number of signal names of a DBC file in an error text."""
 
 
 class FrameId(NamedTuple):
@@ -36,17 +35,20 @@ class FrameId(NamedTuple):
 
 
 Key = tuple[str, int]
-"""Quantity as ``[source]`` calls it, and number of the cell from 0."""
+"""Name of the quantity in ``[source]``, and cell number from 0; 0 for other quantities."""
 
 
 class _Frame(NamedTuple):
-    """Frame with wanted signals."""
+    """Frame that contains signals of the settings."""
 
     message: Message
     signals: list[tuple[Key, Signal]]
 
     def values(self, data: bytes) -> Iterator[tuple[Key, float | None]]:
-        """Return values in V, A or C; NaN if absent, None if ``data`` is too short; none of another multiplexer value."""
+        """Yield the values of the signals [V, A, degC]. Signals of another multiplexer value are skipped.
+
+        A value is NaN if the device reports it as absent, and None if ``data`` is too short for its signal.
+        """
         decoded = _decode(self.message, data)
         is_multiplexed = bool(decoded) and self.message.is_multiplexed()
         for key, signal in self.signals:
@@ -62,9 +64,9 @@ class _Frame(NamedTuple):
 
 
 class CanMap:
-    """The newest values of a bus, and the readings that they make, the current as the bus counts it.
+    """Decoder that assembles readings from the latest values of a bus. The current has the sign of the bus.
 
-    A reading is made when voltage and current have both been updated; temperature and cells are the newest.
+    A reading is complete when voltage and current have both been updated. It contains the latest temperature and cells.
 
     Args:
         settings: Signals of the values.
@@ -75,46 +77,46 @@ class CanMap:
 
     def __init__(self, settings: CanSource) -> None:
         self._frames: dict[FrameId, _Frame] = {}
-        database = _packaged(settings.profile) if settings.dbc is None else _load(settings.dbc)
+        database = _load_profile(settings.profile) if settings.dbc is None else _load(settings.dbc)
         for key, signal in _signals(settings):
             message = _message(key[0], signal.signal, database)
             frame_id = FrameId(message.frame_id, message.is_extended_frame)
             self._frames.setdefault(frame_id, _Frame(message, [])).signals.append((key, signal))
         self._cells = sum(cells.count for cells in settings.cells)
-        self._apart_s = min(APART_PERIODS * settings.interval_s, KEPT_S)
-        self._newest: dict[Key, tuple[float, float]] = {}  # arrival [s], value
+        self._max_distance_s = min(MAX_DISTANCE_PERIODS * settings.interval_s, MAX_AGE_S)
+        self._newest: dict[Key, tuple[float, float]] = {}  # arrival time [s] and value
         self._fresh: set[str] = set()
         self._short = self._absent = 0
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Since start: frames that are too short for a signal, values that are not measured."""
+        """Number of frames that are too short for a signal, and of values that the device does not measure, since start."""
         return {"short_frames": self._short, "not_measured": self._absent}
 
     @property
-    def places(self) -> Sequence[FrameId]:
-        """The frames that are looked at."""
+    def frame_ids(self) -> Sequence[FrameId]:
+        """Identifiers of the decoded frames."""
         return tuple(self._frames)
 
     @property
     def missing(self) -> str | None:
-        """Signals that are missing for a first reading, as text; None if none is."""
-        waited = {
-            quantity: str(place)
-            for place, frame in self._frames.items()
+        """Signals that are missing for the next reading, as text; None if none is missing."""
+        missing = {
+            quantity: str(frame_id)
+            for frame_id, frame in self._frames.items()
             for (quantity, _), _ in frame.signals
             if quantity in ("voltage", "current") and quantity not in self._fresh
         }
-        return ", ".join(f"source.{quantity} (frame {place})" for quantity, place in waited.items()) or None
+        return ", ".join(f"source.{quantity} (frame {frame_id})" for quantity, frame_id in missing.items()) or None
 
     def feed(self, arrival_s: float, identifier: int, extended: bool, data: bytes) -> Reading | None:
-        """Take a frame. Returns the reading that is whole with it.
+        """Decode a frame. Return the reading that it completes, if any.
 
         Args:
-            arrival_s: On any clock that never steps back [s].
+            arrival_s: Arrival time, on any clock that never steps back [s].
             identifier: Identifier of the frame.
-            extended: Whether it has 29 bits.
-            data: What the frame holds.
+            extended: True for an identifier of 29 bits.
+            data: Content of the frame.
         """
         frame = self._frames.get(FrameId(identifier, extended))
         if frame is None:
@@ -136,20 +138,20 @@ class CanMap:
     def _reading(self, now_s: float) -> Reading:
         cells_v = tuple(self._get("cells", now_s, number) for number in range(self._cells))
         return Reading(
-            self._get("voltage", now_s, kept_s=self._apart_s),
-            self._get("current", now_s, kept_s=self._apart_s),
+            self._get("voltage", now_s, max_age_s=self._max_distance_s),
+            self._get("current", now_s, max_age_s=self._max_distance_s),
             self._get("temperature", now_s),
             () if all(map(math.isnan, cells_v)) else cells_v,
         )
 
-    def _get(self, quantity: str, now_s: float, number: int = 0, kept_s: float = KEPT_S) -> float:
+    def _get(self, quantity: str, now_s: float, number: int = 0, max_age_s: float = MAX_AGE_S) -> float:
         """Return the newest value; NaN if it is missing or too old."""
-        came_s, value = self._newest.get((quantity, number), (-math.inf, math.nan))
-        return value if now_s - came_s <= kept_s else math.nan
+        arrival_s, value = self._newest.get((quantity, number), (-math.inf, math.nan))
+        return value if now_s - arrival_s <= max_age_s else math.nan
 
 
 def _signals(settings: CanSource) -> Iterator[tuple[Key, Signal]]:
-    """All signals of the settings."""
+    """Yield all signals of the settings."""
     yield ("voltage", 0), settings.voltage
     yield ("current", 0), settings.current
     if settings.temperature is not None:
@@ -158,7 +160,7 @@ def _signals(settings: CanSource) -> Iterator[tuple[Key, Signal]]:
     yield from ((("cells", number), signal) for number, signal in enumerate(members))
 
 
-def _packaged(profile: str | None) -> Database:
+def _load_profile(profile: str | None) -> Database:
     """Load the DBC file of a profile."""
     database = Database()
     database.add_dbc_string((resources.files("bms_estimator.sources.fieldbus") / f"{profile}.dbc").read_text())
@@ -166,10 +168,10 @@ def _packaged(profile: str | None) -> Database:
 
 
 def _load(path: Path) -> Database:
-    """Load the file that defines the signals.
+    """Load the DBC file of the settings.
 
     Raises:
-        UserError: It cannot be read.
+        UserError: The file cannot be read, or defines no frames.
     """
     try:
         loaded = cantools.database.load_file(path)
@@ -186,13 +188,13 @@ def _message(quantity: str, signal: str, database: Database) -> Message:
     """Return the message that contains a signal.
 
     Raises:
-        UserError: None does, or several do.
+        UserError: No message contains the signal, or several do.
     """
-    *of_message, name = signal.split(".")
+    *message_name, name = signal.split(".")
     found = [
         message
         for message in database.messages
-        if (not of_message or message.name == of_message[0]) and name in (s.name for s in message.signals)
+        if (not message_name or message.name == message_name[0]) and name in (s.name for s in message.signals)
     ]
     if len(found) == 1:
         return found[0]
@@ -200,13 +202,15 @@ def _message(quantity: str, signal: str, database: Database) -> Message:
         reason = f"several messages have it: write {' or '.join(f'{message.name}.{name}' for message in found)}"
     else:
         known = sorted(s.name for message in database.messages for s in message.signals)
-        shown = ", ".join(known[:SHOWN]) + (f" and {len(known) - SHOWN} more" if len(known) > SHOWN else "")
+        shown = ", ".join(known[:MAX_SHOWN_NAMES]) + (
+            f" and {len(known) - MAX_SHOWN_NAMES} more" if len(known) > MAX_SHOWN_NAMES else ""
+        )
         reason = f"the DBC file has no such signal; it has {shown or 'none'}"
     raise UserError(f"source.{quantity}: signal = {signal!r}: {reason}")
 
 
 def _decode(message: Message, data: bytes) -> Mapping[str, float]:
-    """Return values by name, in the DBC file's units, as far as the frame is long enough and its multiplexer selects them."""
+    """Return the values by name in the units of the DBC file. Signals beyond a short frame are omitted."""
     try:
         values = message.decode(data, decode_choices=False, allow_truncated=True)
     except (DecodeError, ValueError, KeyError):

@@ -166,7 +166,12 @@ class ModbusProducer(LineProducer):
             log.warning("quantity omitted", source=self.name, failure=request.described, reason=str(error))
 
     async def _request(self, client: Client, request: Request) -> Sequence[int]:
-        """Send a request; raises SourceUnavailableError without a response, _RefusedError for an exception response."""
+        """Send a request, and return the register contents.
+
+        Raises:
+            SourceUnavailableError: The device does not respond, or responds with another number of registers.
+            _ExceptionResponseError: The device responds with an exception.
+        """
         read = client.read_input_registers if request.table == "input" else client.read_holding_registers
         try:
             answer = await read(request.address, count=request.words, device_id=self._settings.unit)
@@ -208,5 +213,5 @@ def _client(settings: ModbusSource) -> Client:
 
 def producer(settings: Settings) -> ModbusProducer:
     """Make the line producer of ``[source]``."""
-    assert isinstance(settings.source, ModbusSource)  # noqa: S101 - as KINDS has it
+    assert isinstance(settings.source, ModbusSource)  # noqa: S101 - KINDS maps "modbus" to ModbusSource
     return ModbusProducer(settings.source)

@@ -11,7 +11,8 @@ from bms_estimator.settings.modbus_source import MAX_WORDS, ModbusSource, Regist
 GAP_WORDS = 8
 """Maximum gap of unused registers in one request. One request reads the values on both sides at the same moment."""
 DECIMALS = 5
-"""Decimals of rounded values: finer than any register. Rounding makes 259 * 0.01 exactly 2.59."""
+"""Number of decimals of values, more than any register resolves. Rounding makes 259 * 0.01 exactly 2.59."""
+
 Table = Literal["holding", "input"]
 Words = Mapping[tuple[Table, int], int]
 """Contents of the registers by table and address."""
@@ -28,7 +29,7 @@ class Value(NamedTuple):
 
     @property
     def needed(self) -> bool:
-        """True if there is no reading without it."""
+        """True if a reading needs this value."""
         return self.quantity in ("voltage", "current")
 
 
@@ -43,7 +44,7 @@ class Request(NamedTuple):
 
     @property
     def described(self) -> str:
-        """Describe the request: ``source.voltage, source.current (holding registers 259 to 261)``."""
+        """Description as text, e.g. ``source.voltage, source.current (holding registers 259 to 261)``."""
         quantities = ", ".join(dict.fromkeys(f"source.{value.quantity}" for value in self.values))
         last = f" to {self.address + self.words - 1}" if self.words > 1 else ""
         return f"{quantities} ({self.table} register{'s' if last else ''} {self.address}{last})"
@@ -88,7 +89,7 @@ def split(request: Request) -> tuple[Request, ...]:
 
 
 def decode(register: Register, words: Words) -> float:
-    """Return the value in V, A or C; NaN if it was not read, is ``absent``, or is itself NaN."""
+    """Return the value of a register [V, A or degC]; NaN if it was not read, is ``absent``, or is itself NaN."""
     addresses = range(register.address, register.address + register.words)
     if any((register.table, address) not in words for address in addresses):
         return math.nan

@@ -97,9 +97,8 @@ class LinuxSensor(LineProducer):
         try:
             await self._wait(future)
         except SourceUnavailableError:
-            future.add_done_callback(
-                lambda late: late.exception()
-            )  # retrieved, because no caller waits for it any more
+            # asyncio logs an exception that is never retrieved, and no caller waits for this call any more
+            future.add_done_callback(lambda late: late.exception())
             self._hung_call = future
             raise
         return future.result()
@@ -204,7 +203,7 @@ class LinuxSensor(LineProducer):
 
 def producer(settings: Settings) -> LinuxSensor:
     """Make the line producer of ``[source]``."""
-    assert isinstance(settings.source, LinuxSource)  # noqa: S101 - as KINDS has it
+    assert isinstance(settings.source, LinuxSource)  # noqa: S101 - KINDS maps kind = "linux" to LinuxSource
     return LinuxSensor(settings.source)
 
 

@@ -115,7 +115,9 @@ class MqttProducer(LineProducer):
                 await asyncio.wait({receiving}, timeout=self._wait_s(now_s, poll_sent_s))
                 if receiving.done():
                     message, receiving = receiving.result(), None
-                    self._assembler.take(message.topic, message.payload, self._monotonic(), retained=message.retain)
+                    self._assembler.add_message(
+                        message.topic, message.payload, self._monotonic(), retained=message.retain
+                    )
                     self._log_conflict()
                 if line := self._assembler.line(self._monotonic()):
                     yield line

@@ -67,7 +67,7 @@ class PublisherConflict:
         self._messages: deque[_Message] = deque(maxlen=MAX_MESSAGES)
         self._levels: tuple[float, float] | None = None  # before and after the last jump
 
-    def take(self, value: float, now_s: float) -> bool:
+    def add(self, value: float, now_s: float) -> bool:
         """Add a value; return True if there are two publishers.
 
         Args:

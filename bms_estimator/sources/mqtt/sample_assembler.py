@@ -1,4 +1,4 @@
-"""Assembly of samples from values that arrive on several topics at different times. No I/O; time is an argument."""
+"""Assembler of samples from values that arrive on several topics at different times. It does no I/O."""
 
 import math
 import re
@@ -21,7 +21,7 @@ NEEDED = ("voltage", "current")
 
 
 class _TopicBinding(NamedTuple):
-    """A topic of a quantity."""
+    """Topic that carries a quantity."""
 
     quantity: str
     location: ValueLocation
@@ -65,7 +65,7 @@ class SampleAssembler:
             for binding in self._bindings
             if binding.quantity in NEEDED
         }
-        self._conflicts: dict[tuple[str, str], str] = {}  # by quantity and topic
+        self._conflicts: dict[tuple[str, str], str] = {}  # topic and values of each conflict, by quantity and topic
 
     @property
     def topics(self) -> list[str]:
@@ -107,10 +107,10 @@ class SampleAssembler:
         return f"{absent[0]}: no message on {', '.join(self._find_topics(absent[0]))}" if absent else None
 
     def wait_s(self, now_s: float) -> float | None:
-        """Return the time until a sample is complete without a further message [s]; None if one is needed."""
+        """Return the time until a sample is complete without a further message [s]; None if a message is needed."""
         return max(min(self._unused.values()) + self._settings.settle_s - now_s, 0.0) if self._unused else None
 
-    def take(self, topic: str, payload: bytes, now_s: float, *, retained: bool) -> None:
+    def add_message(self, topic: str, payload: bytes, now_s: float, *, retained: bool) -> None:
         """Store the values of a message.
 
         Args:
@@ -191,7 +191,7 @@ class SampleAssembler:
         """Return True if two publishers write to this topic, by its latest value."""
         key = binding.quantity, binding.topic
         detector = self._detectors.get(key)
-        if detector is None or not detector.take(self._values[binding.quantity].value, now_s):
+        if detector is None or not detector.add(self._values[binding.quantity].value, now_s):
             self._conflicts.pop(key, None)
             return False
         self._conflicts[key] = f"{binding.topic}: {binding.quantity} {detector.text}"

@@ -28,10 +28,11 @@ QUERY_INTERVAL_S = 0.3
 READ_TIMEOUT_S = 0.1
 """Timeout of a read [s]."""
 READ_BYTES = 4096
+"""Maximum size of a read [bytes]."""
 REFERENCE_RATE_HZ = 100
 """Default sample rate of the firmware [Hz]. It measures the bandgap in every second sample, without an NTC in each."""
 REFERENCE_SAMPLES = 300
-"""Number of samples for the mean of the bandgap, whose noise is then 0.03 %."""
+"""Number of samples for the mean of the bandgap. Its noise is then 0.03 %."""
 REFERENCE_TIMEOUT_S = 10.0
 """Timeout of the bandgap measurement [s]."""
 

@@ -23,8 +23,8 @@ log = structlog.get_logger(__name__)
 class KnownBoardFile:
     """File ``<pack.name>.board.json`` in the state folder, readable by its owner only.
 
-    It is separate from the checkpoint, because a checkpoint is discarded when the cell changes, and the board stays the
-    same. A person may read and delete it.
+    The file is separate from the checkpoint, because a checkpoint is discarded when the cell changes, but the board is not.
+    A person may read and delete the file.
 
     Args:
         folder: The state folder.

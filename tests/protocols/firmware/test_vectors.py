@@ -97,6 +97,6 @@ def test_decoder_accepts_every_message(vector: Vector) -> None:
     if vector["message"] == "hello":
         assert decoder.hello == make_message(vector)
     if vector["message"] == "ack":
-        assert decoder.take_acks() == [make_message(vector)]
+        assert decoder.pop_acks() == [make_message(vector)]
     counters = decoder.counters
     assert counters.crc_errors + counters.cobs_errors + counters.length_errors + counters.type_errors == 0

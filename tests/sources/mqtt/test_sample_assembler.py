@@ -35,7 +35,7 @@ def feed(
     """Feed messages that arrive together. Return the samples, including the one that is complete 0.5 s later."""
     lines = []
     for topic, payload in messages:
-        assembly.take(topic, payload.encode(), at_s, retained=retained)
+        assembly.add_message(topic, payload.encode(), at_s, retained=retained)
         lines.append(assembly.line(at_s))
     lines.append(assembly.line(at_s + 0.5))
     return [json.loads(line) for line in lines if line]
@@ -207,7 +207,7 @@ def test_paths_units_scales_and_times(settings: dict[str, Any], payload: str, sa
 def test_pack_with_the_maximum_number_of_cells_is_decoded() -> None:
     assembly, decoder = SampleAssembler(json_source(cells="c")), TextProtocol()
     payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELL_NUMBER})
-    assembly.take("home/pack", payload.encode(), 0.0, retained=False)
+    assembly.add_message("home/pack", payload.encode(), 0.0, retained=False)
     assert decoder.feed(0.0, assembly.line(0.0)).size == 1
     assert decoder.cells.shape == (1, MAX_CELL_NUMBER)
 
@@ -217,7 +217,7 @@ def test_unchanged_topic_keeps_its_value_up_to_the_maximum_age() -> None:
     assert feed(assembly, [("v", "52")]) == []
     assert assembly.fault == "current: no message on i"
     assert feed(assembly, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
-    assembly.take("i", b"2", 20.0, retained=False)
+    assembly.add_message("i", b"2", 20.0, retained=False)
     assert assembly.line(20.4) == b""
     assert assembly.wait_s(20.4) == pytest.approx(0.1)
     assert json.loads(assembly.line(20.5)) == {"voltage_v": 51.0, "current_a": 2.0}
@@ -279,7 +279,7 @@ def test_invalid_payload_is_counted_and_reported(payload: str, kind: str, reason
 def test_no_payload_raises(payload: bytes) -> None:
     settings = json_source(cells="c.{cell}", temperature={"path": "0.1"}, time={"path": "t", "unit": "iso"})
     assembly = SampleAssembler(settings)
-    assembly.take("home/pack", payload, 0.0, retained=False)
+    assembly.add_message("home/pack", payload, 0.0, retained=False)
     assembly.line(1.0)
     for name, place in settings.places():
         for read in (read_value, read_cells):
@@ -350,7 +350,7 @@ def _conflict_times(messages: list[tuple[float, float]]) -> tuple[SampleAssemble
     assembly, times_s = SampleAssembler(json_source()), list[float]()
     for at_s, current_a in messages:
         before = assembly.counters["publisher_errors"]
-        assembly.take("home/pack", json.dumps({"u": 52.0, "i": current_a}).encode(), at_s, retained=False)
+        assembly.add_message("home/pack", json.dumps({"u": 52.0, "i": current_a}).encode(), at_s, retained=False)
         times_s += [at_s] * (assembly.counters["publisher_errors"] - before)
     return assembly, times_s
 
