@@ -73,10 +73,10 @@ async def tab(browser: Browser, url: str, *, size: dict[str, int] = DESKTOP, **o
     context = await browser.new_context(viewport=size, **options)  # type: ignore[arg-type]
     context.set_default_timeout(1e3 * LONG_S)
     page = await context.new_page()
-    opened = Tab(page)
-    page.on("console", lambda message: opened.errors.append(message.text) if message.type == "error" else None)
-    page.on("pageerror", lambda error: opened.errors.append(str(error)))
-    page.on("request", lambda request: opened.requests.append(request.url))
+    page_tab = Tab(page)
+    page.on("console", lambda message: page_tab.errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: page_tab.errors.append(str(error)))
+    page.on("request", lambda request: page_tab.requests.append(request.url))
     await page.goto(url)
-    yield opened
+    yield page_tab
     await context.close()

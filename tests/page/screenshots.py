@@ -70,44 +70,46 @@ def _current_a(time_s: float) -> float:
     return 0.9 + 0.3 * math.sin(time_s / 700.0) - 4.0 * max(0.0, 1.0 - ((hour - 12.5) / 4.0) ** 2)
 
 
-async def shoot(opened: Tab, name: str, part: str = "", *, top: bool = False) -> None:
+async def shoot(page_tab: Tab, name: str, part: str = "", *, top: bool = False) -> None:
     path = DOCS / f"page-{name}.png"
     if part:
-        await opened.page.locator(part).screenshot(path=path)
+        await page_tab.page.locator(part).screenshot(path=path)
     else:
-        await opened.page.screenshot(path=path, clip={"x": 0, "y": 0, "width": 1280, "height": TOP_PX} if top else None)
+        await page_tab.page.screenshot(
+            path=path, clip={"x": 0, "y": 0, "width": 1280, "height": TOP_PX} if top else None
+        )
     sys.stdout.write(f"{path.relative_to(DOCS.parents[1])}: {path.stat().st_size / 1e3:.0f} kB\n")
 
 
 @contextlib.asynccontextmanager
 async def open_page(browser: Browser, service: Service, **options: Any) -> AsyncIterator[Tab]:
     """Open the page and wait until its curves are drawn."""
-    async with tab(browser, service.url, **options) as opened:
-        await opened.until_status("live")
-        await opened.until("() => document.querySelectorAll('.curve [aria-label]').length >= 4")
-        yield opened
+    async with tab(browser, service.url, **options) as page_tab:
+        await page_tab.until_status("live")
+        await page_tab.until("() => document.querySelectorAll('.curve [aria-label]').length >= 4")
+        yield page_tab
 
 
 async def shoot_all(service: Service, browser: Browser) -> None:
-    async with open_page(browser, service) as opened:
+    async with open_page(browser, service) as page_tab:
         await asyncio.sleep(LEARN_S)
-        await shoot(opened, "desktop")
-        await shoot(opened, "cells", ".cells")
-        await opened.page.get_by_text("Day", exact=True).click()
-        await opened.page.get_by_role("img", name="Voltage, last day: from").wait_for()
-        await shoot(opened, "day", ".curves")
-    async with open_page(browser, service, size=PHONE, device_scale_factor=1.5) as opened:
-        await shoot(opened, "phone")
-    async with open_page(browser, service, color_scheme="dark") as opened:
-        await shoot(opened, "dark")
+        await shoot(page_tab, "desktop")
+        await shoot(page_tab, "cells", ".cells")
+        await page_tab.page.get_by_text("Day", exact=True).click()
+        await page_tab.page.get_by_role("img", name="Voltage, last day: from").wait_for()
+        await shoot(page_tab, "day", ".curves")
+    async with open_page(browser, service, size=PHONE, device_scale_factor=1.5) as page_tab:
+        await shoot(page_tab, "phone")
+    async with open_page(browser, service, color_scheme="dark") as page_tab:
+        await shoot(page_tab, "dark")
         await service.kill()
-        await opened.until_status("stale since")
-        await shoot(opened, "stale", top=True)
+        await page_tab.until_status("stale since")
+        await shoot(page_tab, "stale", top=True)
     await service.start(ALARMS)
-    async with open_page(browser, service) as opened:
-        await opened.page.locator(".alarm").nth(1).wait_for()
+    async with open_page(browser, service) as page_tab:
+        await page_tab.page.locator(".alarm").nth(1).wait_for()
         await asyncio.sleep(LEARN_S / 2)
-        await shoot(opened, "alarm", top=True)
+        await shoot(page_tab, "alarm", top=True)
 
 
 async def main() -> None:

@@ -154,9 +154,9 @@ async def publish_state(live: Listener, **values: Any) -> dict[str, Any]:
 
 @contextlib.asynccontextmanager
 async def dashboard_of(browser: Browser, house: House, pack: str, **options: Any) -> AsyncIterator[Tab]:
-    async with tab(browser, f"{house.dashboard}#{pack}", **options) as opened:
-        await opened.until("name => document.getElementById('name').textContent === name", pack)
-        yield opened
+    async with tab(browser, f"{house.dashboard}#{pack}", **options) as page_tab:
+        await page_tab.until("name => document.getElementById('name').textContent === name", pack)
+        yield page_tab
 
 
 def format_time(time: str) -> str:
@@ -165,37 +165,37 @@ def format_time(time: str) -> str:
 
 
 async def test_page_shows_the_published_values_with_units(browser: Browser, house: House) -> None:
-    async with dashboard_of(browser, house, "cellar") as opened:
+    async with dashboard_of(browser, house, "cellar") as page_tab:
         await publish_state(house.live, **STATE_VALUES)
-        await opened.until_text("soc", SHOWN_TEXTS["soc"])
-        assert {name: await opened.text(name) for name in SHOWN_TEXTS} == SHOWN_TEXTS
-        meter = opened.page.get_by_role("meter", name="State of charge")
+        await page_tab.until_text("soc", SHOWN_TEXTS["soc"])
+        assert {name: await page_tab.text(name) for name in SHOWN_TEXTS} == SHOWN_TEXTS
+        meter = page_tab.page.get_by_role("meter", name="State of charge")
         assert await meter.get_attribute("aria-valuenow") == "43"
-        cell = opened.page.get_by_role("img", name="cell 4: 3.269 V, lowest")
+        cell = page_tab.page.get_by_role("img", name="cell 4: 3.269 V, lowest")
         assert await cell.is_visible()
-        assert await opened.page.get_by_role("img", name="cell 3: not measured").count() == 1
-        assert await opened.page.title() == "43 % · cellar"
-        await opened.until_status("live")
-        assert opened.errors == []
+        assert await page_tab.page.get_by_role("img", name="cell 3: not measured").count() == 1
+        assert await page_tab.page.title() == "43 % · cellar"
+        await page_tab.until_status("live")
+        assert page_tab.errors == []
 
 
 async def test_unknown_values_are_hidden(browser: Browser, house: House) -> None:
-    async with dashboard_of(browser, house, "cellar") as opened:
+    async with dashboard_of(browser, house, "cellar") as page_tab:
         state = await publish_state(house.live, soc_std=None, temperature_c=None, innovation_v=None, voltage_v=3.21)
-        await opened.until_text("voltage_v", "3.210 V")
+        await page_tab.until_text("voltage_v", "3.210 V")
         for name in ("soc_std", "temperature_c", "innovation_v", "time_left", "celllow"):
-            assert await opened.text(name) == "", name
+            assert await page_tab.text(name) == "", name
         assert STACK.estimate
         await publish_state(house.live, **STACK.estimate.model_dump(exclude={"time"}))
-        await opened.until_text("voltage_v", "13.00 V")
-        assert not await opened.page.locator(".hero").is_visible()  # a fuel cell has no state of charge
+        await page_tab.until_text("voltage_v", "13.00 V")
+        assert not await page_tab.page.locator(".hero").is_visible()  # a fuel cell has no state of charge
         for key in set(state) - {"time", "voltage_v"}:
             state.pop(key)
         await publish_state(house.live, **dict.fromkeys(STATE_VALUES))
-        await opened.until_text("voltage_v", "")
-        body = await opened.page.inner_text("body")
+        await page_tab.until_text("voltage_v", "")
+        body = await page_tab.page.inner_text("body")
         assert not re.search("NaN|undefined|null|Infinity", body)
-        assert opened.errors == []
+        assert page_tab.errors == []
 
 
 async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_nothing_from_elsewhere(
@@ -203,28 +203,28 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
 ) -> None:
     parameters = await house.live.wait_json("bms/attic/parameters")
     async with tab(browser, house.service.url) as own, dashboard_of(browser, house, "attic") as other:
-        for opened in (own, other):
-            await opened.until_text("voltage_v", f"{sum(CELLS):.2f} V")
-            assert await opened.text("current_a") == "2.500 A"
-            assert await opened.text("power_w") == f"{2.5 * sum(CELLS):.1f} W"
-            assert await opened.text("temperature_c") == "21.5 °C"
-            assert await opened.text("way") == "discharging"
+        for page_tab in (own, other):
+            await page_tab.until_text("voltage_v", f"{sum(CELLS):.2f} V")
+            assert await page_tab.text("current_a") == "2.500 A"
+            assert await page_tab.text("power_w") == f"{2.5 * sum(CELLS):.1f} W"
+            assert await page_tab.text("temperature_c") == "21.5 °C"
+            assert await page_tab.text("way") == "discharging"
             for name, published, factor in (("soc", "soc", 100.0), ("soc_std", "soc_std", 200.0)):
-                text = await opened.text(name)
+                text = await page_tab.text(name)
                 await house.live.wait_json("bms/attic/state", lambda s: f"{factor * s[published]:.1f}" == text)  # noqa: B023
-            assert re.fullmatch(r"\d+ h \d\d min", await opened.text("time_left"))
-            assert await opened.text("celllow") == "3.311 V · cell 1"
-            assert "in series" in await opened.page.inner_text("#what")
-            await opened.until(
+            assert re.fullmatch(r"\d+ h \d\d min", await page_tab.text("time_left"))
+            assert await page_tab.text("celllow") == "3.311 V · cell 1"
+            assert "in series" in await page_tab.page.inner_text("#what")
+            await page_tab.until(
                 "count => document.querySelectorAll('#params tr').length === count", count_parameters(parameters)
             )
-            row = opened.page.locator('[data-p="a a1"]')
+            row = page_tab.page.locator('[data-p="a a1"]')
             text = (await row.locator("td").nth(0).inner_text()).replace(MINUS, "-")
             await house.live.wait_json("bms/attic/parameters", lambda p: format_parameter(p["a"]["a1"]) == text)  # noqa: B023
-            await opened.until_status("live")
-            assert opened.errors == []
-            origin = "/".join(opened.page.url.split("/")[:3])
-            assert all(url.startswith(origin) for url in opened.requests), opened.requests
+            await page_tab.until_status("live")
+            assert page_tab.errors == []
+            origin = "/".join(page_tab.page.url.split("/")[:3])
+            assert all(url.startswith(origin) for url in page_tab.requests), page_tab.requests
         assert await own.page.get_by_role("tab").count() == 0
         assert await other.page.get_by_role("tab").count() == 2
 
@@ -242,17 +242,17 @@ def count_parameters(parameters: dict[str, Any]) -> int:
 
 
 async def test_pack_is_selected_by_keyboard(browser: Browser, house: House) -> None:
-    async with dashboard_of(browser, house, "attic") as opened:
-        page = opened.page
+    async with dashboard_of(browser, house, "attic") as page_tab:
+        page = page_tab.page
         await page.keyboard.press("Tab")
         assert await page.evaluate("document.activeElement.textContent") == "attic"
         await page.keyboard.press("ArrowRight")
-        await opened.until("() => document.getElementById('name').textContent === 'cellar'")
+        await page_tab.until("() => document.getElementById('name').textContent === 'cellar'")
         selected = page.get_by_role("tab", selected=True)
         assert await selected.inner_text() == "cellar"
         assert page.url.endswith("#cellar")
         await page.keyboard.press("Home")
-        await opened.until("() => document.getElementById('name').textContent === 'attic'")
+        await page_tab.until("() => document.getElementById('name').textContent === 'attic'")
         await page.keyboard.press("Tab")
         await page.keyboard.press("ArrowRight")
         assert await page.get_by_role("radio", name="Hour").is_checked()
@@ -273,9 +273,9 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
         unit="V",
         text="cell 3 has 2.412 V: stop discharging",
     )
-    async with dashboard_of(browser, house, "cellar") as opened:
+    async with dashboard_of(browser, house, "cellar") as page_tab:
         await publish(house.live, "alarm/cell_under_voltage", alarm.model_dump_json())
-        element = opened.page.get_by_role("alert").locator(".alarm")
+        element = page_tab.page.get_by_role("alert").locator(".alarm")
         await element.wait_for()
         text = await element.inner_text()
         for part in (
@@ -297,7 +297,7 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
         assert "cell voltages are missing" in text
         assert "cannot be watched" in text
         await publish(house.live, "alarm/cell_under_voltage", b"")
-        assert opened.errors == []
+        assert page_tab.errors == []
 
 
 async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(browser: Browser, house: House) -> None:
@@ -313,18 +313,18 @@ async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(bro
         await house.live.publish("bms/shed/state", json.dumps(state), qos=1)
 
     await put(*states[0])
-    async with dashboard_of(browser, house, "shed") as opened:
+    async with dashboard_of(browser, house, "shed") as page_tab:
         for voltage_v, time in states:
             await put(voltage_v, time)
-            await opened.until_text("voltage_v", f"{voltage_v:.2f} V")
-        await opened.until(
+            await page_tab.until_text("voltage_v", f"{voltage_v:.2f} V")
+        await page_tab.until(
             "() => [...document.querySelectorAll('.curve [role=img]')].some((e) => e.ariaLabel?.endsWith('last 52.000 V'))"
         )
         await house.live.publish("bms/shed/state", b"", qos=1)
-        await opened.until(
+        await page_tab.until(
             "() => ![...document.querySelectorAll('#packs button')].some((t) => t.textContent === 'shed')"
         )
-        assert opened.errors == []
+        assert page_tab.errors == []
 
 
 async def test_pack_with_an_alarm_is_listed_first_among_too_many_packs(
@@ -346,61 +346,63 @@ async def test_pack_with_an_alarm_is_listed_first_among_too_many_packs(
     async with (
         Listener(broker) as live,
         dashboard(settings, PageSettings(listen="127.0.0.1:0"), folder) as url,
-        tab(browser, url) as opened,
+        tab(browser, url) as page_tab,
     ):
         for number in range(100):
             await live.publish(f"crowd/a{number:03}/availability", b"online", qos=1, retain=True)
-        await opened.until("() => document.getElementById('hidden').textContent === '36 more devices not shown'")
+        await page_tab.until("() => document.getElementById('hidden').textContent === '36 more devices not shown'")
         await live.publish("crowd/zz/alarm/over_temperature", alarm.model_dump_json(), qos=1, retain=True)
-        await opened.until("() => document.querySelector('#packs button').textContent === 'zz'")
-        await opened.until("() => document.getElementById('hidden').textContent === '37 more devices not shown'")
-        assert await opened.page.get_by_role("tab").count() == MAX_DEVICES
-        first = opened.page.get_by_role("tab").first
+        await page_tab.until("() => document.querySelector('#packs button').textContent === 'zz'")
+        await page_tab.until("() => document.getElementById('hidden').textContent === '37 more devices not shown'")
+        assert await page_tab.page.get_by_role("tab").count() == MAX_DEVICES
+        first = page_tab.page.get_by_role("tab").first
         await first.click()
-        await opened.until("() => document.getElementById('alarms').textContent.includes('70 °C')")
+        await page_tab.until("() => document.getElementById('alarms').textContent.includes('70 °C')")
         assert "raised" in str(await first.get_attribute("class"))
         await live.publish("crowd/zz/alarm/over_temperature", b"", qos=1, retain=True)
-        await opened.until("() => ![...document.querySelectorAll('#packs button')].some((t) => t.textContent === 'zz')")
-        assert opened.errors == []
+        await page_tab.until(
+            "() => ![...document.querySelectorAll('#packs button')].some((t) => t.textContent === 'zz')"
+        )
+        assert page_tab.errors == []
 
 
 async def test_history_is_drawn_for_each_span(browser: Browser, house: House, folder: Path) -> None:
     now_s = datetime.now(UTC).timestamp()
     begin_s = datetime.fromisoformat(at(0.0).estimate.time).timestamp()
     await record(folder / "cellar.sqlite", [at(now_s - begin_s - 30.0 * s, 3.0, 3.9) for s in range(100, 0, -1)])
-    async with dashboard_of(browser, house, "cellar") as opened:
+    async with dashboard_of(browser, house, "cellar") as page_tab:
         for span in ("Hour", "Day", "Month"):
-            await opened.page.get_by_text(span, exact=True).click()
-            chart = opened.page.get_by_role("img", name=f"Voltage, last {span.lower()}: from 3.900 to 3.900 V")
+            await page_tab.page.get_by_text(span, exact=True).click()
+            chart = page_tab.page.get_by_role("img", name=f"Voltage, last {span.lower()}: from 3.900 to 3.900 V")
             await chart.wait_for()
             assert await chart.locator("canvas").is_visible()
-        assert opened.errors == []
+        assert page_tab.errors == []
 
 
 async def test_missing_history_is_reported(browser: Browser, house: House) -> None:
     await house.live.publish("bms/guest/availability", b"online", qos=1)
-    async with dashboard_of(browser, house, "guest") as opened:
-        await opened.page.get_by_text("Day", exact=True).click()
-        await opened.page.get_by_text("No history is kept here").wait_for()
+    async with dashboard_of(browser, house, "guest") as page_tab:
+        await page_tab.page.get_by_text("Day", exact=True).click()
+        await page_tab.page.get_by_text("No history is kept here").wait_for()
 
 
 async def test_page_is_stale_while_the_sensor_or_the_service_is_offline(browser: Browser, house: House) -> None:
-    async with dashboard_of(browser, house, "cellar") as opened:
+    async with dashboard_of(browser, house, "cellar") as page_tab:
         state = await publish_state(house.live)
-        await opened.until_status("live")
+        await page_tab.until_status("live")
         offline = ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "the board is silent"})
         await publish(house.live, "health", offline.model_dump_json())
         await publish(house.live, "sensor/availability", b"offline")
-        await opened.until_status(f"stale since {format_time(state['time'])}")
-        assert "the board is silent" in await opened.page.inner_text("#why")
+        await page_tab.until_status(f"stale since {format_time(state['time'])}")
+        assert "the board is silent" in await page_tab.page.inner_text("#why")
         await publish(house.live, "sensor/availability", b"online")
         await publish(house.live, "health", ONE.health.model_dump_json())
-        await opened.until_status("live")
+        await page_tab.until_status("live")
         await publish(house.live, "availability", b"offline")
-        await opened.until_status("stale since")
-        assert await opened.page.inner_text("#why") == "the service is offline"
+        await page_tab.until_status("stale since")
+        assert await page_tab.page.inner_text("#why") == "the service is offline"
         await publish(house.live, "availability", b"online")
-        await opened.until_status("live")
+        await page_tab.until_status("live")
 
 
 async def test_page_is_stale_after_a_kill_of_the_service_and_live_after_its_restart(
@@ -425,33 +427,33 @@ async def test_page_is_stale_after_a_kill_of_the_service_and_live_after_its_rest
 async def test_page_is_stale_from_the_loss_of_the_broker_until_new_values_arrive(
     browser: Browser, house: House
 ) -> None:
-    async with dashboard_of(browser, house, "attic") as opened:
-        await opened.until_status("live")
+    async with dashboard_of(browser, house, "attic") as page_tab:
+        await page_tab.until_status("live")
         house.broker.stop()
-        await opened.until_status("stale since")
-        assert await opened.page.inner_text("#why")
+        await page_tab.until_status("stale since")
+        assert await page_tab.page.inner_text("#why")
         house.broker.start()
-        await opened.until_status("live")
+        await page_tab.until_status("live")
 
 
 async def test_page_for_other_machines_requires_the_token(browser: Browser, folder: Path, broker: Broker) -> None:
     token = folder / "token"
     token.write_text("0123456789abcdef")
     settings = PageSettings(listen=f"0.0.0.0:{free_port()}", token_file=token)
-    async with dashboard(MqttSettings(url=broker.url), settings, folder) as url, tab(browser, url) as opened:
-        assert await opened.page.locator("#pack").count() == 0
-        await opened.page.get_by_label("Token").fill("0123456789abcdef")
-        await opened.page.keyboard.press("Enter")
-        await opened.page.locator("#pack").wait_for()
-        assert "token" not in opened.page.url
-        await opened.page.reload()
-        await opened.page.locator("#pack").wait_for()
+    async with dashboard(MqttSettings(url=broker.url), settings, folder) as url, tab(browser, url) as page_tab:
+        assert await page_tab.page.locator("#pack").count() == 0
+        await page_tab.page.get_by_label("Token").fill("0123456789abcdef")
+        await page_tab.page.keyboard.press("Enter")
+        await page_tab.page.locator("#pack").wait_for()
+        assert "token" not in page_tab.page.url
+        await page_tab.page.reload()
+        await page_tab.page.locator("#pack").wait_for()
 
 
 @pytest.mark.parametrize("size", [PHONE, {"width": 320, "height": 600}, {"width": 1920, "height": 1080}], ids=str)
 async def test_no_element_is_wider_than_the_screen(browser: Browser, house: House, size: dict[str, int]) -> None:
-    async with dashboard_of(browser, house, "attic", size=size) as opened:
-        await opened.until_text("celllow", "3.311 V · cell 1")
+    async with dashboard_of(browser, house, "attic", size=size) as page_tab:
+        await page_tab.until_text("celllow", "3.311 V · cell 1")
         wider = """width => [...document.querySelectorAll("body, header *, #pack, .card, .card :not(.scroll *)")]
             .filter((e) => e.getBoundingClientRect().right > width + 0.5).map((e) => e.outerHTML.slice(0, 80))"""
-        assert await opened.page.evaluate(wider, size["width"]) == []
+        assert await page_tab.page.evaluate(wider, size["width"]) == []

@@ -34,18 +34,18 @@ def hub() -> PackTopics:
 
 
 @pytest.fixture
-def past() -> HistoryQuery:
+def history() -> HistoryQuery:
     return HistoryQuery()
 
 
 @contextlib.asynccontextmanager
 async def browsing(
-    hub: PackTopics, past: HistoryQuery, settings: PageSettings | None = None
+    hub: PackTopics, history: HistoryQuery, settings: PageSettings | None = None
 ) -> AsyncIterator[aiohttp.ClientSession]:
     """Start a server. Yield a client with cookies for its address."""
     jar = aiohttp.CookieJar(unsafe=True)  # accepts cookies of an IP address
     async with (
-        PageServer(settings or PageSettings(listen="127.0.0.1:0"), hub, past, patient=False) as server,
+        PageServer(settings or PageSettings(listen="127.0.0.1:0"), hub, history, patient=False) as server,
         aiohttp.ClientSession(server.url, cookie_jar=jar) as session,
     ):
         yield session
@@ -65,8 +65,8 @@ def test_static_files_are_small_and_local():
     assert not any("http://" in text.replace("http://www.w3.org/2000/svg", "") or "https://" in text for text in own)
 
 
-async def test_files_have_media_type_security_headers_and_etag(hub, past):
-    async with browsing(hub, past) as session:
+async def test_files_have_media_type_security_headers_and_etag(hub, history):
+    async with browsing(hub, history) as session:
         for path, (file, kind) in FILES.items():
             async with session.get(path) as response:
                 assert (response.status, response.content_type) == (200, kind)
@@ -82,9 +82,9 @@ async def test_files_have_media_type_security_headers_and_etag(hub, past):
             assert response.status == 405
 
 
-async def test_reader_gets_stored_and_then_new_values(hub, past):
+async def test_reader_gets_stored_and_then_new_values(hub, history):
     hub.put("attic", "availability", "online")
-    async with browsing(hub, past) as session, session.get("/events") as response:
+    async with browsing(hub, history) as session, session.get("/events") as response:
         assert response.content_type == "text/event-stream"
         stream = messages(response)
         assert (await anext(stream))["attic/availability"] == "online"
@@ -92,16 +92,16 @@ async def test_reader_gets_stored_and_then_new_values(hub, past):
         assert (await anext(stream)) == {"attic/state": {"time": "2026-11-22T16:00:00Z", "soc": 0.5}}
 
 
-async def test_keep_alive_events_reveal_a_lost_connection(hub, past, monkeypatch):
+async def test_keep_alive_events_reveal_a_lost_connection(hub, history, monkeypatch):
     monkeypatch.setattr(web_server, "PING_S", 0.05)
-    async with browsing(hub, past) as session, session.get("/events") as response:
+    async with browsing(hub, history) as session, session.get("/events") as response:
         stream = messages(response)
         assert [await anext(stream) for _ in range(3)] == [{}, {}, {}]
 
 
-async def test_client_that_reads_nothing_is_disconnected(hub, past, monkeypatch):
+async def test_client_that_reads_nothing_is_disconnected(hub, history, monkeypatch):
     monkeypatch.setattr(web_server, "WRITE_S", 0.2)
-    async with browsing(hub, past) as session:
+    async with browsing(hub, history) as session:
         reader, writer = await asyncio.open_connection(session._base_url.host, session._base_url.port, limit=1024)
         writer.write(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
         async with asyncio.timeout(LONG_S):
@@ -115,25 +115,25 @@ async def test_client_that_reads_nothing_is_disconnected(hub, past, monkeypatch)
 
 
 async def test_excess_stream_replaces_the_oldest_of_the_busiest_address(
-    hub: PackTopics, past: HistoryQuery, monkeypatch: pytest.MonkeyPatch
+    hub: PackTopics, history: HistoryQuery, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(web_server, "MAX_STREAMS", 3)
     hub.set_link_state(None)
-    async with browsing(hub, past) as session, contextlib.AsyncExitStack() as streams:
+    async with browsing(hub, history) as session, contextlib.AsyncExitStack() as streams:
         url = session._base_url.join(URL("/events"))
 
-        async def opened(address: str) -> AsyncIterator[dict[str, object]]:
+        async def open_stream(address: str) -> AsyncIterator[dict[str, object]]:
             connector = aiohttp.TCPConnector(local_addr=(address, 0))
             client = await streams.enter_async_context(aiohttp.ClientSession(connector=connector))
             stream = messages(await streams.enter_async_context(client.get(url)))
             assert "link" in await anext(stream)
             return stream
 
-        first, second, third = [await opened("127.0.0.2") for _ in range(3)]
-        other = await opened("127.0.0.3")
+        first, second, third = [await open_stream("127.0.0.2") for _ in range(3)]
+        other = await open_stream("127.0.0.3")
         with pytest.raises(aiohttp.ClientError):
             await anext(first)
-        fourth = await opened("127.0.0.2")
+        fourth = await open_stream("127.0.0.2")
         with pytest.raises(aiohttp.ClientError):
             await anext(second)
         hub.put("attic", "availability", "online")
@@ -141,11 +141,11 @@ async def test_excess_stream_replaces_the_oldest_of_the_busiest_address(
             assert "attic/availability" in await anext(stream)
 
 
-async def test_stalled_readers_share_their_texts(hub: PackTopics, past: HistoryQuery) -> None:
+async def test_stalled_readers_share_their_texts(hub: PackTopics, history: HistoryQuery) -> None:
     for number in range(256):
         hub.put("attic", f"alarm/{number}", f"{number}".zfill(65_000))
     process = psutil.Process()
-    async with browsing(hub, past) as session:
+    async with browsing(hub, history) as session:
         before = process.memory_info().rss
         address = session._base_url.host, session._base_url.port
         clients = [await asyncio.open_connection(*address, limit=1024) for _ in range(web_server.MAX_STREAMS)]
@@ -162,17 +162,17 @@ async def test_stalled_readers_share_their_texts(hub: PackTopics, past: HistoryQ
     assert grown < 100e6, f"{grown / 1e6:.0f} MB"
 
 
-async def test_foreign_host_name_is_rejected(hub, past):
-    async with browsing(hub, past) as session:
+async def test_foreign_host_name_is_rejected(hub, history):
+    async with browsing(hub, history) as session:
         for path in ("/", "/events", "/history"):
             async with session.get(path, headers={"Host": "evil.example.org"}) as response:
                 assert response.status == 403
 
 
-async def test_token_is_replaced_by_a_cookie(hub, past, tmp_path):
+async def test_token_is_replaced_by_a_cookie(hub, history, tmp_path):
     (tmp_path / "token").write_text(TOKEN)
     settings = PageSettings(listen="0.0.0.0:0", token_file=tmp_path / "token")
-    async with browsing(hub, past, settings) as session:
+    async with browsing(hub, history, settings) as session:
         for path in ("/", "/page.js", "/events", "/history?pack=a&span=day", "/?token=wrong", "/?token="):
             async with session.get(path) as response:
                 assert response.status == 401, path
@@ -199,9 +199,9 @@ async def test_token_is_replaced_by_a_cookie(hub, past, tmp_path):
 async def test_history_has_a_limited_number_of_points(tmp_path, hub):
     await record(tmp_path / "attic.sqlite", [at(30.0 * s) for s in range(4000)])  # 33 h
     now_s = epoch_s(at(30.0 * 3999).estimate.time)
-    past = HistoryQuery(lambda: now_s)
-    past.add("attic", tmp_path / "attic.sqlite")
-    async with browsing(hub, past) as session:
+    history = HistoryQuery(lambda: now_s)
+    history.add("attic", tmp_path / "attic.sqlite")
+    async with browsing(hub, history) as session:
         lengths = {}
         for span in ("hour", "day", "month"):
             async with session.get("/history", params={"pack": "attic", "span": span}) as response:
@@ -220,22 +220,22 @@ async def test_history_has_a_limited_number_of_points(tmp_path, hub):
                 assert response.status == status
 
 
-async def test_a_pack_without_a_database_has_no_history(tmp_path, hub, past):
-    past.add("attic", tmp_path / "attic.sqlite")
-    async with browsing(hub, past) as session, session.get("/history?pack=attic&span=day") as response:
+async def test_a_pack_without_a_database_has_no_history(tmp_path, hub, history):
+    history.add("attic", tmp_path / "attic.sqlite")
+    async with browsing(hub, history) as session, session.get("/history?pack=attic&span=day") as response:
         assert response.status == 404
         assert "no history there" in await response.text()
 
 
-async def test_address_in_use_is_reported_and_retried(hub, past, monkeypatch):
+async def test_address_in_use_is_reported_and_retried(hub, history, monkeypatch):
     monkeypatch.setattr(web_server, "RETRY_S", 0.05)
     opened = asyncio.Queue[str]()
     with socket.create_server(("127.0.0.1", 0)) as other:
         settings = PageSettings(listen=f"127.0.0.1:{other.getsockname()[1]}")
         with pytest.raises(UserError, match=r"page\.listen = 127\.0\.0\.1:\d+: .*in use"):
-            async with PageServer(settings, hub, past, patient=False):
+            async with PageServer(settings, hub, history, patient=False):
                 pass
-        server = await PageServer(settings, hub, past, opened=opened.put_nowait).__aenter__()
+        server = await PageServer(settings, hub, history, opened=opened.put_nowait).__aenter__()
         assert opened.empty()
     async with asyncio.timeout(LONG_S):
         url = await opened.get()

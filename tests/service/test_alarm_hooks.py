@@ -45,39 +45,44 @@ CLEARED = RAISED.model_copy(update={"active": False, "since": None, "value": Non
 
 @asynccontextmanager
 async def hooks(*tables: dict[str, Any], **changes: Any) -> AsyncIterator[AlarmHooks]:
+    """Run the hooks with these settings."""
     options = {"publish": None, "set_relay": None} | changes
-    async with AlarmHooks([AlarmHook.model_validate(each) for each in tables], "pack", **options) as running:
+    async with AlarmHooks([AlarmHook.model_validate(table) for table in tables], "pack", **options) as running:
         yield running
 
 
-def program(path: Path, text: str) -> str:
+def write_program(path: Path, text: str) -> str:
+    """Write a shell script. Return its path."""
     path.write_text(f"#!/bin/sh\n{text}\n")
     path.chmod(0o700)
     return str(path)
 
 
-async def relay(board: VirtualBoard, *, high: bool) -> None:
+async def wait_for_relay(board: VirtualBoard, *, high: bool) -> None:
     """Wait until the relay of the board has this level."""
     async with asyncio.timeout(LONG_S):
         while board.relay_high != high:  # noqa: ASYNC110 - a pin has no event
             await asyncio.sleep(0.01)
 
 
-async def until(path: Path, lines: int) -> list[str]:
+async def wait_for_lines(path: Path, lines: int) -> list[str]:
+    """Wait until a file has this number of lines. Return them."""
     async with asyncio.timeout(LONG_S):
         while len(output := _lines(path)) < lines:  # noqa: ASYNC110 - a program has no event
             await asyncio.sleep(0.01)
     return output
 
 
-async def until_health(running: AlarmHooks, fits: Callable[[HookHealth], bool]) -> HookHealth:
+async def wait_for_health(running: AlarmHooks, condition: Callable[[HookHealth], bool]) -> HookHealth:
+    """Wait until the health of the hooks fulfils the condition. Return the health."""
     async with asyncio.timeout(LONG_S):
-        while (health := running.health) is None or not fits(health):  # noqa: ASYNC110 - as above
+        while (health := running.health) is None or not condition(health):  # noqa: ASYNC110 - health has no event
             await asyncio.sleep(0.01)
     return health
 
 
-def _runs(process: int) -> bool:
+def _is_running(process: int) -> bool:
+    """Return True if the process exists and is no zombie."""
     stat = Path(f"/proc/{process}/stat")
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
@@ -86,15 +91,15 @@ def _lines(path: Path) -> list[str]:
     return path.read_text().splitlines() if path.exists() else []
 
 
-async def test_a_program_gets_the_alarm_on_stdin_and_in_its_environment_one_after_the_other(tmp_path: Path) -> None:
+async def test_programs_get_the_alarm_on_stdin_and_in_the_environment_and_run_in_sequence(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    script = program(
+    script = write_program(
         tmp_path / "script", f'json=$(cat); echo "$1 $BMS_NAME $BMS_STATE $BMS_VALUE $BMS_DEVICE $json" >> {out}'
     )
     async with hooks({"run": [script, "a b;c"]}) as running:
         for alarm in (RAISED, CLEARED):
             running.on_alarm_change(Change(0.0, alarm))
-        output = await until(out, 2)
+        output = await wait_for_lines(out, 2)
     assert output[0].startswith("a b;c soc_low raised 0.09 pack {")
     assert json.loads(output[0][output[0].index("{") :]) == RAISED.model_dump()
     assert output[1].startswith("a b;c soc_low cleared  pack {")
@@ -102,42 +107,42 @@ async def test_a_program_gets_the_alarm_on_stdin_and_in_its_environment_one_afte
 
 async def test_a_program_that_could_not_be_started_before_a_restart_is_started_after_it(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    script = program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
+    script = write_program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
     failed = RAISED.model_copy(update={"name": "hook_failed"})
     async with hooks({"run": [script]}) as running:
         running.restore_active([RAISED, failed, CLEARED.model_copy(update={"name": "soc_high"})])
-        assert await until(out, 1) == ["soc_low raised"]
+        assert await wait_for_lines(out, 1) == ["soc_low raised"]
         running.on_alarm_change(Change(0.0, CLEARED))
-        assert await until(out, 2) == ["soc_low raised", "soc_low cleared"]
+        assert await wait_for_lines(out, 2) == ["soc_low raised", "soc_low cleared"]
 
 
 async def test_an_alarm_raised_in_an_earlier_run_is_not_reported_again(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    script = program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
+    script = write_program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
     async with hooks({"run": [script]}) as running:
         running.restore_active([RAISED])
         running.on_alarm_change(Change(0.0, CLEARED))
-        assert await until(out, 1) == ["soc_low cleared"]
+        assert await wait_for_lines(out, 1) == ["soc_low cleared"]
 
 
 async def test_a_hook_runs_only_for_its_alarms_and_states(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    script = program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
+    script = write_program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
     other = RAISED.model_copy(update={"name": "link_lost"})
     async with hooks({"run": [script], "alarms": ["soc_low"], "on": ["raised"]}) as running:
         for alarm in (other, CLEARED, RAISED):
             running.on_alarm_change(Change(0.0, alarm))
-        assert await until(out, 1) == ["soc_low raised"]
+        assert await wait_for_lines(out, 1) == ["soc_low raised"]
 
 
 async def test_after_a_program_that_hangs_the_next_alarm_is_reported(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    hang = program(tmp_path / "hang", f"[ $BMS_STATE = raised ] && sleep 1000; echo $BMS_STATE > {out}")
+    hang = write_program(tmp_path / "hang", f"[ $BMS_STATE = raised ] && sleep 1000; echo $BMS_STATE > {out}")
     with capture_logs() as lines:
         async with hooks({"run": [hang], "timeout_s": 2.0}) as running:
             for alarm in (RAISED, CLEARED):
                 running.on_alarm_change(Change(0.0, alarm))
-            assert await until(out, 1) == ["cleared"]
+            assert await wait_for_lines(out, 1) == ["cleared"]
     assert [line["event"] for line in lines] == ["alarm hook: the program takes too long and is killed"]
 
 
@@ -160,23 +165,25 @@ async def test_all_descendants_of_a_program_are_killed_after_the_time_limit(
 ) -> None:
     started = tmp_path / "started"
     started.touch()
-    daemon = program(tmp_path / "daemon", f"echo $$ >> {started}; exec /bin/sleep 1000")
+    daemon = write_program(tmp_path / "daemon", f"echo $$ >> {started}; exec /bin/sleep 1000")
     lines = [start.format(daemon=daemon) for start in starts]
     lines += [f"until [ $(wc -l < {started}) = {len(starts)} ]; do :; done", then]
-    script = program(tmp_path / "script", "\n".join(lines))
+    script = write_program(tmp_path / "script", "\n".join(lines))
     async with hooks({"run": [script], "timeout_s": 10.0}) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        failed = await until_health(running, lambda health: health.failures == 1)
+        failed = await wait_for_health(running, lambda health: health.failures == 1)
     assert failed.failing == [f"run {script}: took longer than 10 s"]
-    assert [_runs(int(line)) for line in _lines(started)] == [False] * len(starts)
+    assert [_is_running(int(line)) for line in _lines(started)] == [False] * len(starts)
 
 
 async def test_a_child_that_outlives_its_program_runs_until_the_time_limit(tmp_path: Path) -> None:
     out, go = tmp_path / "out", tmp_path / "go"
-    child = program(tmp_path / "child", f"until [ -e {go} ]; do sleep 0.01; done; echo sent > {out}")
-    async with hooks({"run": [program(tmp_path / "script", f"{child} & : > {go}")], "timeout_s": LONG_S}) as running:
+    child = write_program(tmp_path / "child", f"until [ -e {go} ]; do sleep 0.01; done; echo sent > {out}")
+    async with hooks(
+        {"run": [write_program(tmp_path / "script", f"{child} & : > {go}")], "timeout_s": LONG_S}
+    ) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        assert (await until_health(running, lambda health: health.done == 1)).failing == []
+        assert (await wait_for_health(running, lambda health: health.done == 1)).failing == []
     assert _lines(out) == ["sent"]
 
 
@@ -184,21 +191,21 @@ async def test_a_program_that_cannot_be_started_is_tried_again_until_its_alarm_h
     out, path = tmp_path / "out", tmp_path / "script"
     async with hooks({"run": [str(path)]}) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        await until_health(running, lambda health: health.failures >= 2)
+        await wait_for_health(running, lambda health: health.failures >= 2)
         running.on_alarm_change(Change(0.0, CLEARED))
-        program(path, f"echo $BMS_STATE >> {out}")
-        assert await until(out, 1) == ["cleared"]
-        assert (await until_health(running, lambda health: health.done == 1)).failing == []
+        write_program(path, f"echo $BMS_STATE >> {out}")
+        assert await wait_for_lines(out, 1) == ["cleared"]
+        assert (await wait_for_health(running, lambda health: health.done == 1)).failing == []
 
 
 async def test_another_alarm_does_not_shorten_the_retry_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alarm_hooks, "FIRST_RETRY_S", LONG_S)
     async with hooks({"run": [str(tmp_path / "none")]}) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        await until_health(running, lambda health: health.failures == 1)
+        await wait_for_health(running, lambda health: health.failures == 1)
         running.on_alarm_change(Change(0.0, RAISED.model_copy(update={"name": "link_lost"})))
         running.on_alarm_change(Change(0.0, CLEARED.model_copy(update={"name": "link_lost"})))
-        for _ in range(100):  # each pass of the loop would let the hook try
+        for _ in range(100):  # without the delay, the hook would retry in the next cycles of the loop
             await asyncio.sleep(0)
         assert running.health is not None
         assert running.health.failures == 1
@@ -206,33 +213,33 @@ async def test_another_alarm_does_not_shorten_the_retry_delay(tmp_path: Path, mo
 
 async def test_a_program_without_a_free_descriptor_is_started_once_one_is_free(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    script = program(tmp_path / "script", f"echo $BMS_STATE >> {out}")
-    most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    script = write_program(tmp_path / "script", f"echo $BMS_STATE >> {out}")
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     async with hooks({"run": [script]}) as running:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (3, most[1]))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
         try:
             running.on_alarm_change(Change(0.0, RAISED))
-            failed = await until_health(running, lambda health: health.failures >= 2)
+            failed = await wait_for_health(running, lambda health: health.failures >= 2)
         finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, most)
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
         assert failed.failing == [f"run {script}: cannot be started: [Errno 24] Too many open files"]
-        assert await until(out, 1) == ["raised"]
+        assert await wait_for_lines(out, 1) == ["raised"]
 
 
 async def test_a_lack_of_descriptors_neither_keeps_a_program_alive_nor_runs_it_twice(tmp_path: Path) -> None:
     child = tmp_path / "child"
-    script = program(tmp_path / "script", f"sleep 1000 & echo $! >> {child}; echo $$ >> {child}; exec sleep 1000")
-    most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    script = write_program(tmp_path / "script", f"sleep 1000 & echo $! >> {child}; echo $$ >> {child}; exec sleep 1000")
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     async with hooks({"run": [script], "timeout_s": 10.0}) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        await until(child, 2)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (3, most[1]))
+        await wait_for_lines(child, 2)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
         try:
-            failed = await until_health(running, lambda health: health.failures == 1)
+            failed = await wait_for_health(running, lambda health: health.failures == 1)
         finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, most)
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert failed.failing == [f"run {script}: took longer than 10 s"]
-    assert [_runs(int(line)) for line in _lines(child)] == [False, False]
+    assert [_is_running(int(line)) for line in _lines(child)] == [False, False]
 
 
 @pytest.mark.parametrize("error", [RuntimeError("can't start new thread"), MemoryError()])
@@ -248,19 +255,19 @@ async def test_a_program_without_a_free_thread_or_memory_is_tried_again(
         return await start(*command, **options)
 
     monkeypatch.setattr(asyncio, "create_subprocess_exec", fail_first)
-    async with hooks({"run": [program(tmp_path / "script", f"echo $BMS_STATE >> {out}")]}) as running:
+    async with hooks({"run": [write_program(tmp_path / "script", f"echo $BMS_STATE >> {out}")]}) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        assert await until(out, 1) == ["raised"]
-        assert (await until_health(running, lambda health: health.done == 1)).failures == 1
+        assert await wait_for_lines(out, 1) == ["raised"]
+        assert (await wait_for_health(running, lambda health: health.done == 1)).failures == 1
 
 
 async def test_a_null_character_in_a_text_does_not_prevent_the_start_of_a_program(tmp_path: Path) -> None:
     """A publisher's last will becomes the reason of ``link_lost``; no environment can hold a null character."""
     out = tmp_path / "out"
-    script = program(tmp_path / "script", f'echo "$BMS_TEXT" > {out}')
+    script = write_program(tmp_path / "script", f'echo "$BMS_TEXT" > {out}')
     async with hooks({"run": [script]}) as running:
         running.on_alarm_change(Change(0.0, RAISED.model_copy(update={"text": "the publisher says offline\0"})))
-        assert await until(out, 1) == ["the publisher says offline "]
+        assert await wait_for_lines(out, 1) == ["the publisher says offline "]
 
 
 async def test_an_internal_error_does_not_end_a_hook() -> None:
@@ -273,10 +280,10 @@ async def test_an_internal_error_does_not_end_a_hook() -> None:
 
     async with hooks({"topic": "load/set", "payload": "$state"}, publish=publish) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        failed = await until_health(running, lambda health: health.failures == 1)
+        failed = await wait_for_health(running, lambda health: health.failures == 1)
         assert failed.failing == ["publish on load/set: internal error: RuntimeError('a fault of ours')"]
         running.on_alarm_change(Change(0.0, CLEARED))
-        await until_health(running, lambda health: health.done == 1)
+        await wait_for_health(running, lambda health: health.done == 1)
     assert output == [b"cleared"]
 
 
@@ -286,10 +293,10 @@ async def test_a_program_inherits_only_listed_and_configured_variables(
     for name in ("LC_TIME", "MQTT_PASSWORD", "NOTIFY_SOCKET", "GATEWAY"):
         monkeypatch.setenv(name, "here")
     out = tmp_path / "out"
-    show = program(tmp_path / "show", f"env > {out}.part; mv {out}.part {out}")
+    show = write_program(tmp_path / "show", f"env > {out}.part; mv {out}.part {out}")
     async with hooks({"run": [show], "pass_environment": ["GATEWAY", "NOT_SET"]}) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        names = {line.partition("=")[0] for line in await until(out, 1)}
+        names = {line.partition("=")[0] for line in await wait_for_lines(out, 1)}
     assert {"PATH", "LC_TIME", "GATEWAY", "BMS_NAME"} <= names
     assert names.isdisjoint({"MQTT_PASSWORD", "NOTIFY_SOCKET", "NOT_SET", "PYTHONPATH"})
 
@@ -312,7 +319,7 @@ async def test_a_critical_alarm_that_cannot_be_watched_counts_as_raised() -> Non
         ):
             running.on_alarm_change(Change(0.0, alarm))
         running.on_alarm_change(Change(0.0, RAISED))
-        await until_health(running, lambda health: health.done == 3)
+        await wait_for_health(running, lambda health: health.done == 3)
     assert output == [
         b"over_temperature raised no temperature",
         b"over_temperature cleared ",
@@ -324,14 +331,14 @@ async def test_a_failed_hook_raises_hook_failed_until_a_run_succeeds(
     tmp_path: Path,
 ) -> None:
     failed = RAISED.model_copy(update={"name": "hook_failed"})
-    script = program(tmp_path / "script", '[ "$BMS_NAME" = hook_failed ]')
+    script = write_program(tmp_path / "script", '[ "$BMS_NAME" = hook_failed ]')
     output: list[bytes] = []
     tables = {"run": [script], "alarms": ["soc_low", "hook_failed"]}, {"topic": "all", "payload": "$name"}
     async with hooks(*tables, publish=lambda _, payload: output.append(payload)) as running:
         running.on_alarm_change(Change(0.0, RAISED))
-        await until_health(running, lambda health: health.failing == [f"run {script}: exit code 1"])
+        await wait_for_health(running, lambda health: health.failing == [f"run {script}: exit code 1"])
         running.on_alarm_change(Change(0.0, failed))
-        await until_health(running, lambda health: health.failing == [])
+        await wait_for_health(running, lambda health: health.failing == [])
     assert output == [b"soc_low"]
 
 
@@ -339,7 +346,7 @@ async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_p
     with capture_logs() as lines:
         async with hooks({"run": [str(tmp_path / "none"), "token=secret"]}) as running:
             running.on_alarm_change(Change(0.0, RAISED))
-            await until_health(running, lambda health: health.failures >= 1)
+            await wait_for_health(running, lambda health: health.failures >= 1)
             assert "secret" not in str(running.health)
     assert "secret" not in str(lines)
 
@@ -360,7 +367,7 @@ async def test_without_when_silent_the_board_gets_the_alarm_level_for_silence() 
 
 
 async def test_a_missing_or_failing_program_is_logged_and_the_hook_continues(tmp_path: Path) -> None:
-    tables = {"run": [str(tmp_path / "none")]}, {"run": [program(tmp_path / "fail", "exit 3")]}
+    tables = {"run": [str(tmp_path / "none")]}, {"run": [write_program(tmp_path / "fail", "exit 3")]}
     with capture_logs() as lines:
         async with hooks(*tables) as running:
             running.on_alarm_change(Change(0.0, RAISED))
@@ -375,12 +382,12 @@ async def test_a_missing_or_failing_program_is_logged_and_the_hook_continues(tmp
 
 async def test_a_dry_run_logs_the_action_and_does_nothing(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    script = program(tmp_path / "script", f"echo >> {out}")
+    script = write_program(tmp_path / "script", f"echo >> {out}")
     output: list[object] = []
     tables: tuple[dict[str, Any], ...] = {"run": [script]}, {"topic": "load/set", "payload": "OFF"}, {"relay": "high"}
     with capture_logs() as lines:
         async with hooks(
-            *({**each, "dry_run": True} for each in tables), publish=output.append, set_relay=output.append
+            *({**table, "dry_run": True} for table in tables), publish=output.append, set_relay=output.append
         ) as running:
             running.on_alarm_change(Change(0.0, RAISED))
     assert [line.get("would") or line.get("hook") for line in lines] == [
@@ -422,7 +429,7 @@ async def test_an_over_current_switches_the_relay_is_published_and_acknowledged(
     cell, sink = load_cell("thunder_power_6s"), Collector()
 
     @asynccontextmanager
-    async def served() -> AsyncIterator[None]:
+    async def run_service() -> AsyncIterator[None]:
         stop = asyncio.Event()
         settings = Settings.model_validate(tables | {"sensor": {"port": board.path}})
         task = asyncio.create_task(run_pack_service(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
@@ -435,27 +442,27 @@ async def test_an_over_current_switches_the_relay_is_published_and_acknowledged(
     with board:
         running = asyncio.create_task(board.run())
         async with Listener(broker) as live:
-            async with served():
-                output = await live.wait_json(TOPIC, lambda tables: tables["latched"])
+            async with run_service():
+                alarm = await live.wait_json(TOPIC, lambda alarm: alarm["latched"])
                 assert board.relay_high
-                assert (output["active"], output["limit"], output["severity"]) == (True, 5.0, "critical")
-                assert output["value"] == pytest.approx(load_a, abs=0.1)
+                assert (alarm["active"], alarm["limit"], alarm["severity"]) == (True, 5.0, "critical")
+                assert alarm["value"] == pytest.approx(load_a, abs=0.1)
                 assert live.all("load/set") == [b'{"discharge_over_current": "raised"}']
             load_a = 1.0
             board.reset()
             assert not board.relay_high
-            async with served():
-                await relay(board, high=True)
-                tables = len(live.messages)
+            async with run_service():
+                await wait_for_relay(board, high=True)
+                messages_before = len(live.messages)
                 await live.publish("bms/pack/request/acknowledge_alarm", b'{"name": "discharge_over_current"}')
-                assert await live.wait_json("bms/pack/response/acknowledge_alarm", skip=tables) == {
+                assert await live.wait_json("bms/pack/response/acknowledge_alarm", skip=messages_before) == {
                     "status": "ok",
                     "data": {"acknowledged": ["discharge_over_current"]},
                     "error": None,
                     "transaction": None,
                 }
-                await live.wait_json(TOPIC, lambda alarm: not alarm["active"], tables)
-                await relay(board, high=False)
+                await live.wait_json(TOPIC, lambda alarm: not alarm["active"], skip=messages_before)
+                await wait_for_relay(board, high=False)
                 await live.wait("load/set", lambda payload: b"cleared" in payload)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
@@ -467,7 +474,7 @@ async def test_a_lost_temperature_sensor_switches_the_relay_and_a_hook_that_cann
     """The NTC of a virtual board breaks while the pack is charged."""
     temperature_c, out, missing = 25.0, tmp_path / "out", tmp_path / "later"
     board = VirtualBoard(lambda _: Reading(-8.0, 22.0, temperature_c))
-    hot = {"alarms": ["over_temperature"]}
+    of_over_temperature = {"alarms": ["over_temperature"]}
     tables: dict[str, Any] = {
         "publish": {"rate_hz": 10.0},
         "mqtt": {"url": broker.url},
@@ -475,9 +482,9 @@ async def test_a_lost_temperature_sensor_switches_the_relay_and_a_hook_that_cann
             "lost_s": 0.5,
             "hook_failed": {"delay_s": 0.0, "clear_delay_s": 0.0},
             "hook": [
-                hot | {"relay": "high", "when_silent": "high"},
-                hot | {"topic": "load/set", "payload": "$name $state"},
-                hot | {"run": [str(missing)], "on": ["raised"]},
+                of_over_temperature | {"relay": "high", "when_silent": "high"},
+                of_over_temperature | {"topic": "load/set", "payload": "$name $state"},
+                of_over_temperature | {"run": [str(missing)], "on": ["raised"]},
             ],
         },
     }
@@ -488,26 +495,28 @@ async def test_a_lost_temperature_sensor_switches_the_relay_and_a_hook_that_cann
             settings = Settings.model_validate(tables | {"sensor": {"port": board.path}})
             service = asyncio.create_task(run_pack_service(settings, cell, stop=stop, folder=tmp_path))
             await live.wait_json("bms/pack/alarm/over_temperature", lambda alarm: alarm["watched"])
-            await relay(board, high=False)
+            await wait_for_relay(board, high=False)
             temperature_c = math.nan
-            output = await live.wait_json("bms/pack/alarm/over_temperature", lambda alarm: not alarm["watched"])
-            assert (output["active"], output["unwatched_reason"]) == (False, "the temperature is no longer measured")
+            alarm = await live.wait_json("bms/pack/alarm/over_temperature", lambda alarm: not alarm["watched"])
+            assert (alarm["active"], alarm["unwatched_reason"]) == (False, "the temperature is no longer measured")
             fault = await live.wait_json("bms/pack/alarm/sensor_fault", lambda alarm: alarm["active"])
             assert "over_temperature" in fault["text"]
             await live.wait("load/set", lambda payload: payload == b"over_temperature raised")
-            await relay(board, high=True)
+            await wait_for_relay(board, high=True)
             failed = await live.wait_json(
                 "bms/pack/alarm/hook_failed", lambda alarm: alarm["active"] and str(missing) in alarm["text"]
             )
             assert f"run {missing}: cannot be started" in failed["text"]
             await live.wait_json("bms/pack/health", lambda health: (health["hooks"] or {}).get("failures", 0) > 0)
-            program(missing, f"echo $BMS_NAME $BMS_STATE > {out}")
-            assert await until(out, 1) == ["over_temperature raised"]
-            tables = len(live.messages)
+            write_program(missing, f"echo $BMS_NAME $BMS_STATE > {out}")
+            assert await wait_for_lines(out, 1) == ["over_temperature raised"]
+            messages_before = len(live.messages)
             await live.wait_json("bms/pack/alarm/hook_failed", lambda alarm: not alarm["active"])
             temperature_c = 25.0
-            await live.wait_json("bms/pack/alarm/over_temperature", lambda alarm: alarm["watched"], tables)
-            await relay(board, high=False)
+            await live.wait_json(
+                "bms/pack/alarm/over_temperature", lambda alarm: alarm["watched"], skip=messages_before
+            )
+            await wait_for_relay(board, high=False)
             await live.wait("load/set", lambda payload: payload == b"over_temperature cleared")
             stop.set()
             await asyncio.wait_for(service, LONG_S)

@@ -1,4 +1,4 @@
-"""A service whose values go to InfluxDB and Prometheus, by its settings alone."""
+"""Service that exports its values to InfluxDB and Prometheus."""
 
 import asyncio
 import urllib.error
@@ -35,7 +35,7 @@ async def test_samples_of_a_board_reach_influxdb_and_prometheus(line: Line, tmp_
     serving = asyncio.create_task(run_pack_service(settings, load_cell("ncr18650"), stop=stop))
     try:
         async with asyncio.timeout(LONG_S):
-            while "bms_voltage_volts{" not in await asyncio.to_thread(scraped, listen):
+            while "bms_voltage_volts{" not in await asyncio.to_thread(scrape, listen):
                 line.write(b"3.80,0.10,25.0\r\n")
                 await asyncio.sleep(0.05)
         stop.set()
@@ -47,8 +47,8 @@ async def test_samples_of_a_board_reach_influxdb_and_prometheus(line: Line, tmp_
         await asyncio.to_thread(influxdb.stop)
 
 
-def scraped(listen: str) -> str:
-    """Return an empty text until the server listens."""
+def scrape(listen: str) -> str:
+    """Return the metrics; an empty text until the server listens."""
     try:
         with urllib.request.urlopen(f"http://{listen}/metrics", timeout=LONG_S) as response:
             return response.read().decode()

@@ -191,7 +191,7 @@ async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after
     assert [line["log_level"] for line in lines if line.get("outcome") == outcome] == ["warning"]
     before, command, _ = outcome.split("`")
     assert before.endswith("is installed again, stop the service and ")
-    subprocess.run(command, shell=True, check=True)  # noqa: ASYNC221 - as a person would
+    subprocess.run(command, shell=True, check=True)  # noqa: ASYNC221 - a user enters the command in a shell
     monkeypatch.setattr("bms_estimator.checkpoint.checkpoint_file.FORMAT", FORMAT + 1)
     restored = (await run_samples(folder, samples=1)).health.checkpoint
     assert restored == f"restored: SOC {learned.state['soc'][0]:.4f}"

@@ -158,7 +158,7 @@ async def test_a_board_slower_than_the_publications_stays_online(sensor: SensorS
         for tick in range(20):
             if tick % 5 == 0:  # once a second
                 run.source.give((now_s, 0.1, 3.8))
-            now_s += 0.2  # the next publication is overdue, sample or no sample
+            now_s += 0.2  # the next publication is due, also without a sample
             await run.sink.until(lambda _: True, skip=len(run.sink.snapshots))
         online = [s.health.sensor_online for s in run.sink.snapshots]
         assert all(online[online.index(True) :])
@@ -239,8 +239,8 @@ async def test_health_counts_dropped_messages_and_requests() -> None:
         await run.sink.until(lambda s: s.health.requests == {"granted": 1})
 
 
-@pytest.mark.parametrize("again", [{}, {"serial": "A1", "firmware": "1.1"}])
-async def test_the_properties_of_a_silent_board_stay_published(again: dict[str, str]) -> None:
+@pytest.mark.parametrize("later_board", [{}, {"serial": "A1", "firmware": "1.1"}])
+async def test_the_properties_of_a_silent_board_stay_published(later_board: dict[str, str]) -> None:
     async with running() as run:
         run.source.board = {"serial": "A1", "firmware": "1.0"}
         run.source.give((0.0, 0.1, 3.8))
@@ -249,11 +249,11 @@ async def test_the_properties_of_a_silent_board_stay_published(again: dict[str, 
         snapshots_before = len(run.sink.snapshots)
         at_s = run.sink.snapshots[-1].health.uptime_s
         await run.sink.until(lambda s: s.health.uptime_s > at_s + 1.0, skip=snapshots_before)
-        run.source.board = again
+        run.source.board = later_board
         await run.end()
     boards = [s.info.board for s in run.sink.snapshots[snapshots_before:]]
     assert {} not in boards
-    assert boards[-1] == (again or {"serial": "A1", "firmware": "1.0"})
+    assert boards[-1] == (later_board or {"serial": "A1", "firmware": "1.0"})
 
 
 class ZeroRecorder:

@@ -111,7 +111,7 @@ async def stop_service(process: Process) -> list[Any]:
 
 
 async def feed(line: Line) -> None:
-    """Print text as a board at 50 Hz, whether it is read or not."""
+    """Print text like a board at 50 Hz, also while the line is not read."""
     with contextlib.suppress(OSError):  # not opened yet
         line.received()  # the board continues while the line is full
     while True:
@@ -255,7 +255,7 @@ async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_r
     async with service(pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{folder}"')) as process:
         assert process.stderr
         output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
-        assert await process.wait() == 1  # 2 is never restarted
+        assert await process.wait() == 1  # systemd does not restart the service after exit code 2
     assert output == f"error: state.folder = {folder}: No space left on device\n"
 
 

@@ -65,17 +65,17 @@ def test_usable_charge_ends_at_the_margins() -> None:
 
 
 @pytest.mark.parametrize("current_a", [0.0, -1.0, 1e-5])
-def test_time_to_empty_is_none_unless_the_pack_is_discharged(current_a: float) -> None:
+def test_time_to_empty_is_nan_unless_the_pack_is_discharged(current_a: float) -> None:
     assert math.isnan(remaining_charge(estimator_at(0.5), current_a).time_to_empty_s)
 
 
-def test_time_to_full_is_none_unless_the_pack_is_charged() -> None:
+def test_time_to_full_is_nan_unless_the_pack_is_charged() -> None:
     assert remaining_charge(estimator_at(0.4), -0.055).time_to_full_s == pytest.approx(0.6 * Q_AH / 0.055 * 3600.0)
     assert remaining_charge(estimator_at(1.0), -0.055).time_to_full_s == 0.0
     assert all(math.isnan(remaining_charge(estimator_at(0.5), a).time_to_full_s) for a in (0.0, 1.0, -1e-5))
 
 
-def test_values_are_none_before_the_first_sample() -> None:
+def test_values_are_missing_before_the_first_sample() -> None:
     estimator = Estimator(CELL, initial_soc=0.5, identifier=None)
     assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)
     assert make_parameters_payload(estimator, NOW_S).elements == {}
@@ -107,7 +107,7 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert report.elements["e_o_v"].source == "configured"
     a1, target = report.a["a1"], float(estimator.state["target"][0, 1])
     assert target != estimator.settings["target"][0, 1]
-    # not valid, for the SOC was swept little
+    # The parameter is not valid, because the SOC changed little.
     assert (a1.value, a1.source, a1.valid) == (pytest.approx(target, rel=1e-3), "identified", False)
     assert abs(a1.value - CELL.a[1]) < 3.0 * a1.std
     unsure = [p for p in (*report.a.values(), *report.elements.values()) if p.source == "identified" and not p.valid]

@@ -5,7 +5,7 @@ The payloads have the formats of the projects in ``settings/mqtt_profiles.py``, 
 
 import json
 import random
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import given
@@ -335,12 +335,21 @@ def test_settings_override_the_profile() -> None:
     assert (merged.prefix, merged.period_s) == ("BE", 2.0)
 
 
-def _merge_publishers(*publishers: tuple[float, float, float, float]) -> list[tuple[float, float]]:
-    """Return times and currents of messages. Each publisher has a period, a first and a last time, and a current."""
+class _Publisher(NamedTuple):
+    """Publisher of a constant current at regular intervals."""
+
+    period_s: float
+    first_s: float
+    last_s: float
+    current_a: float
+
+
+def _merge_publishers(*publishers: _Publisher) -> list[tuple[float, float]]:
+    """Return the times and currents of the messages of all publishers, in the order of their times."""
     messages = [
-        (first_s + period_s * i, current_a)
-        for period_s, first_s, last_s, current_a in publishers
-        for i in range(round((last_s - first_s) / period_s))
+        (publisher.first_s + publisher.period_s * i, publisher.current_a)
+        for publisher in publishers
+        for i in range(round((publisher.last_s - publisher.first_s) / publisher.period_s))
     ]
     return sorted(messages)
 
@@ -357,12 +366,13 @@ def _conflict_times(messages: list[tuple[float, float]]) -> tuple[SampleAssemble
 
 @pytest.mark.parametrize("period_s", [0.2, 1.0, 2.7])
 def test_second_publisher_of_a_topic_is_reported_until_it_stops(period_s: float) -> None:
-    second_publisher = (period_s, 100.3, 160.0, -80.0)
-    assembly, times_s = _conflict_times(_merge_publishers((1.0, 0.0, 160.0, 5.0), second_publisher))
+    publisher = _Publisher(period_s=1.0, first_s=0.0, last_s=160.0, current_a=5.0)
+    second_publisher = _Publisher(period_s, first_s=100.3, last_s=160.0, current_a=-80.0)
+    assembly, times_s = _conflict_times(_merge_publishers(publisher, second_publisher))
     assert 100.3 < times_s[0] < 115.0
     assert times_s[-1] > 158.0
     assert set(assembly.conflict.removeprefix("home/pack: current ").split(" and ")) == {"5", "-80"}
-    assembly, times_s = _conflict_times(_merge_publishers((1.0, 0.0, 400.0, 5.0), second_publisher))
+    assembly, times_s = _conflict_times(_merge_publishers(publisher._replace(last_s=400.0), second_publisher))
     assert assembly.conflict == ""
     assert times_s[-1] < 160.0 + 64.0
 
@@ -402,7 +412,9 @@ def test_publisher_of_changes_and_regular_messages_is_no_second_publisher(*, res
 
 
 def test_slower_second_publisher_is_detected() -> None:
-    _, times_s = _conflict_times(_merge_publishers((1.0, 0.0, 400.0, 5.0), (10.0, 100.3, 400.0, -80.0)))
+    publisher = _Publisher(period_s=1.0, first_s=0.0, last_s=400.0, current_a=5.0)
+    slower = _Publisher(period_s=10.0, first_s=100.3, last_s=400.0, current_a=-80.0)
+    _, times_s = _conflict_times(_merge_publishers(publisher, slower))
     assert times_s
     assert times_s[0] < 160.0
 
@@ -412,7 +424,8 @@ def test_second_publisher_at_random_times_is_detected() -> None:
     while at_s < 160.0:
         at_s += rng.expovariate(1.0)
         second_publisher.append((at_s, -80.0))
-    _, times_s = _conflict_times(sorted(_merge_publishers((1.0, 0.0, 160.0, 5.0)) + second_publisher))
+    publisher = _Publisher(period_s=1.0, first_s=0.0, last_s=160.0, current_a=5.0)
+    _, times_s = _conflict_times(sorted(_merge_publishers(publisher) + second_publisher))
     assert 100.0 < times_s[0] < 115.0
 
 
