@@ -75,7 +75,7 @@ def learner(file: CellModel, soc: float = FIRST_SOC, **observer: float) -> Estim
     return Estimator(file, settings, identifier=None, initial_soc=soc, voltage_resolution_v=RESOLUTION_V)
 
 
-def errors(estimator: Estimator, factors: Sequence[float]) -> np.ndarray:
+def relative_errors(estimator: Estimator, factors: Sequence[float]) -> np.ndarray:
     """Return the relative errors of the learned parameters, for a file with wrong ``factors``; shape (5,)."""
     theta = estimator.record[0]["learning"]["theta"][: len(NAMES)]
     return np.abs(np.exp(theta) * np.asarray(factors) - 1.0)
