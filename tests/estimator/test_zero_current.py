@@ -56,7 +56,7 @@ def test_a_zero_current_is_detected_with_noise() -> None:
 
 
 @pytest.mark.parametrize(
-    "unknown",
+    "arguments",
     [
         {"shown_a": 0.05},
         {"shown_a": -0.05},
