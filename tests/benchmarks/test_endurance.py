@@ -1,4 +1,4 @@
-"""Short run of ``make load``."""
+"""Short runs of two parts of ``make load``: serial bytes, and the attack by a lost sensor."""
 
 from pathlib import Path
 
