@@ -148,13 +148,13 @@ def calls_from_python(block: SampleBlock) -> tuple[float, float]:
         for sample in samples:
             estimator.step(*sample)
 
-    def kernel_step_ns() -> None:
+    def step_kernel() -> None:
         for sample in samples:
             kernel.step(state, settings, *sample)
 
     best = np.full(2, np.inf)
     for _ in range(3):
-        for i, run in enumerate((step, kernel_step_ns)):
+        for i, run in enumerate((step, step_kernel)):
             estimator.state["started"] = 0
             best[i] = min(best[i], elapsed_ns(run))
     return float(best[0]) / len(samples), float(best[1]) / len(samples)
