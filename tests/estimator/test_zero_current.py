@@ -33,10 +33,11 @@ def offset_after(reported_a, sampling=None, smallest_a=SMALLEST_A):
     estimator = Estimator(
         load_cell("nmc", CAPACITY_AH), initial_soc=0.6, **({"sampling": sampling} if sampling else {})
     )
-    return offset_found(estimator, samples)
+    return run_and_get_offset(estimator, samples)
 
 
-def offset_found(estimator, samples):
+def run_and_get_offset(estimator, samples):
+    """Return the offset and its std after the samples [A]."""
     estimator.run(samples)
     f = estimator.record[0]["filter"]
     return f["mean"][f["best"], OFFSET], np.sqrt(f["covariance"][f["best"], OFFSET, OFFSET])
@@ -58,12 +59,12 @@ def test_a_zero_current_is_detected_with_noise() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        {"shown_a": 0.05},
-        {"shown_a": -0.05},
-        {"shown_a": 0.02},
-        {"shown_a": 0.0, "smallest_a": 0.3},
-        {"shown_a": 0.0, "sampling": Sampling(1.0, 0.0, 0.5)},
-        {"shown_a": 0.0, "sampling": Sampling(1.0, 0.1)},
+        {"reported_a": 0.05},
+        {"reported_a": -0.05},
+        {"reported_a": 0.02},
+        {"reported_a": 0.0, "smallest_a": 0.3},
+        {"reported_a": 0.0, "sampling": Sampling(1.0, 0.0, 0.5)},
+        {"reported_a": 0.0, "sampling": Sampling(1.0, 0.1)},
     ],
     ids=["50 mA", "-50 mA", "20 mA", "unknown resolution", "dead band", "coarse steps"],
 )
@@ -87,7 +88,7 @@ def offset_of(steps, estimator=None):
     samples = np.zeros(len(times), dtype=SAMPLE)
     samples["time_s"], samples["current_a"] = times, currents
     samples["voltage_v"], samples["temperature_c"] = 3.7 - 0.03 * samples["current_a"], 25.0
-    return offset_found(estimator, samples)
+    return run_and_get_offset(estimator, samples)
 
 
 def test_samples_of_both_signs_are_no_rest() -> None:
