@@ -26,13 +26,13 @@ class Collector:
         pass
 
     async def until(self, accepts: Callable[[Snapshot], bool], skip: int = 0) -> Snapshot:
-        """Wait for a snapshot that ``accepts`` accepts, and return it; the first ``skip`` snapshots are ignored."""
-        seen = skip
+        """Wait for a snapshot that ``accepts`` accepts, and return it. The first ``skip`` snapshots are ignored."""
+        checked = skip
         async with asyncio.timeout(LONG_S):
             while True:
                 self._received.clear()
-                for snapshot in self.snapshots[seen:]:
+                for snapshot in self.snapshots[checked:]:
                     if accepts(snapshot):
                         return snapshot
-                seen = max(seen, len(self.snapshots))
+                checked = max(checked, len(self.snapshots))
                 await self._received.wait()

@@ -12,7 +12,7 @@ PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int | str, str, str]:
     """Run the command line in this process. Return exit code, stdout and stderr."""
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as caught:
         main([str(argument) for argument in arguments])
     out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
+    return caught.value.code or 0, out, err

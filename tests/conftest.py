@@ -15,7 +15,7 @@ from tests.simavr_board import firmware
 
 __all__ = ["broker", "disk_without_files", "firmware", "full_disk", "line"]
 
-# no deadline: compilation and shared machines make times meaningless
+# There is no deadline, because compilation and other processes make times meaningless.
 settings.register_profile("short", deadline=None, derandomize=True, database=None)
 settings.register_profile(
     "long", deadline=None, max_examples=int(os.environ.get("INPUTS", "20000")), suppress_health_check=list(HealthCheck)

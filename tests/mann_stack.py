@@ -1,8 +1,8 @@
-"""A PEM stack with effects that the model lacks: the truth of the fuel cell's tests and benchmark.
+"""Simulation of a PEM stack for tests and the benchmark of the fuel cell.
 
-Losses after Mann et al. (2000) with the coefficients of Correa et al. (2004), from which ``pem_30w`` is made, and beyond
-the model: a membrane whose resistance follows current, temperature and a water content that lags by a minute, oxygen that
-lags by 0.3 s, a stack that warms by some K, a reaction that also runs backwards (Butler-Volmer).
+The losses are those of Mann et al. (2000) with the coefficients of Correa et al. (2004), as in ``pem_30w``. The stack has
+additional effects that the model omits: a membrane resistance that depends on current, temperature and a water content with a
+lag of a minute, oxygen with a lag of 0.3 s, self-heating by some K, and a reaction that also runs backwards (Butler-Volmer).
 """
 
 import math
@@ -20,20 +20,26 @@ B_V, LIMIT_A, INTERNAL_A = 0.016, 0.469 * AREA_CM2, 0.003 * AREA_CM2
 C_FARAD, CONTACT_OHM = 3.0 / 64.0 * AREA_CM2, 0.0003 * 64.0 / AREA_CM2
 HYDROGEN_ATM, OXYGEN_ATM = 1.0, 0.21
 WATER_S, OXYGEN_S, WARM_S = 60.0, 0.3, 300.0
-DRY, PER_AMPERE = 12.0, 0.5
-"""Water content of the membrane at no load, and what an ampere adds."""
-COLD_C, WARM_K = 35.0, 6.0
+"""Time constants of water content, oxygen and temperature [s]."""
+DRY = 12.0
+"""Water content of the membrane without load."""
+PER_AMPERE = 0.5
+"""Increase of the water content per ampere [1/A]."""
+COLD_C = 35.0
+"""Temperature without load [C]."""
+WARM_K = 6.0
+"""Increase of the temperature at ``FULL_W`` [K]."""
 FULL_W = 30.0
-"""At this power the stack warms by ``WARM_K``."""
 CURVE_A = np.array([0, 0.05, 0.1, 0.2, 0.4, 0.7, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 5.5, 6, 6.5, 7, 7.5, 8, 8.5])
 """Points of a polarisation curve [A]."""
 SUBSTEP_S = 5e-4
+"""Maximum integration step [s]."""
 NOISE_V = 0.003
 RESOLUTION_V = 0.001
 
 
 class Record(NamedTuple):
-    """Columns, shape (n,) each; the last is no measurement but the truth."""
+    """Measured columns and the true resistance, shape (n,) each."""
 
     time_s: Floats
     current_a: Floats
@@ -42,21 +48,21 @@ class Record(NamedTuple):
     r_ohm: Floats
 
     def every(self, n: int) -> "Record":
-        """Each n-th sample alone, as a slower board has them: steps of the current lie anywhere between two."""
+        """Return each n-th sample, as of a slower board, so that current steps are at any time between two samples."""
         return Record(*(column[::n] for column in self))
 
 
 def measured(
     time_s: Floats, current_a: Floats, *, seed: int = 0, noise_v: float = NOISE_V, more_ohm: Floats | float = 0.0
 ) -> Record:
-    """Voltage and temperature of the stack under a current that holds from each sample on; it starts settled.
+    """Return voltage and temperature of the stack, from the steady state. A current is constant until the next sample.
 
     Args:
         time_s: Shape (n,), increasing [s].
         current_a: Shape (n,), not negative [A].
-        seed: Of the noise.
+        seed: Seed of the noise.
         noise_v: Standard deviation of a voltage [V].
-        more_ohm: What the contacts have grown by, of the stack, a number or shape (n,) [ohm].
+        more_ohm: Increase of the contact resistance of the stack, a number or shape (n,) [ohm].
     """
     growth = np.broadcast_to(np.asarray(more_ohm, dtype=float), time_s.shape).copy()
     voltage_v, temperature_c, r_ohm = _run(np.asarray(time_s, dtype=float), np.asarray(current_a, dtype=float), growth)
@@ -66,7 +72,7 @@ def measured(
 
 
 def curve(currents_a: Floats, *, seed: int = 0, noise_v: float = NOISE_V) -> Record:
-    """A polarisation curve: under each current the stack has settled and is as warm as it gets."""
+    """Return a polarisation curve: voltage and temperature in the steady state of each current."""
     time_s = np.arange(3.0)
     last = [measured(time_s, np.full(time_s.size, i), seed=seed + k, noise_v=noise_v) for k, i in enumerate(currents_a)]
     columns = (np.array([getattr(record, name)[-1] for record in last]) for name in Record._fields)
@@ -74,21 +80,24 @@ def curve(currents_a: Floats, *, seed: int = 0, noise_v: float = NOISE_V) -> Rec
 
 
 def random_steps(duration_s: float, rate_hz: float, *, seed: int, highest_a: float = 5.0) -> tuple[Floats, Floats]:
-    """Time [s] and a current of random steps of 0.5 to 5 s between 0.2 A and ``highest_a``."""
-    dice = np.random.default_rng(seed)
+    """Return time [s] and a current of random steps of 0.5 to 5 s between 0.2 A and ``highest_a`` [A]."""
+    rng = np.random.default_rng(seed)
     time_s = np.arange(round(duration_s * rate_hz)) / rate_hz
-    starts = np.cumsum(dice.uniform(0.5, 5.0, math.ceil(duration_s / 0.5)))
-    heights = dice.uniform(0.2, highest_a, starts.size + 1)
-    return time_s, heights[np.searchsorted(starts, time_s)]
+    starts_s = np.cumsum(rng.uniform(0.5, 5.0, math.ceil(duration_s / 0.5)))
+    levels_a = rng.uniform(0.2, highest_a, starts_s.size + 1)
+    return time_s, levels_a[np.searchsorted(starts_s, time_s)]
 
 
 def model_itself(a: Floats, duration_s: float, *, seed: int = 0, noise_v: float = NOISE_V) -> Record:
-    """100 Hz of the model with the parameters ``a``, shape (16,), for comparison; steps of the current lie between samples."""
+    """Return samples of the model itself at 100 Hz, with the parameters ``a`` of shape (16,).
+
+    Current steps are between samples.
+    """
     time_s, current_a = random_steps(duration_s, 500.0, seed=seed)
-    missing = np.full(time_s.size, np.nan)
-    voltage_v, _ = open_loop(a, np.zeros(8), time_s, current_a, missing)
+    no_temperature = np.full(time_s.size, np.nan)
+    voltage_v, _ = open_loop(a, np.zeros(8), time_s, current_a, no_temperature)
     voltage_v += np.random.default_rng(seed).normal(0.0, noise_v, time_s.size)
-    return Record(time_s, current_a, voltage_v, missing, missing).every(5)
+    return Record(time_s, current_a, voltage_v, no_temperature, no_temperature).every(5)
 
 
 @njit
@@ -120,20 +129,20 @@ def _run(time_s: Floats, current_a: Floats, more_ohm: Floats) -> tuple[Floats, F
     kelvin, water = COLD_C + 273.15, DRY + PER_AMPERE * current_a[0]
     oxygen = 1.0 - (current_a[0] + INTERNAL_A) / LIMIT_A
     loss_v = 0.0
-    for _ in range(20):  # as warm as the first current makes it
+    for _ in range(20):  # iterate the steady-state temperature under the first current
         loss_v = _activation_v(kelvin) - XI_4 * kelvin * math.log(current_a[0] + INTERNAL_A) - B_V * math.log(oxygen)
         start_v = CELLS * (_nernst_v(kelvin) - loss_v - current_a[0] * _cell_ohm(current_a[0], kelvin, water))
         kelvin = 273.15 + COLD_C + WARM_K * current_a[0] * start_v / FULL_W
     for j in range(n):
         if j > 0:
-            left_s, i = time_s[j] - time_s[j - 1], current_a[j - 1]
-            while left_s > 1e-9:
-                dt_s = min(SUBSTEP_S, left_s)
-                left_s -= dt_s
+            remaining_s, i = time_s[j] - time_s[j - 1], current_a[j - 1]
+            while remaining_s > 1e-9:
+                dt_s = min(SUBSTEP_S, remaining_s)
+                remaining_s -= dt_s
                 tafel_v = -XI_4 * kelvin
                 exchange_a = math.exp(-_activation_v(kelvin) / tafel_v)
-                forth = math.exp((loss_v + B_V * math.log(oxygen)) / tafel_v)
-                reaction_a = exchange_a * (forth - math.exp(-loss_v / tafel_v))
+                forward = math.exp((loss_v + B_V * math.log(oxygen)) / tafel_v)
+                reaction_a = exchange_a * (forward - math.exp(-loss_v / tafel_v))
                 loss_v += dt_s * (i + INTERNAL_A - reaction_a) / C_FARAD
                 oxygen += dt_s / OXYGEN_S * (max(1.0 - (i + INTERNAL_A) / LIMIT_A, 0.01) - oxygen)
                 water += dt_s / WATER_S * (DRY + PER_AMPERE * i - water)

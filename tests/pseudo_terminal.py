@@ -1,4 +1,4 @@
-"""The command line on a pseudo-terminal of any size."""
+"""Program ``bms-estimator`` on a pseudo-terminal of any size."""
 
 import fcntl
 import os
@@ -35,7 +35,7 @@ class PseudoTerminal:
     def __enter__(self) -> Self:
         self.settings = termios.tcgetattr(self._slave)
         command = [PROGRAM, *self._arguments]
-        # these variables of the shell that started the tests would override the size of the terminal
+        # COLUMNS and LINES of the shell that started the tests would override the size of the terminal.
         env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
         self.process = subprocess.Popen(
             command, stdin=self._slave, stdout=self._slave, stderr=self._slave, env=env | {"TERM": "xterm-256color"}

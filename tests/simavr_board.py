@@ -1,4 +1,7 @@
-"""The real firmware in simavr: its serial line is a PTY. Needs avr-gcc and libsimavr, else the tests skip and say so."""
+"""Real firmware in simavr, with a PTY as its serial line.
+
+It needs avr-gcc and libsimavr. Without them the tests are skipped with the reason.
+"""
 
 import asyncio
 import functools
@@ -21,28 +24,29 @@ SIMULATOR = FIRMWARE / "build" / "board_sim"
 
 
 READINGS_HZ = 50
-"""Rate of readings of the pack model [Hz]; each is held until the next."""
+"""Rate of the readings of the pack model [Hz]. Each reading holds until the next."""
 LINES_AT_ONCE = 50
+"""Number of readings that are written to the simulator at a time."""
 STOP_S = 5.0
 
 
 class FirmwareBoard:
-    """``firmware/build/board_sim`` while the context lasts. It powers up when its line is first opened.
+    """Process of ``firmware/build/board_sim``. The board powers up when its line is first opened.
 
     Args:
         build: Folder of the built firmware.
-        readings: Signal at its pins: a function of time [s], or a file with
-            ``time_s,current_a,voltage_v[,temperature_c]``, each line held until the next.
+        readings: Signal at the pins: a function of time [s], or a file with
+            ``time_s,current_a,voltage_v[,temperature_c]``. Each line holds until the next.
         speed: Board seconds per second; ``math.inf``: as fast as the host reads.
-        avcc_mv: Supply and reference of its converter.
-        noise_lsb: Noise of its converter [steps].
-        loop: Begin a file again after its last line; else that is held.
-        relay: Whether its relay pin cuts the load while it is high.
-        seed: Of the noise.
+        avcc_mv: Supply voltage, which is the reference of the ADC [mV].
+        noise_lsb: Noise of the ADC [steps].
+        loop: True: a file is repeated after its last line; False: the last line holds.
+        relay: True if the load is switched off while the relay pin is high.
+        seed: Seed of the noise.
 
     Attributes:
-        path: Of the pseudo-terminal.
-        exit_code: Of the simulator, once it has ended; below zero where it had to be killed.
+        path: Path of the pseudo-terminal.
+        exit_code: Exit code of the ended simulator; negative if it was killed.
     """
 
     def __init__(
@@ -71,16 +75,16 @@ class FirmwareBoard:
 
     @staticmethod
     def is_built(build: Path) -> bool:
-        """Return True if ``build`` holds the firmware and its simulator."""
+        """Return True if ``build`` contains the firmware and its simulator."""
         return all((build / name).is_file() for name in ("board_sim", "bms_board.elf"))
 
     def __enter__(self) -> Self:
         """Start the simulator.
 
         Raises:
-            UserError: It does not run.
+            UserError: The simulator does not start.
         """
-        # a session of its own: Ctrl-C is for the program that ends it
+        # With a new session, Ctrl-C does not reach the simulator, which this object ends.
         self._process = subprocess.Popen(
             self._command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )
@@ -106,12 +110,12 @@ class FirmwareBoard:
         self._process.stdout.close()
 
     async def run(self) -> None:
-        """Have a signal's readings at its pins for as long as it runs: the pipe takes them as it needs them."""
+        """Write the readings of a signal until the simulator ends. The pipe blocks while the simulator needs none."""
         while await asyncio.to_thread(self._feed):
             pass
 
     def _feed(self) -> bool:
-        """Give the next readings of a signal. Returns whether the simulator takes more."""
+        """Write the next readings of a signal. Return False if the simulator accepts no more."""
         if isinstance(self._readings, Path):
             return False
         lines = b"".join(self._line(self._readings) for _ in range(LINES_AT_ONCE))
@@ -129,8 +133,8 @@ class FirmwareBoard:
 
 
 @functools.cache
-def _built() -> str:
-    """Build firmware and simulator once. Returns why that is impossible, or nothing."""
+def _build_firmware() -> str:
+    """Build firmware and simulator once. Return the reason if that is impossible, otherwise an empty text."""
     if subprocess.run([ROOT / ".ci" / "can-simulate"], check=False).returncode != 0:
         return "no simavr or no compiler for the AVR here: make apt"
     subprocess.run(["make", "--silent", "-C", FIRMWARE, "all", "sim"], check=True, stdout=subprocess.DEVNULL)
@@ -139,13 +143,13 @@ def _built() -> str:
 
 @pytest.fixture(scope="session")
 def firmware() -> None:
-    """Skips where the firmware cannot be built or simulated."""
-    if reason := _built():
+    """Skip the test if the firmware cannot be built or simulated."""
+    if reason := _build_firmware():
         pytest.skip(reason)
 
 
 def write_readings(path: Path, readings: Iterable[tuple[float, ...]]) -> Path:
-    """A file of (time_s, current_a, voltage_v[, temperature_c]) for the simulator."""
+    """Write a file of (time_s, current_a, voltage_v[, temperature_c]) for the simulator, and return its path."""
     with path.open("w") as file:
         file.write("time_s,current_a,voltage_v,temperature_c\n")
         for reading in readings:
@@ -154,7 +158,7 @@ def write_readings(path: Path, readings: Iterable[tuple[float, ...]]) -> Path:
 
 
 class SimavrBoard(FirmwareBoard):
-    """The firmware's ELF in simavr, fed from a file of readings; leaving it asserts the clean end."""
+    """Firmware in simavr with readings from a file. Its exit asserts that the simulator ended without an error."""
 
     def __init__(self, readings: Path, **options: Any) -> None:
         super().__init__(FIRMWARE / "build", readings, **options)

@@ -1,4 +1,4 @@
-"""What others may build on: its document is true, it is fast to import, it does what the command line does."""
+"""Public Python interface: its documentation, import time, names, and captures from tables in memory."""
 
 import doctest
 import subprocess
@@ -15,30 +15,30 @@ from tests.patience import LONG_S
 ROOT = Path(__file__).parents[1]
 
 
-def test_the_examples_of_the_document_are_true(monkeypatch):
+def test_the_examples_of_the_documentation_are_correct(monkeypatch):
     pytest.importorskip("pandas", reason="pandas is not installed: docs/reference/python.md makes a DataFrame")
     monkeypatch.chdir(ROOT)
-    failed, tried = doctest.testfile(str(ROOT / "docs" / "reference" / "python.md"), module_relative=False)
-    assert (failed, tried > 20) == (0, True)
+    failed, attempted = doctest.testfile(str(ROOT / "docs" / "reference" / "python.md"), module_relative=False)
+    assert (failed, attempted > 20) == (0, True)
 
 
 @pytest.mark.parametrize(
     "program", ["import bms_estimator", "from bms_estimator.cli.main import main; main(['--help'])"]
 )
-def test_the_package_and_its_help_do_not_wait_for_numba(program):
-    watched = f"import atexit, sys; atexit.register(lambda: print('numba' in sys.modules, file=sys.stderr)); {program}"
-    ended = subprocess.run([sys.executable, "-c", watched], capture_output=True, timeout=LONG_S, check=True, text=True)
-    assert ended.stderr == "False\n"
+def test_importing_the_package_and_printing_help_do_not_import_numba(program):
+    script = f"import atexit, sys; atexit.register(lambda: print('numba' in sys.modules, file=sys.stderr)); {program}"
+    process = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=LONG_S, check=True, text=True)
+    assert process.stderr == "False\n"
 
 
-def test_every_public_name_is_there():
+def test_every_public_name_exists():
     assert dir(bms_estimator) == sorted(bms_estimator.__all__)
     assert all(getattr(bms_estimator, name) is not None for name in bms_estimator.__all__)
     with pytest.raises(AttributeError, match="module 'bms_estimator' has no attribute 'estimates'"):
-        bms_estimator.estimates  # noqa: B018 - to be refused
+        bms_estimator.estimates  # noqa: B018 - the access must fail
 
 
-def test_an_estimator_identifies_unless_told_otherwise():
+def test_an_estimator_identifies_by_default():
     cell = bms_estimator.load_cell("leaf")
     assert bms_estimator.Estimator(cell).identifying
     assert not bms_estimator.Estimator(cell, identifier=None).identifying
@@ -46,8 +46,8 @@ def test_an_estimator_identifies_unless_told_otherwise():
 
 def test_a_table_in_memory_is_a_capture_with_the_errors_of_a_file(data):
     capture = bms_estimator.load_capture(data / "lgm50" / "rate_0p5c_25c.csv.gz")
-    again = bms_estimator.load_capture(capture.to_pandas() if "pandas" in sys.modules else dict(capture))
-    assert np.array_equal(again.rows, capture.rows)
+    from_table = bms_estimator.load_capture(capture.to_pandas() if "pandas" in sys.modules else dict(capture))
+    assert np.array_equal(from_table.rows, capture.rows)
     bdf = {
         "Test Time / s": capture["time_s"],
         "Current / A": -capture["current_a"],
@@ -60,7 +60,7 @@ def test_a_table_in_memory_is_a_capture_with_the_errors_of_a_file(data):
         bms_estimator.load_capture(bdf, current_sign="charge")
 
 
-def test_a_column_that_is_not_there_is_a_key_error_that_names_those_that_are(data):
+def test_a_missing_column_raises_a_key_error_with_the_existing_columns(data):
     capture = bms_estimator.load_capture(data / "lgm50" / "rate_0p5c_25c.csv.gz")
     assert "soc" not in capture
     with pytest.raises(KeyError, match="soc: no such column; there are time_s, current_a"):

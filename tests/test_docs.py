@@ -15,13 +15,13 @@ DOCUMENTS = sorted(ROOT.glob("*.md"))
 EQUATIONS = (ROOT / "docs" / "theory" / "equations.md").read_text(encoding="utf-8")
 
 QUICK = {"NO_MKDOCS_2_WARNING": "1", "WITHOUT_THESIS": "1"}
-"""Environment without the theme's advertisement, and without the tables that take half a minute."""
+"""Environment without the advertisement of the theme, and without the tables that take half a minute."""
 NUMBERED = {"2": 13, "3": 19, "4": 2, "5": 2, "7": 1}
-"""Chapter: its last equation that there is code for; the rest of chapter 4 are steps of proofs."""
+"""Number of the last equation with code, by chapter of the thesis. Later equations of chapter 4 are steps of proofs."""
 
 
-def rows(text: str) -> list[list[str]]:
-    """Cells of all rows of all tables."""
+def table_rows(text: str) -> list[list[str]]:
+    """Return the cells of all rows of all tables."""
     return [
         [cell.strip().replace("\\|", "|") for cell in line[1:-1].split(" | ")]
         for line in text.splitlines()
@@ -30,8 +30,8 @@ def rows(text: str) -> list[list[str]]:
 
 
 @cache
-def names(path: Path) -> set[str]:
-    """What a module defines: functions, classes, and methods as Class.method."""
+def defined_names(path: Path) -> set[str]:
+    """Return the names that a module defines: functions, classes, and methods as Class.method."""
     found = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -41,10 +41,13 @@ def names(path: Path) -> set[str]:
     return found
 
 
-def places() -> list[tuple[str, str]]:
-    """Path and name of each place that docs/theory/equations.md gives: a name belongs to the path before it."""
+def code_references() -> list[tuple[str, str]]:
+    """Return path and name of each code reference in docs/theory/equations.md.
+
+    A name belongs to the path before it.
+    """
     found = []
-    for cells in rows(EQUATIONS):
+    for cells in table_rows(EQUATIONS):
         path = ""
         for word in re.findall(r"`([^`]+)`", cells[-1]):
             if word.endswith(".py"):
@@ -54,13 +57,13 @@ def places() -> list[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize(("path", "name"), sorted(set(places())))
-def test_place_of_an_equation_exists(path: str, name: str) -> None:
-    assert name in names(ROOT / path)
+@pytest.mark.parametrize(("path", "name"), sorted(set(code_references())))
+def test_the_code_of_an_equation_exists(path: str, name: str) -> None:
+    assert name in defined_names(ROOT / path)
 
 
-def test_every_equation_has_its_row_and_place() -> None:
-    given = {cells[0]: cells[-1] for cells in rows(EQUATIONS)}
+def test_every_equation_has_a_row_with_its_code() -> None:
+    given = {cells[0]: cells[-1] for cells in table_rows(EQUATIONS)}
     for chapter, last in NUMBERED.items():
         for number in range(1, last + 1):
             assert re.search(r"`[\w/]+\.py`: `\w+`", given[f"({chapter}.{number})"])
@@ -75,5 +78,5 @@ def test_relative_links_lead_to_files(document: Path) -> None:
 
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path / "site"]
-    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ | QUICK)
-    assert (built.returncode, built.stderr) == (0, "")
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ | QUICK)
+    assert (process.returncode, process.stderr) == (0, "")

@@ -1,4 +1,4 @@
-"""Benchmarks in one table: ``make benchmark`` for all, ``make benchmark ARGS="kernel live"`` for some."""
+"""Table of the benchmarks: ``make benchmark`` for all, ``make benchmark ARGS="kernel live"`` for some."""
 
 import sys
 from itertools import chain

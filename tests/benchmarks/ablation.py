@@ -1,7 +1,7 @@
-"""Value of each part of the filter: the table of ``make anywhere`` without it, by kinds of groups.
+"""Ablation study of the filter: scores of ``make anywhere`` without one part of the filter, by kinds of groups.
 
-One part at a time is switched off in the filter's settings, in its first state or in what it sees; the cell files stay.
-Each cell of the table: RMSE, share of time inside two std, interval score, all in %.
+One part at a time is disabled in the settings of the filter, in its first state or in its samples. The cell files are not
+changed. A cell of the table has RMSE, fraction of time inside two std, and interval score, all in %.
 """
 
 import sys
@@ -45,8 +45,8 @@ KINDS = {
 """Groups by the beginning of their names; a full name selects one group."""
 
 
-def setting(**values: float) -> Change:
-    """Change settings of the filter, ``p``."""
+def change_settings(**values: float) -> Change:
+    """Return a function that changes settings of the filter, ``p``."""
 
     def change(p: np.void) -> None:
         for name, value in values.items():
@@ -55,80 +55,80 @@ def setting(**values: float) -> Change:
     return change
 
 
-def known_resistances_of_the_middle(p: np.void) -> None:
+def use_resistances_of_mid_soc(p: np.void) -> None:
     """Make the resistances independent of SOC, with their values at mid SOC."""
     for name in ("weak_ohm", "strong_ohm"):
         p[name] = p[name][GRID // 2]
 
 
 PARTS: dict[str, Change] = {
-    "nothing": setting(),
-    "large R (5 mV instead of 50)": setting(model_v=0.005),
-    "biases": setting(bias_relative=0.0, bias_grown=0.0, bias_soc=0.0),
-    "error of R over SOC": setting(bias_soc=0.0),
-    "error of grown resistances": setting(bias_grown=0.0),
-    "learned scales of R": setting(r_std=1e-6),
-    "R over SOC": known_resistances_of_the_middle,
-    "error outside the file's temperatures": setting(low_c=-100.0, high_c=200.0),
-    "entropy": setting(per_kelvin_v=0.0),
-    "error of the OCV": setting(curve_error_v=0.0),
-    "learned OCV": setting(learned=0.0),
-    "larger error at the knees of the OCV": setting(curve_soc=CURVE_SOC),
-    "hysteresis": setting(hysteresis_v=0.0),
-    "offset": setting(offset_c=0.0),
-    "offset from rests": setting(zero_std_c=1.0),
-    "error of the capacity": setting(capacity_std=0.0),
-    "drift of offset and capacity": setting(offset_s=1e12, aged_soc=1e9),
-    "unknown load before switch-on": setting(load_c=0.0, load_level_c=1e-3),
-    "tempered weights": setting(half_likelihood_exponent=0.5),
-    "reduced innovation variance in weights": setting(min_innovation_scale=1.0),
-    "penalty for large biases": setting(inconsistency_penalty=0.0),
+    "nothing": change_settings(),
+    "large R (5 mV instead of 50)": change_settings(model_v=0.005),
+    "biases": change_settings(bias_relative=0.0, bias_grown=0.0, bias_soc=0.0),
+    "error of R over SOC": change_settings(bias_soc=0.0),
+    "error of grown resistances": change_settings(bias_grown=0.0),
+    "learned scales of R": change_settings(r_std=1e-6),
+    "R over SOC": use_resistances_of_mid_soc,
+    "error outside the file's temperatures": change_settings(low_c=-100.0, high_c=200.0),
+    "entropy": change_settings(per_kelvin_v=0.0),
+    "error of the OCV": change_settings(curve_error_v=0.0),
+    "learned OCV": change_settings(learned=0.0),
+    "larger error at the knees of the OCV": change_settings(curve_soc=CURVE_SOC),
+    "hysteresis": change_settings(hysteresis_v=0.0),
+    "offset": change_settings(offset_c=0.0),
+    "offset from rests": change_settings(zero_std_c=1.0),
+    "error of the capacity": change_settings(capacity_std=0.0),
+    "drift of offset and capacity": change_settings(offset_s=1e12, aged_soc=1e9),
+    "unknown load before switch-on": change_settings(load_c=0.0, load_level_c=1e-3),
+    "tempered weights": change_settings(half_likelihood_exponent=0.5),
+    "reduced innovation variance in weights": change_settings(min_innovation_scale=1.0),
+    "penalty for large biases": change_settings(inconsistency_penalty=0.0),
 }
 ONE_FILTER, NO_TEMPERATURE = "filter bank (one hypothesis)", "temperature"
 
 
 def main() -> None:
-    """Print the table; arguments are parts of the names of kinds."""
+    """Print the table of the kinds whose name contains an argument, or of all."""
     kinds = {k: v for k, v in KINDS.items() if not sys.argv[1:] or any(part in k for part in sys.argv[1:])}
     table = Table("without", *kinds, title="RMSE / inside / score in %")
     with tempfile.TemporaryDirectory() as folder:
         for part in (*PARTS, ONE_FILTER, NO_TEMPERATURE):
             cells = []
-            for begins in kinds.values():
-                groups = [g for g in chosen(GROUPS, []) if any(belongs(g, begin) for begin in begins)]
-                found = np.array([[s.rmse, s.cover, s.score] for g in groups for s in scores(g, part, Path(folder))])
-                cells.append("{:.2f} / {:.0f} / {:.1f}".format(*found.mean(axis=0)))
+            for prefixes in kinds.values():
+                groups = [g for g in chosen(GROUPS, []) if any(belongs(g, prefix) for prefix in prefixes)]
+                results = np.array([[s.rmse, s.cover, s.score] for g in groups for s in scores(g, part, Path(folder))])
+                cells.append("{:.2f} / {:.0f} / {:.1f}".format(*results.mean(axis=0)))
             table.add_row(part, *cells)
     Console(width=None if sys.stdout.isatty() else 200).print(table)
 
 
-def belongs(group: Group, begin: str) -> bool:
-    """Return whether a group's name begins with the text."""
-    return group.name == begin or (group.name.startswith(begin) and begin not in {g.name for g in GROUPS})
+def belongs(group: Group, prefix: str) -> bool:
+    """Return True if a group's name begins with ``prefix``, which is not the full name of another group."""
+    return group.name == prefix or (group.name.startswith(prefix) and prefix not in {g.name for g in GROUPS})
 
 
 def scores(group: Group, part: str, folder: Path) -> list[Score]:
     """Return the scores of every run of a group."""
-    found = [judge(part, *run) for run in runs(group, folder)]
-    return [s for s in found if s is not None]
+    results = [score_without(part, *run) for run in runs(group, folder)]
+    return [s for s in results if s is not None]
 
 
-def judge(part: str, cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float) -> Score | None:
+def score_without(part: str, cell: CellModel, samples: SampleBlock, truth: Floats, start_soc: float) -> Score | None:
     """Score one run with a part of the filter removed."""
     estimator = Estimator(cell, initial_soc=start_soc)
-    PARTS.get(part, setting())(estimator.settings_record[0]["filter"])
+    PARTS.get(part, change_settings())(estimator.settings_record[0]["filter"])
     if part == NO_TEMPERATURE:
-        seen = seen.copy()
-        seen["temperature_c"] = REFERENCE_C
-    begun = estimator.run(seen[:1])
+        samples = samples.copy()
+        samples["temperature_c"] = REFERENCE_C
+    first_row = estimator.run(samples[:1])
     if part == ONE_FILTER:
-        unite_all(estimator.record[0]["filter"], estimator.settings_record[0]["filter"])
-    trace = np.concatenate([begun, estimator.run(seen[1:])])
-    true = np.interp(trace["time_s"], seen["time_s"], truth)
-    return score(trace["time_s"], trace["soc"], trace["soc_std"], true)
+        merge_all_hypotheses(estimator.record[0]["filter"], estimator.settings_record[0]["filter"])
+    trace = np.concatenate([first_row, estimator.run(samples[1:])])
+    true_soc = np.interp(trace["time_s"], samples["time_s"], truth)
+    return score(trace["time_s"], trace["soc"], trace["soc_std"], true_soc)
 
 
-def unite_all(s: np.void, p: np.void) -> None:
+def merge_all_hypotheses(s: np.void, p: np.void) -> None:
     """Replace all hypotheses by the middle one, with the standard deviation of all."""
     if s["count"] == HYPOTHESES:
         copy_hypothesis(s, HYPOTHESES // 2, 0)

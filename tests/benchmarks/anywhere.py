@@ -1,18 +1,20 @@
-"""Error of the SOC when the service starts anywhere in real captures, beside other methods.
+"""Error of the SOC after a start at any point of real captures, compared with other methods.
 
-Cell files come from `ocv` and `identify`. Each capture is entered cut in mid-load (or from its start, where the group says
-so), 0.2 too low and 0.2 too high, and judged from 15 min later on, above SOC 0.05, weighted by time:
+Cell files come from `ocv` and `identify`. The estimator starts in mid-load, or at the start of the capture for some groups,
+with an initial SOC 0.2 too low or 0.2 too high. Results are scored from 15 min after the start on, above SOC 0.05, weighted
+by time:
 
-- RMSE: of the SOC against the start of the capture less Ah / capacity, or a counter of its own; mean and worst run [%]
-- inside: share of time that the truth is inside soc +- 2 soc_std; mean and worst run [%]
+- RMSE: error of the SOC, with the true SOC by counting or by a counter of the capture; mean and worst run [%]
+- inside: fraction of time with the true SOC inside soc +- 2 soc_std; mean and worst run [%]
 - std: mean of soc_std [%]
-- score: interval score of that band as of 95 %: its width plus 40 times what lies outside; smaller is better [%]
-- NIS: of means of the innovation over ten minutes, 1 where S is right
+- score: interval score of this interval as a 95 % interval: width plus 40 times the distance outside; smaller is better [%]
+- NIS: of means of the innovation over ten minutes; 1 if their variance S is correct
 
-"Its own file": there is no other capture of the cell than that which the file was made from.
+"Its own file" marks groups whose capture was also used for the cell file, because the cell has no other capture.
 
-Beside it, with the same cell file: a textbook EKF (two RC pairs of constant elements, 5 mV of noise), an EKF with five time
-constants, resistances over SOC and temperature and the noise that suits it best, and counting from the OCV of the first sample.
+The other methods have the same cell file: a textbook EKF (two RC pairs with constant elements, 5 mV of noise), an EKF with
+five time constants, resistances over SOC and temperature and the measurement noise with the best result, and coulomb counting
+from the OCV of the first sample.
 """
 
 import sys
@@ -47,8 +49,8 @@ class Outcome:
 
     ours: Score
     nis: float
-    textbook: Score
-    five: Score
+    run_textbook_ekf: Score
+    run_five_tau_ekf: Score
     counting: Score
 
 
@@ -62,7 +64,7 @@ def main() -> None:
     table.add_column("counting", justify="right")
     with tempfile.TemporaryDirectory() as folder:
         for group in chosen(GROUPS, sys.argv[1:]):
-            table.add_row(group.name, *cells_of(list(outcomes(group, Path(folder)))))
+            table.add_row(group.name, *table_cells(list(outcomes(group, Path(folder)))))
         console.print(table)
         console.print(cycle_table(sys.argv[1:]))
         console.print(pulse_table(Path(folder), sys.argv[1:]))
@@ -87,69 +89,69 @@ def cycle_table(names: list[str]) -> Table:
     return table
 
 
-def cells_of(found: list[Outcome]) -> Iterator[str]:
+def table_cells(outcomes_of_group: list[Outcome]) -> Iterator[str]:
     """Yield the cells of one table row."""
-    ours = [o.ours for o in found]
+    ours = [o.ours for o in outcomes_of_group]
     yield f"{mean([s.rmse for s in ours]):.2f}/{max(s.rmse for s in ours):.2f}"
     yield f"{mean([s.cover for s in ours]):.0f}/{min(s.cover for s in ours):.0f}"
     yield f"{mean([s.std for s in ours]):.2f}"
     yield f"{mean([s.score for s in ours]):.2f}"
-    yield f"{mean([o.nis for o in found]):.2f}"
-    for other in ([o.textbook for o in found], [o.five for o in found]):
-        yield f"{mean([s.rmse for s in other]):.2f}"
-        yield f"{mean([s.cover for s in other]):.0f}"
-        yield f"{mean([s.score for s in other]):.1f}"
-    yield f"{mean([o.counting.rmse for o in found]):.2f}"
+    yield f"{mean([o.nis for o in outcomes_of_group]):.2f}"
+    for estimate in ([o.textbook for o in outcomes_of_group], [o.five for o in outcomes_of_group]):
+        yield f"{mean([s.rmse for s in estimate]):.2f}"
+        yield f"{mean([s.cover for s in estimate]):.0f}"
+        yield f"{mean([s.score for s in estimate]):.1f}"
+    yield f"{mean([o.counting.rmse for o in outcomes_of_group]):.2f}"
 
 
 def mean(values: list[float]) -> float:
-    """Return the mean of some numbers."""
+    """Return the arithmetic mean."""
     return float(np.mean(values))
 
 
 def outcomes(group: Group, folder: Path) -> Iterator[Outcome]:
-    """Return the outcomes of every capture and start of a group, except those that are too short."""
+    """Yield the outcomes of every capture and start of a group, except of captures that are too short."""
     for run in runs(group, folder):
         outcome = compare(*run)
         if outcome is not None:
             yield outcome
 
 
-def compare(cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float) -> Outcome | None:
-    """Run each method once; None if the capture is too short."""
-    run = run_of(Estimator(cell, initial_soc=start_soc), seen)
-    ours = score(seen["time_s"], run.soc, run.soc_std, truth)
+def compare(cell: CellModel, samples: SampleBlock, truth: Floats, start_soc: float) -> Outcome | None:
+    """Run each method once. Return None if the capture is too short."""
+    run = run_of(Estimator(cell, initial_soc=start_soc), samples)
+    ours = score(samples["time_s"], run.soc, run.soc_std, truth)
     if ours is None:
         return None
     grid = np.array(ocv_grid(cell))
-    first = float(Estimator(cell, initial_soc=start_soc).run(seen[:1])["soc_ocv"][0])
-    counted = first - charge_ah(seen) / cell.cell.capacity_ah
-    others = (
-        textbook(cell, seen, start_soc, grid),
-        five(cell, seen, start_soc, grid),
-        (counted, np.full(seen.size, np.nan)),
+    ocv_soc = float(Estimator(cell, initial_soc=start_soc).run(samples[:1])["soc_ocv"][0])
+    counted_soc = ocv_soc - charge_ah(samples) / cell.cell.capacity_ah
+    estimates = (
+        run_textbook_ekf(cell, samples, start_soc, grid),
+        run_five_tau_ekf(cell, samples, start_soc, grid),
+        (counted_soc, np.full(samples.size, np.nan)),
     )
-    scores = [score(seen["time_s"], *other, truth) for other in others]
+    scores = [score(samples["time_s"], *estimate, truth) for estimate in estimates]
     assert None not in scores
     return Outcome(ours, run.nis(900.0), *scores)
 
 
-def textbook(cell: CellModel, seen: SampleBlock, start_soc: float, grid: Floats) -> tuple[Floats, Floats]:
+def run_textbook_ekf(cell: CellModel, samples: SampleBlock, start_soc: float, grid: Floats) -> tuple[Floats, Floats]:
     """Return SOC and its standard deviation by the EKF with two RC pairs."""
     a = cell.a
     r_s, r1, c1, r2, c2 = (
         f(0.5, a) for f in (chen_mora.r_s, chen_mora.r_ts, chen_mora.c_ts, chen_mora.r_tl, chen_mora.c_tl)
     )
     model = np.array([3600.0 * cell.cell.capacity_ah, r_s, r1, r1 * c1, r2, r2 * c2])
-    time_s, current_a, voltage_v = (np.ascontiguousarray(seen[n]) for n in ("time_s", "current_a", "voltage_v"))
+    time_s, current_a, voltage_v = (np.ascontiguousarray(samples[n]) for n in ("time_s", "current_a", "voltage_v"))
     return fixed_ekf(time_s, current_a, voltage_v, start_soc, model, grid)
 
 
-def five(cell: CellModel, seen: SampleBlock, start_soc: float, grid: Floats) -> tuple[Floats, Floats]:
+def run_five_tau_ekf(cell: CellModel, samples: SampleBlock, start_soc: float, grid: Floats) -> tuple[Floats, Floats]:
     """Return SOC and its standard deviation by the EKF with five time constants."""
     p = filter_settings(cell, (grid[0], grid[1]), IdentifierSettings(), 1e-3, None)[0]
     ohm, energy_j = five_branches(p["weak_ohm"], p["strong_ohm"])
-    columns = [np.ascontiguousarray(seen[n]) for n in ("time_s", "current_a", "voltage_v", "temperature_c")]
+    columns = [np.ascontiguousarray(samples[n]) for n in ("time_s", "current_a", "voltage_v", "temperature_c")]
     columns[3] = np.where(np.isfinite(columns[3]), columns[3], 25.0)
     return ladder_ekf(*columns, start_soc, 3600.0 * cell.cell.capacity_ah, ohm, energy_j, FIVE_TAU_S, grid)
 

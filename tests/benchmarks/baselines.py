@@ -1,4 +1,4 @@
-"""Common estimators on the same capture: textbook EKFs with fixed parameters, and RLS on the ARX form."""
+"""Common estimators for comparison: EKFs with fixed parameters, a joint EKF, and RLS on the ARX form."""
 
 import math
 
@@ -12,32 +12,38 @@ from bms_estimator.numba_cache import njit
 
 EKF_VOLTAGE_SIGMA_V = 0.005
 """Measurement noise of the textbook filter [V]."""
-ELEMENT_STD, ELEMENT_WALK = 0.7, 1e-6
-"""Joint filter: std of ln of each element at the start, a factor of two, and the variance of its random walk [1/s]. Of 1e-8, 1e-7
-and 1e-6 the last has the smallest voltage error on the captures that are learned from (docs/theory/comparison.md)."""
+ELEMENT_STD = 0.7
+"""Joint filter: initial std of ln of each element, a factor of two."""
+ELEMENT_WALK = 1e-6
+"""Joint filter: variance of the random walk of ln of each element [1/s].
+
+Of 1e-8, 1e-7 and 1e-6 this value has the smallest voltage error on the identification captures (docs/theory/comparison.md).
+"""
 NOISE_WINDOW_S = 60.0
-"""Joint filter: time constant with which the noise of the voltage follows the innovations [s]."""
+"""Joint filter: time constant of the adaptation of the measurement noise to the innovations [s]."""
 LN_SPAN = math.log(4.0)
-"""Joint filter: elements stay within a quarter and four times the start, as those of the observer do."""
+"""Joint filter: bound of the change of ln of each element. Elements stay between a quarter and four times their start, as
+those of the observer."""
 FIVE_SIGMA_V = 0.1
-"""The same in the mean of a second, of the filter with five time constants [V]: of 5, 20, 50, 100 and 200 mV what suits it best."""
+"""Filter with five time constants: measurement noise of the mean of a second [V]. Of 5, 20, 50, 100 and 200 mV this value has
+the best result."""
 FIVE_TAU_S = np.array([2.0, 15.0, 80.0, 400.0, 2000.0])
 COLD_C = 0.0
-"""Single activation energy in place of two."""
+"""Temperature at which a single activation energy for each resistance has the effect of the cell file's two [C]."""
 
 
 @njit
 def fixed_ekf(
     time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats
 ) -> tuple[Floats, Floats]:
-    """Extended Kalman filter over (soc, v1, v2) with constant elements.
+    """Run an extended Kalman filter over (soc, v1, v2) with constant elements.
 
     Args:
         time_s: Shape (n,) [s].
         current_a: Shape (n,), positive on discharge [A].
         voltage_v: Shape (n,) [V].
-        soc0: Where it begins, 0..1.
-        cell: capacity [A s], R_s, R_1 [ohm], tau_1 [s], R_2 [ohm], tau_2 [s].
+        soc0: SOC at the first sample, 0..1.
+        cell: Capacity [A s], R_s, R_1 [ohm], tau_1 [s], R_2 [ohm], tau_2 [s].
         grid: Shape (2, m): OCV and its slope over SOC 0..1 [V].
 
     Returns:
@@ -70,9 +76,9 @@ def fixed_ekf(
 def joint_ekf(
     time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats
 ) -> tuple[Floats, Floats]:
-    """Joint extended Kalman filter over (soc, v1, v2, ln R_s, ln R_1, ln tau_1, ln R_2, ln tau_2).
+    """Run a joint extended Kalman filter over (soc, v1, v2, ln R_s, ln R_1, ln tau_1, ln R_2, ln tau_2).
 
-    The noise of the voltage is adapted from the innovations of the last minute, as an adaptive EKF does.
+    The measurement noise is adapted to the innovations of the last minute, as in an adaptive EKF.
 
     Args:
         time_s: Shape (n,) [s].
@@ -120,7 +126,7 @@ def joint_ekf(
         s = model_v2 + noise_v2
         x = x + ph / s * innovation
         x[0] = min(max(x[0], 0.0), 1.0)
-        for j in range(5):  # the bounds that every method has
+        for j in range(5):  # bounds that every method has
             start = math.log(cell[1 + j])
             x[3 + j] = min(max(x[3 + j], start - LN_SPAN), start + LN_SPAN)
         p = p - np.outer(ph, ph) / s
@@ -130,17 +136,19 @@ def joint_ekf(
 
 
 def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]:
-    """A cell file's ladder with ``FIVE_TAU_S`` instead: each branch shared between the two nearest, by the logarithm.
+    """Convert a cell file's ladder to the time constants ``FIVE_TAU_S``.
+
+    The resistance of each RC pair is shared between the two nearest time constants, linearly in their logarithm.
 
     Args:
-        weak_ohm: Shape (GRID, RESISTANCES), as in the filter's settings.
-        strong_ohm: The same.
+        weak_ohm: Resistances with weak temperature dependence, shape (GRID, RESISTANCES) [ohm].
+        strong_ohm: Resistances with strong temperature dependence, shape (GRID, RESISTANCES) [ohm].
 
     Returns:
         Resistances at 25 C, shape (GRID, 6) [ohm], and an activation energy of each, shape (6,) [J/mol].
     """
 
-    def shared(ohm: Floats) -> Floats:
+    def share_between_nearest(ohm: Floats) -> Floats:
         five = np.zeros((len(ohm), 6))
         five[:, 0] = ohm[:, 0]
         for k, tau_s in enumerate(TAU_S):
@@ -150,7 +158,7 @@ def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]
             five[:, 2 + i] += ohm[:, 1 + k] * (position - i)
         return five
 
-    weak, strong = shared(weak_ohm), shared(strong_ohm)
+    weak, strong = share_between_nearest(weak_ohm), share_between_nearest(strong_ohm)
     middle = len(weak) // 2
     factor = weak[middle] * arrhenius(WEAK_J, COLD_C) + strong[middle] * arrhenius(STRONG_J, COLD_C)
     ratio = np.log(np.maximum(factor / np.maximum(weak[middle] + strong[middle], 1e-9), 1.0))
@@ -170,18 +178,20 @@ def ladder_ekf(
     tau_s: Floats,
     grid: Floats,
 ) -> tuple[Floats, Floats]:
-    """Extended Kalman filter over SOC and the voltages of five RC pairs, resistances by SOC and temperature.
+    """Run an extended Kalman filter over SOC and the voltages of five RC pairs.
+
+    The resistances depend on SOC and temperature.
 
     Args:
         time_s: Shape (n,) [s].
         current_a: Shape (n,), positive on discharge [A].
         voltage_v: Shape (n,) [V].
         temperature_c: Shape (n,) [C].
-        soc0: Where it begins, 0..1.
-        capacity_as: [A s].
-        ohm: As ``five_branches`` gives them.
-        energy_j: As ``five_branches`` gives them.
-        tau_s: Shape (5,) [s].
+        soc0: SOC at the first sample, 0..1.
+        capacity_as: Capacity [A s].
+        ohm: Resistances by ``five_branches`` [ohm].
+        energy_j: Activation energies by ``five_branches`` [J/mol].
+        tau_s: Time constants, shape (5,) [s].
         grid: Shape (2, m): OCV and its slope over SOC 0..1 [V].
 
     Returns:
@@ -218,9 +228,9 @@ def ladder_ekf(
 
 @njit
 def rls_arx(current_a: Floats, overpotential_v: Floats, forgetting: float) -> Floats:
-    """Recursive least squares with forgetting on the ARX form of a 2RC model.
+    """Run recursive least squares with forgetting on the ARX form of a model with two RC pairs.
 
-    v[k] = c1 v[k-1] + c2 v[k-2] + c3 i[k] + c4 i[k-1] + c5 i[k-2], v the overpotential E_o - y.
+    v[k] = c1 v[k-1] + c2 v[k-2] + c3 i[k] + c4 i[k-1] + c5 i[k-2] with the overpotential v = E_o - y.
 
     Args:
         current_a: Shape (n,), evenly sampled, positive on discharge [A].
@@ -242,14 +252,14 @@ def rls_arx(current_a: Floats, overpotential_v: Floats, forgetting: float) -> Fl
         theta = theta + gain * (overpotential_v[k] - phi @ theta)
         p = (p - np.outer(gain, pp)) / forgetting
         trace = np.trace(p)
-        if trace > 1e6:  # wind-up while nothing excites
+        if trace > 1e6:  # limits the wind-up without excitation
             p *= 1e6 / trace
         history[k] = theta
     return history
 
 
 def simulate_arx(coefficients: NDArray[np.float64], current_a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Overpotential [V] of the ARX model under ``current_a`` [A], from rest. Shape (n,)."""
+    """Return the overpotential of the ARX model under ``current_a`` [A], from rest. Shape (n,) [V]."""
     from scipy.signal import lfilter  # noqa: PLC0415 - scipy.signal is slow to import and used here only
 
     c1, c2, c3, c4, c5 = coefficients

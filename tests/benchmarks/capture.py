@@ -1,4 +1,4 @@
-"""Replay of a raw serial capture through the command line, decoding included."""
+"""Benchmark of the replay of a raw serial capture by the command line, including its decoding."""
 
 import json
 import re
@@ -22,10 +22,10 @@ from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWri
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOURS = (4, 16)
-"""Durations of a short and a long capture [h]; both must take equal memory."""
+"""Durations of a short and a long capture [h]. Their replays must take equal memory."""
 GROWTH_MIB = 16.0
 """Permitted difference of memory, which the allocator may retain [MiB]."""
-PIECE = 1_000_000
+RECORDS_PER_WRITE = 1_000_000
 RECORD = np.dtype([("arrival_s", "<f8"), ("length", "<u4"), ("data", "u1", SAMPLE_FRAME_BYTES), ("crc", "<u2")])
 """Record of a capture with one frame, as received live at 100 Hz."""
 
@@ -51,15 +51,15 @@ def rows() -> Iterator[Row]:
         for count in samples:
             path.unlink(missing_ok=True)
             write_capture(path, block[:count])
-            replay(path, Path(folder), count)  # the file is in memory, the kernels in their cache
+            replay(path, Path(folder), count)  # fills the disk cache and the cache of kernels
             replays.append(replay(path, Path(folder), count))
         megabytes = path.stat().st_size / 1e6
     short, long = replays
     rate = long.samples_per_s
-    what = f"replay of {HOURS[1]} h at {RATE_HZ} Hz, {long.samples / 1e6:.2f} M samples, {megabytes:.0f} MB"
-    yield Row(what, "at least 500,000 /s", f"{rate:,.0f} /s ({long.wall_s:.1f} s)", rate >= 5e5)
-    grown = long.rss_mib - short.rss_mib
-    met = grown <= GROWTH_MIB
+    quantity = f"replay of {HOURS[1]} h at {RATE_HZ} Hz, {long.samples / 1e6:.2f} M samples, {megabytes:.0f} MB"
+    yield Row(quantity, "at least 500,000 /s", f"{rate:,.0f} /s ({long.wall_s:.1f} s)", rate >= 5e5)
+    growth_mib = long.rss_mib - short.rss_mib
+    met = growth_mib <= GROWTH_MIB
     yield Row(
         f"  memory, {HOURS[0]} h and {HOURS[1]} h", "does not grow", f"{short.rss_mib:.0f}, {long.rss_mib:.0f} MiB", met
     )
@@ -67,22 +67,22 @@ def rows() -> Iterator[Row]:
 
 
 def write_capture(path: Path, block: SampleBlock) -> None:
-    """Write a capture of a block, one frame a record, each a millisecond after its sample."""
+    """Write a capture of a block with one frame in each record, received a millisecond after its sample."""
     with CaptureWriter(path, CaptureHeader()) as writer:
         writer.write(0.0, b"\0" + hello(RATE_HZ))
     with path.open("ab") as file:
-        for first in range(0, block.size, PIECE):
-            piece = block[first : first + PIECE]
-            records = np.zeros(piece.size, dtype=RECORD)
-            records["arrival_s"] = piece["time_s"] + 1e-3
+        for first in range(0, block.size, RECORDS_PER_WRITE):
+            part = block[first : first + RECORDS_PER_WRITE]
+            records = np.zeros(part.size, dtype=RECORD)
+            records["arrival_s"] = part["time_s"] + 1e-3
             records["length"] = SAMPLE_FRAME_BYTES
-            records["data"] = sample_frames(piece, first)
-            _seal(records.view(np.uint8).reshape(piece.size, RECORD.itemsize))
+            records["data"] = sample_frames(part, first)
+            _write_checksums(records.view(np.uint8).reshape(part.size, RECORD.itemsize))
             file.write(records.tobytes())
 
 
 @njit
-def _seal(records):
+def _write_checksums(records):
     for j in range(records.shape[0]):
         crc = crc16(records[j], 0, records.shape[1] - 2)
         records[j, -2], records[j, -1] = crc & 0xFF, crc >> 8
@@ -92,7 +92,7 @@ def replay(path: Path, folder: Path, samples: int) -> Replay:
     """Run ``bms-estimator replay``.
 
     Raises:
-        RuntimeError: It did not take every sample.
+        RuntimeError: Some samples were not replayed.
     """
     rss_mib = 0.0
     with (folder / "result.json").open("w+") as result:
@@ -102,14 +102,17 @@ def replay(path: Path, folder: Path, samples: int) -> Replay:
             time.sleep(0.05)
         result.seek(0)
         text = result.read()
-    found = json.loads(text) if process.returncode == 0 else {}
-    if found.get("samples") != samples:
+    summary = json.loads(text) if process.returncode == 0 else {}
+    if summary.get("samples") != samples:
         raise RuntimeError(f"{samples} samples were to be replayed, exit code {process.returncode}: {text}")
-    fields = {name: found[name] for name in ("samples", "wall_s", "samples_per_s", "lock_lost")}
+    fields = {name: summary[name] for name in ("samples", "wall_s", "samples_per_s", "lock_lost")}
     return Replay(**fields, rss_mib=rss_mib)
 
 
 def peak_mib(pid: int) -> float:
-    """Return the peak resident memory of a process [MiB]; wait4 includes the parent's at the fork."""
-    found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
-    return int(found[1]) / 1024 if found else 0.0
+    """Return the peak resident memory of a process [MiB].
+
+    It is read from /proc, because wait4 includes the memory of the parent at the fork.
+    """
+    match = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    return int(match[1]) / 1024 if match else 0.0

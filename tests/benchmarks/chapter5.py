@@ -1,4 +1,7 @@
-"""Chapter 5 on every real cell with suitable captures: ``make chapter5``."""
+"""Chapter 5 of the thesis on every real cell with suitable captures: ``make chapter5``.
+
+Numbers in parentheses are equations of the thesis.
+"""
 
 import itertools
 import sys
@@ -29,11 +32,11 @@ class Experiment:
     """One cell at one temperature.
 
     Attributes:
-        name: In the table.
-        cell: File that capacity and limits are taken of; nothing else of it is used.
-        capacity_ah: As the captures count from full [Ah].
-        captures: Name in the folder of captures, and what it serves for.
-        room: At room temperature, as the thesis's experiments.
+        name: Name in the table.
+        cell: Cell file, of which only the limits are used.
+        capacity_ah: Capacity by the captures, counted from full [Ah].
+        captures: Name and kind of each capture.
+        room: True for room temperature, as in the experiments of the thesis.
     """
 
     name: str
@@ -43,16 +46,22 @@ class Experiment:
     room: bool = True
 
 
-def _panasonic(name: str, at: str, *captures: tuple[str, Kind]) -> Experiment:
-    """Return its HPPC, discharges with a rest after each, as its relaxation test."""
-    found = tuple((f"{PF}{at}_{capture}", kind) for capture, kind in (("hppc", RELAXATION), *captures))
-    return Experiment(f"18650PF {name}", "nca", 2.9, found, room=at == "25")
+def _panasonic(name: str, index: str, *captures: tuple[str, Kind]) -> Experiment:
+    """Return the experiment of the Panasonic cell at one temperature.
+
+    Its HPPC, discharges with a rest after each, is the relaxation test.
+    """
+    result = tuple((f"{PF}{index}_{capture}", kind) for capture, kind in (("hppc", RELAXATION), *captures))
+    return Experiment(f"18650PF {name}", "nca", 2.9, result, room=index == "25")
 
 
-def _a123(name: str, at: str) -> Experiment:
-    """Return its drive cycles with a rest of 5 min each half hour as a relaxation test, and C/30."""
-    captures = ((f"{LFP}dyn_{at}", RELAXATION), (f"{LFP}c30_dis_{at}", CONSTANT))
-    return Experiment(f"A123 {name}", "lfp", 2.05, captures, room=at == "p25")
+def _a123(name: str, index: str) -> Experiment:
+    """Return the experiment of the A123 cell at one temperature.
+
+    Drive cycles with a rest of 5 min each half hour are the relaxation test. The constant load is C/30.
+    """
+    captures = ((f"{LFP}dyn_{index}", RELAXATION), (f"{LFP}c30_dis_{index}", CONSTANT))
+    return Experiment(f"A123 {name}", "lfp", 2.05, captures, room=index == "p25")
 
 
 EXPERIMENTS = (
@@ -89,24 +98,24 @@ EXPERIMENTS = (
     _a123("5 C", "p05"),
     _a123("-15 C", "n15"),
 )
-"""The LG M50 has no relaxation test: step 1 cannot be run."""
+"""Experiments. The LG M50 is not among them, because it has no relaxation test for step 1."""
 CONSTANT_C = 0.01
-"""Minimum C-rate of a charge or discharge [1/h]."""
+"""Minimum C-rate of a charge or discharge."""
 VOLTAGE_STEP_V = 1e-3
 ROOM = [experiment.name for experiment in EXPERIMENTS if experiment.room]
 R_S_SOC = (0.98, 0.9, 0.7, 0.5, 0.3, 0.1, 0.05)
 """SOC values at which R_s is printed."""
 MIDDLE_SOC = 0.5
-"""SOC values at which the fit of (2.10) is judged."""
+"""SOC near which the residual of the fit of (2.10) is printed."""
 
 
-def protocol(experiment: Experiment) -> Procedure:
-    """Return the procedure on one cell; a constant load is cut to its discharge."""
-    found = load_cell(experiment.cell, experiment.capacity_ah)
+def make_procedure(experiment: Experiment) -> Procedure:
+    """Return the procedure on one cell. Of a constant load only the discharge is used."""
+    result = load_cell(experiment.cell, experiment.capacity_ah)
     captures = [
         Capture(name.split("/")[1], kind, _samples(name, kind, experiment)) for name, kind in experiment.captures
     ]
-    return Procedure(found, captures, VOLTAGE_STEP_V)
+    return Procedure(result, captures, VOLTAGE_STEP_V)
 
 
 def _samples(name: str, kind: Kind, experiment: Experiment) -> SampleBlock:
@@ -114,15 +123,15 @@ def _samples(name: str, kind: Kind, experiment: Experiment) -> SampleBlock:
     return discharge(rows, CONSTANT_C * experiment.capacity_ah) if kind is Kind.CONSTANT else rows
 
 
-def discharge(rows: SampleBlock, least_a: float) -> SampleBlock:
+def discharge(rows: SampleBlock, min_a: float) -> SampleBlock:
     """Return the discharge between two charges with the largest charge, until its last sample under load [A]."""
-    edges = np.r_[0, np.flatnonzero(np.diff((rows["current_a"] < -least_a).astype(np.int8))) + 1, rows.size]
-    stretches = [rows[first:last] for first, last in itertools.pairwise(edges)]
-    most = max(stretches, key=lambda stretch: charge_ah(stretch)[-1])
-    return most[: int(np.flatnonzero(most["current_a"] > least_a)[-1]) + 1]
+    edges = np.r_[0, np.flatnonzero(np.diff((rows["current_a"] < -min_a).astype(np.int8))) + 1, rows.size]
+    parts_between_charges = [rows[first_cell:last] for first_cell, last in itertools.pairwise(edges)]
+    largest_discharge = max(parts_between_charges, key=lambda stretch: charge_ah(stretch)[-1])
+    return largest_discharge[: int(np.flatnonzero(largest_discharge["current_a"] > min_a)[-1]) + 1]
 
 
-def lines(name: str, p: Procedure) -> Iterator[tuple[str, ...]]:
+def load_rows(name: str, p: Procedure) -> Iterator[tuple[str, ...]]:
     """Yield a table row for each load."""
     validating = [capture.name for capture in p.validating]
     for load, run in p.dynamic.items():
@@ -147,20 +156,20 @@ def main() -> None:
     if not DATA.is_dir():
         sys.exit(f"{DATA}: the captures are not there")
     console = Console(width=WIDTH)
-    protocols = {experiment.name: protocol(experiment) for experiment in EXPERIMENTS}
-    console.print(errors(protocols))
-    console.print(parameters(protocols))
-    first = EXPERIMENTS[0].name
-    otherwise = variants(EXPERIMENTS[0], protocols[first])
-    console.print(resistances(first, otherwise))
-    console.print(worst(first, protocols[first]))
-    console.print(ablation(first, otherwise))
-    for on, names in (("all captures", list(protocols)), ("captures at room temperature", ROOM)):
-        console.print(verdicts(on, [protocols[name] for name in names]))
-    console.print(steps_by_variant(protocols))
+    procedures = {experiment.name: make_procedure(experiment) for experiment in EXPERIMENTS}
+    console.print(errors(procedures))
+    console.print(parameters(procedures))
+    first_cell = EXPERIMENTS[0].name
+    variants_of_first = variants(EXPERIMENTS[0], procedures[first_cell])
+    console.print(resistances(first_cell, variants_of_first))
+    console.print(largest_errors(first_cell, procedures[first_cell]))
+    console.print(ablation(first_cell, variants_of_first))
+    for captures_text, names in (("all captures", list(procedures)), ("captures at room temperature", ROOM)):
+        console.print(verdicts(captures_text, [procedures[name] for name in names]))
+    console.print(steps_by_variant(procedures))
 
 
-def errors(protocols: dict[str, Procedure]) -> Table:
+def errors(procedures: dict[str, Procedure]) -> Table:
     """Return the errors of Tables 11 and 13."""
     printed_means = ", ".join(f"{load} {value}" for load, value in printed_values.TABLE_11.items())
     table = Table(
@@ -180,21 +189,21 @@ def errors(protocols: dict[str, Procedure]) -> Table:
         table.add_column(column)
     for column in heads:
         table.add_column(column, justify="right")
-    for name, p in protocols.items():
-        for row in lines(name, p):
+    for name, p in procedures.items():
+        for row in load_rows(name, p):
             table.add_row(*row)
     return table
 
 
-def parameters(protocols: dict[str, Procedure]) -> Table:
-    """Print the results of the three steps."""
+def parameters(procedures: dict[str, Procedure]) -> Table:
+    """Return the table of the results of the three steps."""
     table = Table(title="steps 1 to 3")
     residual = f"residual in mV, nearest SOC {MIDDLE_SOC}"
     heads = ("cell", "step 1: points", residual, "step 2 on", "outcome", "a13..a15 in ohm, -, ohm")
     for column in (*heads, "RC products in s", "of the rests in s"):
         table.add_column(column, overflow="fold")
-    for name, p in protocols.items():
-        residual_v, found = p.joint_fit.residual_v, list(products(p))
+    for name, p in procedures.items():
+        residual_v, result = p.joint_fit.residual_v, list(products(p))
         middle_v = residual_v[np.argmin(np.abs(pooled(p.tests).soc - MIDDLE_SOC))]
         table.add_row(
             name,
@@ -203,32 +212,32 @@ def parameters(protocols: dict[str, Procedure]) -> Table:
             p.smallest.name,
             p.adaptive.outcome,
             ", ".join(f"{value:.4g}" for value in p.r_s_fit.a),
-            ", ".join(f"{estimated_s:.3g}" for _, estimated_s, _ in found),
-            ", ".join(f"{seen_s:.3g}" for _, _, seen_s in found),
+            ", ".join(f"{estimated_s:.3g}" for _, estimated_s, _ in result),
+            ", ".join(f"{seen_s:.3g}" for _, _, seen_s in result),
         )
     return table
 
 
-def verdicts(on: str, protocols: list[Procedure]) -> Table:
+def verdicts(captures_text: str, procedures: list[Procedure]) -> Table:
     """Return the verdict on each claim over the captures of several cells."""
-    table = Table(title=f"claims on {on}; each must be met on more than half of them")
+    table = Table(title=f"claims on {captures_text}; each must be met on more than half of them")
     for column in ("claim", "where", "criterion", "met", "found", "verdict"):
         table.add_column(column)
-    for key, *outcome in outcomes(protocols):
+    for key, *outcome in outcomes(procedures):
         where, criterion, _ = CLAIMS[key]
         table.add_row(key, where, criterion, *outcome)
     return table
 
 
-def outcomes(protocols: list[Procedure]) -> Iterator[tuple[str, str, str, str]]:
-    """Return for each claim: key, how often it was met, range of the values, verdict."""
+def outcomes(procedures: list[Procedure]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield for each claim: key, number of cells that meet it, range of the values, verdict."""
     for key in CLAIMS:
-        found = claim(key, protocols)
-        yield key, f"{found.met} of {len(found.results)}", found.span, found.verdict.value
+        result = claim(key, procedures)
+        yield key, f"{result.met} of {len(result.results)}", result.span, result.verdict.value
 
 
 class FastInStep3(Procedure):
-    """Constant loads of any current give R_s."""
+    """Procedure in which constant loads of any current contribute to R_s."""
 
     @property
     def step_3(self) -> list[Capture]:
@@ -245,7 +254,7 @@ class OwnInStep3(FastInStep3):
 
 
 class Unweighted(Procedure):
-    """The plain mean of (4.2) as printed, for any current (E19)."""
+    """Procedure with the unweighted mean of (4.2), as printed, for any current (erratum 19)."""
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
@@ -254,7 +263,10 @@ class Unweighted(Procedure):
 
 
 class PrintedSign(Unweighted):
-    """The plain mean of (4.2) with its printed sign, by which R_s is negative; the fit holds it at zero (E19)."""
+    """Procedure with the unweighted mean of (4.2) with its printed sign (erratum 19).
+
+    With this sign R_s is negative, so that the fit limits it to zero.
+    """
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
@@ -266,15 +278,15 @@ AS_IT_IS, UNWEIGHTED, FAST = "as it is", "(4.2) not weighted by the current", "1
 VARIANTS = {UNWEIGHTED: Unweighted, FAST: FastInStep3, "each load in its own step 3 as well": OwnInStep3}
 
 
-def variants(experiment: Experiment, made: Procedure) -> dict[str, Procedure]:
-    """Return variants of a procedure: other ways of step 3, and other bounds."""
+def variants(experiment: Experiment, default_procedure: Procedure) -> dict[str, Procedure]:
+    """Return variants of a procedure, with other versions of step 3 or other bounds."""
     model = load_cell(experiment.cell, experiment.capacity_ah)
     bounds = {f"a{i}": model.bounds(i) for i in range(1, 13)}
     own_bounds = model.model_copy(update={"adaptation": bounds})
     return {
-        AS_IT_IS: made,
-        **{name: variant(model, made.captures, VOLTAGE_STEP_V) for name, variant in VARIANTS.items()},
-        "bounds around the cell file's elements": Procedure(own_bounds, made.captures, VOLTAGE_STEP_V),
+        AS_IT_IS: default_procedure,
+        **{name: variant(model, default_procedure.captures, VOLTAGE_STEP_V) for name, variant in VARIANTS.items()},
+        "bounds around the cell file's elements": Procedure(own_bounds, default_procedure.captures, VOLTAGE_STEP_V),
     }
 
 
@@ -287,61 +299,71 @@ STEP_3 = {
 """Variants of step 3 for the claim of Table 11 on steps."""
 
 
-def steps_met(protocols: dict[str, Procedure]) -> Iterator[tuple[str, str, str]]:
-    """Yield for each variant of step 3 how often the printed mean error under steps is met, on all captures and at room temperature."""
-    for what, variant in STEP_3.items():
-        made = {name: variant(p.cell, p.captures, VOLTAGE_STEP_V) for name, p in protocols.items()}
-        found = (claim("steps, mean", [made[name] for name in names]) for names in (list(made), ROOM))
-        yield what, *(f"{one.met} of {len(one.results)}" for one in found)
+def steps_met(procedures: dict[str, Procedure]) -> Iterator[tuple[str, str, str]]:
+    """Yield for each variant of step 3 the numbers of cells that meet the printed mean error under steps.
+
+    The first number is over all captures, the second over those at room temperature.
+    """
+    for variant_name, variant in STEP_3.items():
+        default_procedure = {name: variant(p.cell, p.captures, VOLTAGE_STEP_V) for name, p in procedures.items()}
+        result = (
+            claim("steps, mean", [default_procedure[name] for name in names])
+            for names in (list(default_procedure), ROOM)
+        )
+        yield variant_name, *(f"{claim_result.met} of {len(claim_result.results)}" for claim_result in result)
 
 
-def steps_by_variant(protocols: dict[str, Procedure]) -> Table:
-    """Compute the claim of Table 11 for steps by variants of step 3."""
+def steps_by_variant(procedures: dict[str, Procedure]) -> Table:
+    """Return the table of the claim of Table 11 on steps, by variants of step 3."""
     table = Table(title="mean error under steps at most as printed, by step 3")
     for column in ("step 3", "all captures", "room temperature"):
         table.add_column(column)
-    for row in steps_met(protocols):
+    for row in steps_met(procedures):
         table.add_row(*row)
     return table
 
 
-def ablation(name: str, otherwise: dict[str, Procedure]) -> Table:
-    """Print the value of the parts of step 3 and of the bounds on one cell."""
+def ablation(name: str, variants_of_first: dict[str, Procedure]) -> Table:
+    """Return the table of the errors on one cell with each variant."""
     table = Table(title=f"{name}: mean / largest error in % when one thing is done otherwise")
-    loads = [capture.name for capture in otherwise[AS_IT_IS].validating]
+    loads = [capture.name for capture in variants_of_first[AS_IT_IS].validating]
     for column in ("", *loads):
         table.add_column(column, justify="right")
-    for what, p in otherwise.items():
-        found = (p.dynamic[load] for load in loads)
-        table.add_row(what, *(f"{run.mean_percent:.2f} / {run.max_percent:.1f}" for run in found))
+    for variant_name, p in variants_of_first.items():
+        result = (p.dynamic[load] for load in loads)
+        table.add_row(variant_name, *(f"{run.mean_percent:.2f} / {run.max_percent:.1f}" for run in result))
     return table
 
 
-def resistances(name: str, otherwise: dict[str, Procedure]) -> Table:
+def resistances(name: str, variants_of_first: dict[str, Procedure]) -> Table:
     """Return R_s over SOC by (4.2) for each load of a cell, and by the fit to their mean."""
     table = Table(title=f"{name}: R_s by (4.2) in mohm, by SOC; its fit (2.9)")
     for column in ("load", "its current in A", *map(str, R_S_SOC)):
         table.add_column(column, justify="right")
-    least_a = CONSTANT_C * otherwise[FAST].cell.cell.capacity_ah
-    loaded = {c.name: c.samples["current_a"][c.samples["current_a"] > least_a] for c in otherwise[FAST].step_3}
-    for load, curve in otherwise[FAST].r_s_curves.items():
-        at = np.interp(R_S_SOC, curve.soc, curve.r_s_ohm)
-        table.add_row(load, f"{np.median(loaded[load]):.3f}", *(f"{1e3 * ohm:.0f}" for ohm in at))
-    for what in (AS_IT_IS, UNWEIGHTED):
-        fitted = otherwise[what].r_s_fit(np.array(R_S_SOC))
-        table.add_row(f"fit, {what}", "", *(f"{1e3 * ohm:.0f}" for ohm in fitted))
+    min_a = CONSTANT_C * variants_of_first[FAST].cell.cell.capacity_ah
+    loaded = {c.name: c.samples["current_a"][c.samples["current_a"] > min_a] for c in variants_of_first[FAST].step_3}
+    for load, curve in variants_of_first[FAST].r_s_curves.items():
+        index = np.interp(R_S_SOC, curve.soc, curve.r_s_ohm)
+        table.add_row(load, f"{np.median(loaded[load]):.3f}", *(f"{1e3 * ohm:.0f}" for ohm in index))
+    for variant_name in (AS_IT_IS, UNWEIGHTED):
+        fitted = variants_of_first[variant_name].r_s_fit(np.array(R_S_SOC))
+        table.add_row(f"fit, {variant_name}", "", *(f"{1e3 * ohm:.0f}" for ohm in fitted))
     return table
 
 
-def worst(name: str, p: Procedure) -> Table:
-    """Print where each load of one cell has its largest error."""
+def largest_errors(name: str, p: Procedure) -> Table:
+    """Return the table of the largest error of each load of one cell."""
     table = Table(title=f"{name}: where the largest error is")
     for column in ("load", "at SOC", "measured in V", "less predicted in V", "current in A"):
         table.add_column(column, justify="right")
     for load, run in p.dynamic.items():
-        at = np.flatnonzero(run.aligned)[np.argmax(run.error_percent[run.aligned])]
+        index = np.flatnonzero(run.aligned)[np.argmax(run.error_percent[run.aligned])]
         table.add_row(
-            load, f"{run.soc[at]:.2f}", f"{run.voltage_v[at]:.2f}", f"{run.error_v[at]:.2f}", f"{run.current_a[at]:.2f}"
+            load,
+            f"{run.soc[index]:.2f}",
+            f"{run.voltage_v[index]:.2f}",
+            f"{run.error_v[index]:.2f}",
+            f"{run.current_a[index]:.2f}",
         )
     return table
 

@@ -1,9 +1,10 @@
-"""An attack with the token of one edge: how long other packs of the tenant wait for their estimates meanwhile.
+"""Attack with the token of one edge, and its effect on the latency of estimates of other packs of the tenant.
 
 make load ARGS="--minutes 0 --hours 0 --attack-s 30"
 
-Real server, one worker as a process, honest edges that send a block each half second, and the attacker as a process that
-sends as fast as the server takes it. The wait of a block is from before it is published until its state arrives.
+The server is real, and one worker runs as a process. Honest edges send a block each half second. The attacker is a process
+that sends as fast as the server accepts its messages. The latency of a block is the time from before its publication until
+its state arrives.
 """
 
 import asyncio
@@ -47,12 +48,12 @@ ATTACKS = {
 }
 
 
-def attack(port: int, token: str, name: str) -> None:
-    """Send one kind of message until the process is ended."""
-    asyncio.run(_attack(port, token, ATTACKS[name]()))
+def run_attacker(port: int, token: str, name: str) -> None:
+    """Send one kind of message until the process is killed."""
+    asyncio.run(_flood(port, token, ATTACKS[name]()))
 
 
-async def _attack(port: int, token: str, data: bytes) -> None:
+async def _flood(port: int, token: str, data: bytes) -> None:
     number = 0
     async with mqtt_client(port, token) as edge:
         edge.pending_calls_threshold = IN_FLIGHT
@@ -63,10 +64,10 @@ async def _attack(port: int, token: str, data: bytes) -> None:
 
 
 @contextlib.contextmanager
-def attacked(tenant: Tenant, name: str) -> Iterator[None]:
+def attack_in_background(tenant: Tenant, name: str) -> Iterator[None]:
     """Run an attack while the context lasts."""
     arguments = tenant.cluster.mqtt_port, tenant.token(ATTACKER), name
-    process = mp.get_context("spawn").Process(target=attack, args=arguments, daemon=True)
+    process = mp.get_context("spawn").Process(target=run_attacker, args=arguments, daemon=True)
     process.start()
     try:
         yield
@@ -76,97 +77,97 @@ def attacked(tenant: Tenant, name: str) -> Iterator[None]:
 
 
 @dataclass
-class Waits:
-    """Waits of the honest packs' blocks.
+class Latencies:
+    """Latencies of the blocks of the honest packs.
 
     Attributes:
-        published_s: When a block was published [monotonic s], by pack and time of its last sample.
-        waits_s: Of the blocks whose state has arrived [s].
+        published_s: Monotonic time of the publication of a block [s], by pack and time of its last sample.
+        latencies_s: Latencies of the blocks whose state has arrived [s].
     """
 
     published_s: dict[tuple[str, float], float] = field(default_factory=dict)
-    waits_s: list[float] = field(default_factory=list)
+    latencies_s: list[float] = field(default_factory=list)
 
-    async def hear(self, message: Msg) -> None:
-        """Process a published state."""
+    async def record_state(self, message: Msg) -> None:
+        """Record the latency of the block whose state was published."""
         key = message.subject.split(".")[1], json.loads(message.data)["board_time_s"]
         if key in self.published_s:
-            self.waits_s.append(time.monotonic() - self.published_s.pop(key))
+            self.latencies_s.append(time.monotonic() - self.published_s.pop(key))
 
-    async def all_arrived(self) -> None:
+    async def wait_for_all(self) -> None:
         """Wait until a state has arrived for every block."""
         async with asyncio.timeout(LONG_S):
             while self.published_s:  # noqa: ASYNC110 - states arrive in a callback
                 await asyncio.sleep(0.01)
 
-    def take(self) -> tuple[float, float, int]:
-        """Return median [s], maximum [s] and number of the waits, and reset them."""
-        waits_s, self.waits_s = self.waits_s, []
-        return float(np.median(waits_s)), max(waits_s), len(waits_s)
+    def summarize(self) -> tuple[float, float, int]:
+        """Return median [s], maximum [s] and number of the latencies, and delete them."""
+        latencies_s, self.latencies_s = self.latencies_s, []
+        return float(np.median(latencies_s)), max(latencies_s), len(latencies_s)
 
 
 @dataclass
-class Honest:
-    """The honest packs' edges.
+class HonestEdges:
+    """Edges of the honest packs.
 
     Attributes:
         edges: Connections by pack.
-        waits: Of their blocks.
-        number: Of the last block of each.
+        latencies: Latencies of their blocks.
+        number: Number of the last block of each pack.
     """
 
     edges: dict[str, Edge]
-    waits: Waits
+    latencies: Latencies
     number: int = 0
 
     async def send(self, seconds: float) -> tuple[float, float, int]:
-        """Send blocks for this duration; return the result of ``Waits.take``."""
+        """Send blocks for this duration; return the result of ``Latencies.summarize``."""
         end_s = time.monotonic() + seconds
         while True:
             self.number += 1
             await asyncio.gather(*(self._send(pack, edge) for pack, edge in self.edges.items()))
             if time.monotonic() >= end_s:
                 break
-        await self.waits.all_arrived()
-        return self.waits.take()
+        await self.latencies.wait_for_all()
+        return self.latencies.summarize()
 
     async def _send(self, pack: str, edge: Edge) -> None:
         last_s = PERIOD_S * (SAMPLES * self.number - 1)
-        self.waits.published_s[pack, last_s] = time.monotonic()
+        self.latencies.published_s[pack, last_s] = time.monotonic()
         await edge.publish(f"raw/{pack}", block(pack, self.number), qos=1)
         await asyncio.sleep(PERIOD_OF_BLOCKS_S)
 
 
 @contextlib.asynccontextmanager
-async def honest(tenant: Tenant, reader: Client) -> AsyncIterator[Honest]:
+async def connect_honest_edges(tenant: Tenant, reader: Client) -> AsyncIterator[HonestEdges]:
     """Connect the honest packs."""
-    waits = Waits()
-    await reader.subscribe(subjects.published("*", "state"), cb=waits.hear)
+    latencies = Latencies()
+    await reader.subscribe(subjects.published("*", "state"), cb=latencies.record_state)
     async with AsyncExitStack() as stack:
-        yield Honest({pack: await stack.enter_async_context(tenant.edge(pack)) for pack in PACKS}, waits)
+        yield HonestEdges({pack: await stack.enter_async_context(tenant.edge(pack)) for pack in PACKS}, latencies)
 
 
 async def measure(folder: Path, seconds: float) -> list[Row]:
-    """Measure without an attack and with each."""
+    """Measure the latencies without an attack and with each attack."""
     with one_tenant(folder) as tenant:
         await tenant.make_streams(PARTITIONS, RAW_BYTES)
         admin, reader = await tenant.program(Role.ADMIN), await tenant.program(Role.READER)
         await write_bucket(admin, subjects.PACKS_BUCKET, dict.fromkeys([*PACKS, ATTACKER], KIND))
         worker = Process(folder, tenant.cluster.url, "w", "--creds", tenant.file(Role.WORKER))
         try:
-            async with Heartbeats(reader) as heard, honest(tenant, reader) as packs:
-                await heard.until_held(PARTITIONS, "w")
+            async with Heartbeats(reader) as heartbeats, connect_honest_edges(tenant, reader) as packs:
+                await heartbeats.until_held(PARTITIONS, "w")
                 await packs.send(2.0)  # kernels are loaded
-                alone = await packs.send(seconds)
-                rows = [Row(f"{len(PACKS)} packs of a fleet, without an attack", "", _text(alone), None)]
+                without_attack = await packs.send(seconds)
+                rows = [Row(f"{len(PACKS)} packs of a fleet, without an attack", "", _format(without_attack), None)]
                 for name in ATTACKS:
-                    with attacked(tenant, name):
-                        found = await packs.send(seconds)
-                    ratio = found[1] / alone[1]
-                    measured = f"{_text(found)}: {found[0] / alone[0]:.1f} and {ratio:.1f} times as long"
+                    with attack_in_background(tenant, name):
+                        result = await packs.send(seconds)
+                    ratio = result[1] / without_attack[1]
+                    measured = f"{_format(result)}: {result[0] / without_attack[0]:.1f} and {ratio:.1f} times as long"
                     target = f"longest at most {MAX_RATIO:g} times as long"
                     rows.append(Row(f"  one edge sends {name}", target, measured, ratio < MAX_RATIO))
-                rows.append(await _kept(reader, packs.number))
+                rows.append(await _stream_row(reader, packs.number))
         finally:
             worker.kill()
             await admin.close()
@@ -174,22 +175,27 @@ async def measure(folder: Path, seconds: float) -> list[Row]:
         return rows
 
 
-def _text(found: tuple[float, float, int]) -> str:
-    median_s, longest_s, count = found
+def _format(result: tuple[float, float, int]) -> str:
+    median_s, longest_s, count = result
     return f"{1e3 * median_s:.0f} ms, longest {1e3 * longest_s:.0f} ms, {count} blocks"
 
 
-async def _kept(reader: Client, number: int) -> Row:
-    """Return the row of the blocks that the stream has."""
+async def _stream_row(reader: Client, number: int) -> Row:
+    """Return the row of the honest packs' blocks that the stream contains."""
     info = await reader.jetstream().stream_info(subjects.RAW_STREAM, subjects_filter=">")
     counts = dict(info.state.subjects or {})
-    kept = sum(count for subject, count in counts.items() if not subject.endswith(f".{ATTACKER}"))
-    sent, own = number * len(PACKS), sum(counts.values()) - kept
-    return Row("  their blocks in the stream", "all", f"{kept:,} of {sent:,}, {own:,} of the attacker", kept == sent)
+    stored = sum(count for subject, count in counts.items() if not subject.endswith(f".{ATTACKER}"))
+    sent_blocks, of_attacker = number * len(PACKS), sum(counts.values()) - stored
+    return Row(
+        "  their blocks in the stream",
+        "all",
+        f"{stored:,} of {sent_blocks:,}, {of_attacker:,} of the attacker",
+        stored == sent_blocks,
+    )
 
 
 def rows(seconds: float) -> Iterator[Row]:
-    """Measure without and with each attack for ``seconds`` [s]."""
+    """Measure the latencies without an attack and with each attack, each for ``seconds`` [s]."""
     load_kernels()  # compiled once, not by the worker
     with tempfile.TemporaryDirectory() as folder:
         yield from asyncio.run(measure(Path(folder), seconds))

@@ -1,4 +1,4 @@
-"""Load: thousands of frames a second over a PTY, a day of serial bytes, and attacks.
+"""Load test: thousands of frames a second over a PTY, a day of serial bytes, and attacks.
 
 The attacks are idle connections to the HTTP listeners of service, dashboard and fleet page while their broker or server is
 restarted, a lost sensor, and the token of one edge of a fleet.
@@ -57,9 +57,12 @@ WARM_S = 20.0
 """Warm-up time before CPU time and memory are measured [s]."""
 HALF_DAY_S = 8.0 * 3600.0
 """Duration of the discharge pulses before the charge pulses [s]."""
-MAX_CPU, MAX_GROWTH_MIB = 0.20, 2.0
+MAX_CPU = 0.20
+"""Limit of the CPU time of the service as a fraction of a core."""
+MAX_GROWTH_MIB = 2.0
+"""Limit of the growth of the resident memory [MiB]."""
 READ_BYTES = 4096
-PACK = """
+PACK_TOML = """
 [pack]
 name = "load"
 cell = "{cell}"
@@ -73,13 +76,16 @@ folder = "{folder}"
 """
 
 
-def load(first: int, count: int, rate_hz: int, soc: float) -> tuple[SampleBlock, float]:
-    """Return ``count`` samples from ``first`` on of a pack under pulses, and the SOC at their end. The RC pairs start at rest."""
+def simulate_load(first: int, count: int, rate_hz: int, soc: float) -> tuple[SampleBlock, float]:
+    """Return ``count`` samples from ``first`` on of a pack under pulses, and the SOC at their end.
+
+    The RC voltages are zero at the first sample.
+    """
     cell = load_cell(CELL)
     block = np.zeros(count, dtype=SAMPLE)
     time_s = np.arange(first, first + count) / rate_hz
-    way = 1.0 - 2.0 * (time_s // HALF_DAY_S % 2.0)
-    current_a = ON_A * way * (time_s % (2.0 * HALF_PERIOD_S) < HALF_PERIOD_S)
+    direction = 1.0 - 2.0 * (time_s // HALF_DAY_S % 2.0)
+    current_a = ON_A * direction * (time_s % (2.0 * HALF_PERIOD_S) < HALF_PERIOD_S)
     voltage_v, socs = simulate_cell((soc, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
     noise = np.random.default_rng(first).uniform(-0.5, 0.5, (2, count))
     block["time_s"] = time_s
@@ -89,38 +95,39 @@ def load(first: int, count: int, rate_hz: int, soc: float) -> tuple[SampleBlock,
 
 
 def chunks(rate_hz: int, seconds: float, chunk_s: float) -> Iterator[bytes]:
-    """Yield the bytes of the line."""
+    """Yield the bytes that the board sends, in chunks of ``chunk_s``."""
     soc, first, total = 0.9, 0, round(rate_hz * seconds)
     while first < total:
         count = min(round(rate_hz * chunk_s), total - first)
-        block, soc = load(first, count, rate_hz, soc)
+        block, soc = simulate_load(first, count, rate_hz, soc)
         yield sample_frames(block, first).tobytes()
         first += count
 
 
-def send(master: int, rate_hz: int, seconds: float, sent: "mp.Queue[tuple[int, int, int]]") -> None:
-    """A process: frames in time, as a board sends them; what the line has no room for is lost, and counted.
+def send(master: int, rate_hz: int, seconds: float, results: "mp.Queue[tuple[int, int, int]]") -> None:
+    """Send frames in time, as a board does, in a process of its own.
 
-    Puts frames, those lost, and bytes that the line took. A sender that was held up itself makes up for it little by little.
+    Frames for which the line has no space are lost. Numbers of all frames, of lost frames, and of written bytes are put into the
+    queue. After a delay of the process, pending frames are sent in small bursts.
     """
     os.set_blocking(master, False)
     frame_bytes = len(next(chunks(rate_hz, 1.0 / rate_hz, 1.0)))
-    begin_s, frames, lost, taken = time.monotonic(), 0, 0, 0
+    begin_s, frames, lost, received = time.monotonic(), 0, 0, 0
     for chunk in chunks(rate_hz, seconds, CHUNK_S):
         position = 0
         while position < len(chunk):
             time.sleep(SEND_S)
-            due = min(round((time.monotonic() - begin_s) * rate_hz) - frames, round(BURST_S * rate_hz))
-            end = min(position + due * frame_bytes, len(chunk))
+            due_frames = min(round((time.monotonic() - begin_s) * rate_hz) - frames, round(BURST_S * rate_hz))
+            end = min(position + due_frames * frame_bytes, len(chunk))
             frames += (end - position) // frame_bytes
             while position < end:
                 try:
-                    wrote = os.write(master, chunk[position:end])
-                    position, taken = position + wrote, taken + wrote
+                    written_bytes = os.write(master, chunk[position:end])
+                    position, received = position + written_bytes, received + written_bytes
                 except BlockingIOError:
                     lost += (end - position + frame_bytes - 1) // frame_bytes
                     position = end
-    sent.put((frames, lost, taken))
+    results.put((frames, lost, received))
 
 
 @dataclass(frozen=True)
@@ -138,12 +145,12 @@ class Run:
 
 
 async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> Run:
-    """Run the service behind a PTY."""
+    """Run the service on a PTY, send frames to it, and return its counters."""
     master, slave = os.openpty()
     tty.setraw(slave)
     pack = folder / "load.toml"
     pack.write_text(
-        PACK.format(cell=CELL, port=os.ttyname(slave), rate_hz=BOARD_RATE_HZ, url=broker.url, folder=folder)
+        PACK_TOML.format(cell=CELL, port=os.ttyname(slave), rate_hz=BOARD_RATE_HZ, url=broker.url, folder=folder)
     )
     program = Path(sys.executable).with_name("bms-estimator")
     async with Listener(broker) as live:
@@ -153,14 +160,14 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
             await live.wait_json("bms/load/health", lambda h: "no frame yet" in (h["sensor_message"] or ""))
             os.write(master, b"\0" + hello(BOARD_RATE_HZ))
             spawn = mp.get_context("spawn")
-            told: mp.Queue[tuple[int, int, int]] = spawn.Queue()
+            results: mp.Queue[tuple[int, int, int]] = spawn.Queue()
             sender = spawn.Process(
-                target=_send_over, args=(mp.reduction.DupFd(master), rate_hz, seconds, told), daemon=True
+                target=_send_over, args=(mp.reduction.DupFd(master), rate_hz, seconds, results), daemon=True
             )
             sender.start()
             await live.wait_json("bms/load/state")
             process = psutil.Process(service.pid)
-            rss, begin_s, before_s = list[float](), 0.0, 0.0
+            rss_mib, begin_s, before_s = list[float](), 0.0, 0.0
             started_s = time.monotonic()
             while sender.is_alive() and service.returncode is None:
                 await asyncio.sleep(1.0)
@@ -168,10 +175,10 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
                 if time.monotonic() - started_s < min(WARM_S, 0.2 * seconds):
                     begin_s, before_s = time.monotonic(), sum(process.cpu_times()[:2])
                     continue
-                rss.append(process.memory_info().rss / 2**20)
+                rss_mib.append(process.memory_info().rss / 2**20)
             cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
-            frames, no_room, taken = told.get(timeout=LONG_S)
-            end = await live.wait_json("bms/load/health", lambda h: h["line"]["bytes_received"] >= taken)
+            frames, no_room, received = results.get(timeout=LONG_S)
+            end = await live.wait_json("bms/load/health", lambda h: h["line"]["bytes_received"] >= received)
             service.send_signal(signal.SIGINT)
             await service.wait()
         finally:
@@ -180,8 +187,8 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
                 await service.wait()
             os.close(slave)
             os.close(master)
-    half = len(rss) // 2
-    means = float(np.mean(rss[:half])), float(np.mean(rss[half:]))
+    half = len(rss_mib) // 2
+    means = float(np.mean(rss_mib[:half])), float(np.mean(rss_mib[half:]))
     return Run(frames, no_room, end["line"], end["samples"], cpu, means)
 
 
@@ -189,23 +196,23 @@ def _send_over(master: "mp.reduction.DupFd", *arguments: object) -> None:
     send(master.detach(), *arguments)  # type: ignore[arg-type]
 
 
-def fed(rate_hz: int, seconds: float) -> tuple[BoardProtocol, Estimator, float, list[float]]:
+def process_bytes(rate_hz: int, seconds: float) -> tuple[BoardProtocol, Estimator, float, list[float]]:
     """Process all bytes in reads of ``READ_BYTES``. Return decoder, estimator, elapsed time [s] and hourly RSS [MiB]."""
-    dialect, estimator, process = BoardProtocol(), Estimator(load_cell(CELL)), psutil.Process()
-    dialect.feed(0.0, hello(rate_hz))
-    rss, took_s, bytes_fed = list[float](), 0.0, 0
+    decoder, estimator, process = BoardProtocol(), Estimator(load_cell(CELL)), psutil.Process()
+    decoder.feed(0.0, hello(rate_hz))
+    rss_mib, elapsed_s, bytes_fed = list[float](), 0.0, 0
     bytes_per_s = rate_hz * len(next(chunks(rate_hz, 1.0 / rate_hz, 1.0)))
     for chunk in chunks(rate_hz, seconds, 3600.0):
         begin_s = time.perf_counter()
         for begin in range(0, len(chunk), READ_BYTES):
             data = chunk[begin : begin + READ_BYTES]
             bytes_fed += len(data)
-            block = dialect.feed(bytes_fed / bytes_per_s, data)
+            block = decoder.feed(bytes_fed / bytes_per_s, data)
             if block.size:
                 estimator.run(block)
-        took_s += time.perf_counter() - begin_s
-        rss.append(process.memory_info().rss / 2**20)
-    return dialect, estimator, took_s, rss
+        elapsed_s += time.perf_counter() - begin_s
+        rss_mib.append(process.memory_info().rss / 2**20)
+    return decoder, estimator, elapsed_s, rss_mib
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
@@ -225,24 +232,29 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
             name: run.line[name]
             for name in ("frames_lost", "crc_errors", "cobs_errors", "length_errors", "clock_jumps")
         }
-        taken = run.line["frames_received"]
-        what = f"{options.rate:,} frames/s for {options.minutes:g} min over a PTY"
-        good = taken == run.sent == run.samples["samples"] and not any(faults.values()) and not run.no_room
-        counted = ", ".join(f"{n} {name}" for name, n in (faults | {"without room": run.no_room}).items() if n)
-        yield Row(what, "none lost", f"{taken:,} of {run.sent:,} taken {counted}", good)
+        received = run.line["frames_received"]
+        quantity = f"{options.rate:,} frames/s for {options.minutes:g} min over a PTY"
+        is_met = received == run.sent == run.samples["samples"] and not any(faults.values()) and not run.no_room
+        fault_counts = ", ".join(f"{n} {name}" for name, n in (faults | {"without room": run.no_room}).items() if n)
+        yield Row(quantity, "none lost", f"{received:,} of {run.sent:,} taken {fault_counts}", is_met)
         yield Row("  service's processor time", f"below {MAX_CPU:.0%} of a core", f"{run.cpu:.1%}", run.cpu < MAX_CPU)
         first, second = run.rss_mib
         growth = f"{first:.1f} MiB in the first half, {second:.1f} in the second"
         yield Row("  resident memory", "flat", growth, second - first < MAX_GROWTH_MIB)
     if options.hours:
-        dialect, estimator, took_s, rss = fed(100, 3600.0 * options.hours)
-        taken, samples = dialect.counters["frames_received"], int(estimator.state["samples"][0])
-        sent = round(360_000 * options.hours)
-        what = f"{options.hours:g} h of 100 Hz as serial bytes"
-        yield Row(what, "none lost", f"{samples:,} of {sent:,} in {took_s:.0f} s", sent == taken == samples)
-        begun = math.ceil(len(rss) / 6)  # the allocator's pools grow at first
-        growth = f"{rss[begun - 1]:.1f} MiB after {begun} h, {rss[-1]:.1f} at the end"
-        yield Row("  resident memory", "flat", growth, rss[-1] - rss[begun - 1] < MAX_GROWTH_MIB)
+        decoder, estimator, elapsed_s, rss_mib = process_bytes(100, 3600.0 * options.hours)
+        received, samples = decoder.counters["frames_received"], int(estimator.state["samples"][0])
+        sent_frames = round(360_000 * options.hours)
+        quantity = f"{options.hours:g} h of 100 Hz as serial bytes"
+        yield Row(
+            quantity,
+            "none lost",
+            f"{samples:,} of {sent_frames:,} in {elapsed_s:.0f} s",
+            sent_frames == received == samples,
+        )
+        warm_hours = math.ceil(len(rss_mib) / 6)  # the pools of the allocator grow during the first sixth
+        growth = f"{rss_mib[warm_hours - 1]:.1f} MiB after {warm_hours} h, {rss_mib[-1]:.1f} at the end"
+        yield Row("  resident memory", "flat", growth, rss_mib[-1] - rss_mib[warm_hours - 1] < MAX_GROWTH_MIB)
     if options.attack_s:
         yield from edge_token.rows(options.attack_s)
 
@@ -262,14 +274,14 @@ def idle_rows() -> Iterator[Row]:
 
 
 def _idle_row(program: str, attack: Coroutine[None, None, Outcome]) -> Row:
-    what = f"{IDLE:,} idle connections each, {DESCRIPTORS:,} descriptors: {program}"
+    quantity = f"{IDLE:,} idle connections each, {DESCRIPTORS:,} descriptors: {program}"
     target = "reconnects, answers, no traceback"
     try:
         outcome = asyncio.run(attack)
     except (TimeoutError, AssertionError) as error:
-        return Row(what, target, f"not recovered: {error}", met=False)
+        return Row(quantity, target, f"not recovered: {error}", met=False)
     measured = f"HTTP {outcome.answers}, {outcome.tracebacks} tracebacks, {outcome.log_lines} log lines"
-    return Row(what, target, measured, met=set(outcome.answers) == {200} and outcome.tracebacks == 0)
+    return Row(quantity, target, measured, met=set(outcome.answers) == {200} and outcome.tracebacks == 0)
 
 
 def lost_sensor_rows(lost_s: float) -> Iterator[Row]:

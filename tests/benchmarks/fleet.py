@@ -1,8 +1,8 @@
-"""Cost of a fleet: server, workers and simulated edges as processes on loopback. ``make fleet ARGS="--packs 10000"``.
+"""Benchmark of a fleet of processes: server, workers and simulated edges. ``make fleet ARGS="--packs 10000"``.
 
-Lag is from the arrival of a block's last sample at the edge to the estimate made of it, here, as ``bms.<pack>.state``
-arrives at a listener: of some packs for the shares, of all for the worst, which workers tell in their heartbeats.
-The first minutes are not in the figures: every pack begins then.
+The lag is the time from the arrival of a block's last sample at the edge to the arrival of ``bms.<pack>.state`` at a listener.
+Quantiles are of some packs. The maximum is of all packs, by the heartbeats of the workers. The first minutes, in which every
+pack starts, are not measured.
 """
 
 import argparse
@@ -37,14 +37,14 @@ OBSERVED_PACKS = 256
 
 
 @dataclass
-class Heard:
+class ReceivedMessages:
     """Messages received in the measured time.
 
     Attributes:
-        lags_s: Of estimates of the packs that are listened to [s].
-        worst_s: Of all blocks, as workers say [s].
-        within: Whether the true SOC was within two standard deviations, and how many were judged.
-        workers: Last heartbeat by name.
+        lags_s: Lags of the estimates of the observed packs [s].
+        worst_s: Maximum lag of all blocks, by the heartbeats [s].
+        within: Numbers of estimates with the true SOC inside (True) and outside (False) two standard deviations.
+        workers: Last heartbeat by name of the worker.
     """
 
     lags_s: list[float] = field(default_factory=list)
@@ -57,16 +57,16 @@ class Heard:
         """Number of blocks processed by all workers."""
         return sum(worker.blocks for worker in self.workers.values())
 
-    def total(self, what: str) -> int:
+    def total(self, counter: str) -> int:
         """Return the sum of a counter over all workers."""
-        return sum(worker.counters.get(what, 0) for worker in self.workers.values())
+        return sum(worker.counters.get(counter, 0) for worker in self.workers.values())
 
 
 def main() -> None:
-    """Measure, print a table, and exit with 1 if a target was missed."""
+    """Measure each number of packs, and print a table."""
     arguments = _arguments()
     load_kernels()  # compiled once, not by each worker
-    rows = [asyncio.run(_measured(packs, arguments)) for packs in arguments.packs]
+    rows = [asyncio.run(_measure(packs, arguments)) for packs in arguments.packs]
     table = Table(title=f"a fleet on {psutil.cpu_count()} cores, {arguments.workers} workers, {arguments.minutes} min")
     for name in ("", *(f"{packs:,}" for packs in arguments.packs)):
         table.add_column(name, justify="right" if name else "left")
@@ -88,7 +88,7 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-async def _measured(packs: int, arguments: argparse.Namespace) -> dict[str, str]:
+async def _measure(packs: int, arguments: argparse.Namespace) -> dict[str, str]:
     with tempfile.TemporaryDirectory() as folder, rig(Path(folder), 1, partitions=PARTITIONS) as fleet_rig:
         await make(fleet_rig, partitions=PARTITIONS)
         return await _run(fleet_rig, packs, arguments)
@@ -97,12 +97,12 @@ async def _measured(packs: int, arguments: argparse.Namespace) -> dict[str, str]
 async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dict[str, str]:
     begin_s = int(time.time())
     fleet = SimulatedFleet(packs, seed=SEED, begin_ns=begin_s * 10**9)
-    loaded_s = time.monotonic()
+    load_time_s = time.monotonic()
     await asyncio.to_thread(fleet_rig.load, fleet)
-    loaded_s = time.monotonic() - loaded_s
+    load_time_s = time.monotonic() - load_time_s
     names = [fleet_rig.start_worker(checkpoint_s=CHECKPOINT_S) for _ in range(arguments.workers)]
-    heard = await _listen(fleet_rig, fleet)
-    await _until(lambda: len(heard.workers) == len(names))
+    received = await _listen(fleet_rig, fleet)
+    await _wait_until(lambda: len(received.workers) == len(names))
     minutes = arguments.warm_up + arguments.minutes
     begin = datetime.fromtimestamp(begin_s, UTC).replace(tzinfo=None).isoformat()
     blocks = round(minutes * arguments.speed) + 1
@@ -111,89 +111,95 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     pids = {"server": fleet_rig.engine.pid(0), "edges": edges.pid} | {
         name: fleet_rig.workers[name].pid for name in names
     }
-    used_s = {name: cpu_s(pid) for name, pid in pids.items()}
-    begun_s, blocks_before = time.monotonic(), heard.blocks
-    heard.lags_s.clear()
-    heard.worst_s = 0.0
+    cpu_time_s = {name: cpu_s(pid) for name, pid in pids.items()}
+    measure_begin_s, blocks_before = time.monotonic(), received.blocks
+    received.lags_s.clear()
+    received.worst_s = 0.0
     await asyncio.sleep(60.0 * arguments.minutes)
-    passed_s, taken = time.monotonic() - begun_s, heard.blocks - blocks_before
-    used_s = {name: cpu_s(pid) - used_s[name] for name, pid in pids.items()}
+    elapsed_s, processed_blocks = time.monotonic() - measure_begin_s, received.blocks - blocks_before
+    cpu_time_s = {name: cpu_s(pid) - cpu_time_s[name] for name, pid in pids.items()}
     memory = {name: rss_mib(pid) for name, pid in pids.items()}
     wire = _wire_bytes(fleet_rig)
-    lags = np.sort(heard.lags_s) if heard.lags_s else np.array([np.nan])
-    worst_s = heard.worst_s
+    lags = np.sort(received.lags_s) if received.lags_s else np.array([np.nan])
+    worst_s = received.worst_s
     await asyncio.to_thread(edges.wait, LONG_S + 120.0 * minutes)
-    stopped_s = time.monotonic()
+    stop_time_s = time.monotonic()
     await asyncio.to_thread(fleet_rig.stop_workers)
-    stopped_s = time.monotonic() - stopped_s
-    raw_bytes, raw_messages, states_bytes = await _stored(fleet_rig)
-    pack_days = max(1, taken) * BLOCK_S / DAY_S  # of the processed blocks, even if some are missing
-    work_s = sum(used_s[name] for name in names)
-    a_day = DAY_S / BLOCK_S
+    stop_time_s = time.monotonic() - stop_time_s
+    raw_bytes, raw_messages, states_bytes = await _stream_sizes(fleet_rig)
+    pack_days = max(1, processed_blocks) * BLOCK_S / DAY_S  # of the processed blocks, even if some are missing
+    work_s = sum(cpu_time_s[name] for name in names)
+    blocks_per_day = DAY_S / BLOCK_S
     sys.stderr.write((fleet_rig.folder / "edges.log").read_text().splitlines()[-1] + "\n")
     return {
-        "blocks/s": f"{taken / passed_s:,.1f}",
-        "samples/s": f"{taken * BLOCK_S / passed_s:,.0f}",
+        "blocks/s": f"{processed_blocks / elapsed_s:,.1f}",
+        "samples/s": f"{processed_blocks * BLOCK_S / elapsed_s:,.0f}",
         "lag p50, s": f"{np.quantile(lags, 0.5):.2f}",
         "lag p99, s": f"{np.quantile(lags, 0.99):.2f}",
         "lag max of those heard, s": f"{lags[-1]:.2f} of {lags.size:,}",
         "lag max of all, s": f"{worst_s:.2f}",
-        "workers, CPU, cores": f"{work_s / passed_s:.3f}",
-        "server, CPU, cores": f"{used_s['server'] / passed_s:.3f}",
-        "edges simulated, CPU, cores": f"{used_s['edges'] / passed_s:.3f}",
+        "workers, CPU, cores": f"{work_s / elapsed_s:.3f}",
+        "server, CPU, cores": f"{cpu_time_s['server'] / elapsed_s:.3f}",
+        "edges simulated, CPU, cores": f"{cpu_time_s['edges'] / elapsed_s:.3f}",
         "workers, CPU per pack-day, s": f"{work_s / pack_days:.3f}",
-        "server, CPU per pack-day, s": f"{used_s['server'] / pack_days:.3f}",
-        "wire per pack-day, kB": f"{wire / raw_messages * a_day / 1e3:,.0f}",
-        "stream per pack-day, kB": f"{raw_bytes / raw_messages * a_day / 1e3:,.0f}",
+        "server, CPU per pack-day, s": f"{cpu_time_s['server'] / pack_days:.3f}",
+        "wire per pack-day, kB": f"{wire / raw_messages * blocks_per_day / 1e3:,.0f}",
+        "stream per pack-day, kB": f"{raw_bytes / raw_messages * blocks_per_day / 1e3:,.0f}",
         "checkpoint per pack, kB": f"{states_bytes / packs / 1e3:.1f}",
         "workers, memory each, MiB": f"{max(memory[name] for name in names):,.0f}",
         "server, memory, MiB": f"{memory['server']:,.0f}",
-        "table loaded in, s": f"{loaded_s:.1f}",
-        "clean stop, with checkpoints, s": f"{stopped_s:.1f}",
-        "resends, gaps, lost blocks": " ".join(str(heard.total(what)) for what in ("resend", "gap", "lost_blocks")),
-        "true SOC within 2 std": f"{heard.within[True] / max(1, heard.within.total()):.3f}",
+        "table loaded in, s": f"{load_time_s:.1f}",
+        "clean stop, with checkpoints, s": f"{stop_time_s:.1f}",
+        "resends, gaps, lost blocks": " ".join(
+            str(received.total(counter)) for counter in ("resend", "gap", "lost_blocks")
+        ),
+        "true SOC within 2 std": f"{received.within[True] / max(1, received.within.total()):.3f}",
     }
 
 
-async def _listen(fleet_rig: Rig, fleet: SimulatedFleet) -> Heard:
+async def _listen(fleet_rig: Rig, fleet: SimulatedFleet) -> ReceivedMessages:
     """Receive heartbeats and the estimates of some packs."""
-    heard = Heard()
+    received = ReceivedMessages()
     nc = await fleet_rig.connected()
     index = {name: i for i, name in enumerate(fleet.names)}
 
-    async def beat(message: Msg) -> None:
-        said = Heartbeat.model_validate_json(message.data)
-        heard.workers[said.id] = said
-        heard.worst_s = max(heard.worst_s, said.lag_s or 0.0)
+    async def record_heartbeat(message: Msg) -> None:
+        heartbeat = Heartbeat.model_validate_json(message.data)
+        received.workers[heartbeat.id] = heartbeat
+        received.worst_s = max(received.worst_s, heartbeat.lag_s or 0.0)
 
-    async def state(message: Msg) -> None:
+    async def record_state(message: Msg) -> None:
         estimate: dict[str, Any] = json.loads(message.data)
-        heard.lags_s.append(time.time() - datetime.fromisoformat(estimate["time"]).timestamp())
+        received.lags_s.append(time.time() - datetime.fromisoformat(estimate["time"]).timestamp())
         pack = np.array([index[message.subject.split(".")[1]]])
         truth = fleet.soc(pack, np.array([estimate["board_time_s"]]))[0]
-        heard.within[bool(abs(truth - estimate["soc"]) <= 2.0 * estimate["soc_std"])] += 1
+        received.within[bool(abs(truth - estimate["soc"]) <= 2.0 * estimate["soc_std"])] += 1
 
-    await nc.subscribe(subjects.worker(), cb=beat)
+    await nc.subscribe(subjects.worker(), cb=record_heartbeat)
     for name in fleet.names[:: max(1, len(fleet.names) // OBSERVED_PACKS)]:
-        await nc.subscribe(subjects.published(name, "state"), cb=state)
+        await nc.subscribe(subjects.published(name, "state"), cb=record_state)
     await nc.flush()
-    return heard
+    return received
 
 
-async def _until(true: Any) -> None:
+async def _wait_until(condition: Any) -> None:
     async with asyncio.timeout(LONG_S):
-        while not true():  # noqa: ASYNC110 - messages arrive in callbacks
+        while not condition():  # noqa: ASYNC110 - messages arrive in callbacks
             await asyncio.sleep(0.1)
 
 
 def _wire_bytes(fleet_rig: Rig) -> int:
-    """Return the bytes that edges have sent, by the server's count."""
-    found = fleet_rig.engine.ask(0, "connz?limit=1000")["connections"]
-    return sum(each["in_bytes"] for each in found if each.get("mqtt_client", "").startswith("simulated"))
+    """Return the bytes that the server has received from the edges."""
+    connections = fleet_rig.engine.ask(0, "connz?limit=1000")["connections"]
+    return sum(
+        connection["in_bytes"]
+        for connection in connections
+        if connection.get("mqtt_client", "").startswith("simulated")
+    )
 
 
-async def _stored(fleet_rig: Rig) -> tuple[int, int, int]:
-    """Return bytes and messages of the stream of blocks, and bytes of that of checkpoints."""
+async def _stream_sizes(fleet_rig: Rig) -> tuple[int, int, int]:
+    """Return bytes and messages of the stream of blocks, and bytes of the stream of checkpoints."""
     nc = await fleet_rig.connected()
     js = nc.jetstream()
     raw = (await js.stream_info(subjects.RAW_STREAM)).state

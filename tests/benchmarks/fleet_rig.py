@@ -1,4 +1,4 @@
-"""Fleet as processes on the loopback for the fleet's benchmarks: server, workers, simulated edges."""
+"""Fleet of processes on the loopback interface for benchmarks: server, workers and simulated edges."""
 
 import contextlib
 import signal
@@ -17,11 +17,11 @@ from tests.patience import LONG_S
 
 
 class Rig:
-    """Processes of one fleet; their output is in files of ``folder``.
+    """Processes of one fleet.
 
     Args:
-        folder: For all files.
-        engine: The server, whose nodes run.
+        folder: Folder of all files, with a log file of each process.
+        engine: Server with running nodes.
     """
 
     def __init__(self, folder: Path, engine: NatsCluster) -> None:
@@ -40,7 +40,7 @@ class Rig:
         return name
 
     def stop_workers(self) -> None:
-        """Stop workers as an operator does: each writes its checkpoints."""
+        """Stop the workers by SIGTERM, so that each writes its checkpoints."""
         for process in self.workers.values():
             process.send_signal(signal.SIGTERM)
         for process in self.workers.values():
@@ -58,7 +58,7 @@ class Rig:
     def simulate(
         self, packs: int, *, seed: int, begin: str, speed: float, blocks: int | None = None
     ) -> subprocess.Popen[bytes]:
-        """Simulate the edges of a fleet, for a number of blocks each or until stopped."""
+        """Start the simulated edges of a fleet, each for a number of blocks or until stopped."""
         arguments = ["--packs", packs, "--seed", seed, "--begin", begin, "--speed", speed]
         arguments += ["--blocks", blocks] if blocks else []
         return self.run("simulate", "--mqtt", self._mqtt, *map(str, arguments), log="edges")
@@ -83,11 +83,11 @@ class Rig:
 def rig(folder: Path, nodes: int, *, partitions: int) -> Iterator[Rig]:
     """Run a server without workers."""
     with running(folder, nodes, partitions=partitions) as engine:
-        made = Rig(folder, engine)
+        fleet_rig = Rig(folder, engine)
         try:
-            yield made
+            yield fleet_rig
         finally:
-            made.end()
+            fleet_rig.end()
 
 
 async def make(rig: Rig, *, partitions: int) -> None:

@@ -1,6 +1,7 @@
-"""Figures of the fuel cell (docs/theory/fuel-cell.md): ``make fuelcell``, half a minute.
+"""Numbers of docs/theory/fuel-cell.md: ``make fuelcell`` prints them in half a minute.
 
-Truth is the stack of ``tests.mann_stack``, which does more than the model, and two measured curves in tests/data/fuel_cell.
+The data are of the simulated stack of ``tests.mann_stack``, which has effects that the model omits, and two measured curves in
+tests/data/fuel_cell.
 """
 
 import itertools
@@ -25,21 +26,21 @@ from tests.mann_stack import CURVE_A
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 MIN_A = 0.1
-"""Limit of the measured curves: see docs/theory/fuel-cell.md [A/cm2]."""
-WRONG = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])
-"""Parameters of the file that a search begins at, over those of ``pem_30w``."""
-WATCHED = "r_ohm", "tafel_slope_v", "exchange_current_a", "c_dl_farad"
+"""Minimum current of used points of the measured curves, by docs/theory/fuel-cell.md [A/cm2]."""
+WRONG_FACTORS = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])
+"""Initial parameters of the fit, divided by those of ``pem_30w``."""
+PRINTED_PARAMETERS = "r_ohm", "tafel_slope_v", "exchange_current_a", "c_dl_farad"
 
 
-def say(text: str) -> None:
+def print_line(text: str) -> None:
     sys.stdout.write(f"{text}\n")
 
 
-def source(name: str, record: Record, *, timed: bool = True) -> Source:
+def make_source(name: str, record: Record, *, timed: bool = True) -> Source:
     return Source(name, record.time_s if timed else None, record.current_a, record.voltage_v, record.temperature_c)
 
 
-def samples(record: Record) -> SampleBlock:
+def make_samples(record: Record) -> SampleBlock:
     block = np.zeros(record.time_s.size, SAMPLE)
     for name in ("time_s", "current_a", "voltage_v", "temperature_c"):
         block[name] = getattr(record, name)
@@ -50,11 +51,11 @@ def rms_mv(error_v: np.ndarray) -> float:
     return 1e3 * float(np.sqrt(np.mean(error_v**2)))
 
 
-def left_mv(model: FuelCellModel, held_back: Source) -> float:
+def prediction_rms_mv(model: FuelCellModel, held_back: Source) -> float:
     return rms_mv(held_back.voltage_v - held_back.predict(model.a, np.zeros(8))[0])
 
 
-def told(fit: FuelCellFit) -> str:
+def format_parameters(fit: FuelCellFit) -> str:
     texts = []
     for key in KEYS:
         value, std = getattr(fit.model.fuel_cell, key), fit.model.std.get(key)
@@ -62,100 +63,117 @@ def told(fit: FuelCellFit) -> str:
     return ", ".join(texts)
 
 
-def identification() -> None:
-    say("## Identified from a curve and 60 s of steps, begun at a wrong file, judged on 60 s that were held back")
-    start = PEM.identified(PEM.a * WRONG, {})
-    truth = mann_stack.curve(CURVE_A)
+def print_identification() -> None:
+    print_line(
+        "## Identified from a curve and 60 s of steps, begun at a wrong file, judged on 60 s that were held back"
+    )
+    start = PEM.identified(PEM.a * WRONG_FACTORS, {})
+    measured_curve = mann_stack.curve(CURVE_A)
     first, second = (mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=s), seed=s) for s in (1, 5))
     for rate_hz, every in ((500, 2), (100, 10)):
-        held_back = source("held back", second.every(every))
+        held_back = make_source("held back", second.every(every))
         for name, sources in (
-            ("curve and steps", [source("curve", truth, timed=False), source("steps", first.every(every))]),
-            ("curve alone", [source("curve", truth, timed=False)]),
-            ("steps alone", [source("steps", first.every(every))]),
+            (
+                "curve and steps",
+                [make_source("curve", measured_curve, timed=False), make_source("steps", first.every(every))],
+            ),
+            ("curve alone", [make_source("curve", measured_curve, timed=False)]),
+            ("steps alone", [make_source("steps", first.every(every))]),
         ):
             fit = fit_fuel_cell(sources, start)
-            left = ", ".join(f"{k} {1e3 * v:.1f} mV" for k, v in fit.rms_v.items())
-            say(f"{rate_hz} Hz, {name}: held back {left_mv(fit.model, held_back):.1f} mV; left of {left}")
-            say(f"    {told(fit)}")
-        say(f"    the wrong file {left_mv(start, held_back):.1f} mV, pem_30w {left_mv(PEM, held_back):.1f} mV")
+            residuals = ", ".join(f"{k} {1e3 * v:.1f} mV" for k, v in fit.rms_v.items())
+            print_line(
+                f"{rate_hz} Hz, {name}: held back {prediction_rms_mv(fit.model, held_back):.1f} mV; left of {residuals}"
+            )
+            print_line(f"    {format_parameters(fit)}")
+        print_line(
+            f"    the wrong file {prediction_rms_mv(start, held_back):.1f} mV, pem_30w {prediction_rms_mv(PEM, held_back):.1f} mV"
+        )
     kelvin = first.temperature_c.mean() + 273.15
-    say(
+    print_line(
         f"    truth: r_ohm {first.r_ohm.mean():.4f} on the mean at {kelvin - 273.15:.1f} C, c_dl_farad 0.067, B 0.224 V, i_L 9.38 A"
     )
 
 
-def temperature() -> None:
-    say("## Temperature left out: what the held-back minute then has")
-    second = source("held back", mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=5), seed=5).every(2))
-    fit = fit_fuel_cell([source("curve", mann_stack.curve(CURVE_A), timed=False)], PEM)
-    blind = Source(
+def print_temperature_effect() -> None:
+    print_line("## Temperature left out: what the held-back minute then has")
+    second = make_source(
+        "held back", mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=5), seed=5).every(2)
+    )
+    fit = fit_fuel_cell([make_source("curve", mann_stack.curve(CURVE_A), timed=False)], PEM)
+    without_temperature = Source(
         second.name, second.time_s, second.current_a, second.voltage_v, np.full(second.voltage_v.size, np.nan)
     )
-    say(f"with {left_mv(fit.model, second):.1f} mV, without {left_mv(fit.model, blind):.1f} mV")
+    print_line(
+        f"with {prediction_rms_mv(fit.model, second):.1f} mV, without {prediction_rms_mv(fit.model, without_temperature):.1f} mV"
+    )
 
 
-def real_curves() -> None:
-    say("## Measured curves, 1 cm2, 75 C; impedance has 0.061 ohm (oxygen)")
+def print_real_curves() -> None:
+    print_line("## Measured curves, 1 cm2, 75 C; impedance has 0.061 ohm (oxygen)")
     for name in ("oxygen", "air"):
         columns = read_polarisation(DATA / f"nafion112_{name}.csv")
         assert columns is not None
         for text, part in ((f"above {MIN_A} A", columns[columns[:, 0] > MIN_A]), ("all points", columns)):
             fit = fit_fuel_cell([Source(name, None, *part.T.copy())], load_fuel_cell(DATA / "one_cm2.toml"))
-            say(f"{name}, {text}: {1e3 * fit.rms_v[name]:.1f} mV RMS of {len(part)} points\n    {told(fit)}")
+            print_line(
+                f"{name}, {text}: {1e3 * fit.rms_v[name]:.1f} mV RMS of {len(part)} points\n    {format_parameters(fit)}"
+            )
 
 
-def learning() -> None:
-    say("## Learned in operation at 100 Hz; the contacts grow by 60 mohm at 300 s")
+def print_learning() -> None:
+    print_line("## Learned in operation at 100 Hz; the contacts grow by 60 mohm at 300 s")
     time_s, current_a = mann_stack.random_steps(1200.0, 500.0, seed=4)
     record = mann_stack.measured(time_s, current_a, seed=4, more_ohm=np.where(time_s < 300.0, 0.0, 0.06)).every(5)
-    estimator, block = Estimator(PEM), samples(record)
+    estimator, block = Estimator(PEM), make_samples(record)
     estimator.run(block[:1])
     edges = [1, *(100 * s for s in (60, 150, 300, 310, 360, 450, 600, 900, 1200))]
     for low, high in itertools.pairwise(edges):
         innovation_v = estimator.run(block[low:high])["innovation_v"]
         p = fuel_cell_parameters(estimator, 0.0)
-        shown = ", ".join(f"{k} {p[k].value:.4g} +- {p[k].std:.1g}" for k in WATCHED)
-        truth = record.r_ohm[max(low, high - 3000) : high].mean()
-        say(f"{high / 100:6.0f} s: e {rms_mv(innovation_v):6.1f} mV, true r {truth:.4f}; {shown}")
+        values = ", ".join(f"{k} {p[k].value:.4g} +- {p[k].std:.1g}" for k in PRINTED_PARAMETERS)
+        true_ohm = record.r_ohm[max(low, high - 3000) : high].mean()
+        print_line(f"{high / 100:6.0f} s: e {rms_mv(innovation_v):6.1f} mV, true r {true_ohm:.4f}; {values}")
 
 
-def wrong_start() -> None:
-    say("## The model itself: r +50 %, A -10 %, a +5 %, C +30 % of the file's, 3 mV of noise, 100 Hz")
+def print_wrong_start() -> None:
+    print_line("## The model itself: r +50 %, A -10 %, a +5 %, C +30 % of the file's, 3 mV of noise, 100 Hz")
     factors = np.array([1.0, 1.5, 0.9, 1.05, 1.3, *[1.0] * 11])
-    block = samples(mann_stack.model_itself(PEM.a * factors, 600.0))
+    block = make_samples(mann_stack.model_itself(PEM.a * factors, 600.0))
     for memory_s in (MEMORY_S, 600.0):
-        say(f"memory {memory_s:.0f} s")
+        print_line(f"memory {memory_s:.0f} s")
         estimator = Estimator(PEM)
         estimator.settings_record["learning"]["memory_s"] = memory_s
         for low, high in itertools.pairwise((0, 3000, 6000, 12000, 30000, 60000)):
             innovation_v = estimator.run(block[low:high])["innovation_v"]
-            off = 100.0 * (estimator.state["a"][0][1:5] / (PEM.a * factors)[1:5] - 1.0)
-            texts = ", ".join(f"{x:+.1f} %" for x in off)
-            say(f"{high / 100:6.0f} s: e {rms_mv(innovation_v):6.1f} mV; r, A, a, C off by {texts}")
+            error_percent = 100.0 * (estimator.state["a"][0][1:5] / (PEM.a * factors)[1:5] - 1.0)
+            texts = ", ".join(f"{x:+.1f} %" for x in error_percent)
+            print_line(f"{high / 100:6.0f} s: e {rms_mv(innovation_v):6.1f} mV; r, A, a, C off by {texts}")
 
 
-def ablation() -> None:
-    say(
+def print_ablation() -> None:
+    print_line(
         "## What is learned, and how long it is remembered: a jump of r at 300 s by 60 mohm; over the truth at 450, 600, 900 s"
     )
     time_s, current_a = mann_stack.random_steps(900.0, 500.0, seed=4)
     more_ohm = np.where(time_s < 300.0, 0.0, 0.06)
-    nobody, grown_a = np.full(time_s.size, np.nan), PEM.a.copy()
+    no_temperature, grown_a = np.full(time_s.size, np.nan), PEM.a.copy()
     grown_a[1] += 0.06
-    before_v, after_v = (open_loop(a, np.zeros(8), time_s, current_a, nobody)[0] for a in (PEM.a, grown_a))
+    before_v, after_v = (open_loop(a, np.zeros(8), time_s, current_a, no_temperature)[0] for a in (PEM.a, grown_a))
     own_v = np.where(time_s < 300.0, before_v, after_v) + np.random.default_rng(0).normal(0.0, 0.003, time_s.size)
     records = {
         "Mann's stack": mann_stack.measured(time_s, current_a, seed=4, more_ohm=more_ohm).every(5),
-        "the model itself": Record(time_s, current_a, own_v, nobody, PEM.a[1] + more_ohm).every(5),
+        "the model itself": Record(time_s, current_a, own_v, no_temperature, PEM.a[1] + more_ohm).every(5),
     }
     for count, memory_s in ((4, 60.0), (4, 600.0), (7, 60.0), (7, 600.0)):
         for name, record in records.items():
-            say(f"{count} learned, memory {memory_s:3.0f} s, {name}: {_after_a_jump(record, count, memory_s)}")
+            print_line(
+                f"{count} learned, memory {memory_s:3.0f} s, {name}: {_format_after_jump(record, count, memory_s)}"
+            )
 
 
-def _after_a_jump(record: Record, count: int, memory_s: float) -> str:
-    estimator, block = Estimator(PEM), samples(record)
+def _format_after_jump(record: Record, count: int, memory_s: float) -> str:
+    estimator, block = Estimator(PEM), make_samples(record)
     q = estimator.settings_record["learning"]
     q["count"], q["memory_s"] = count, memory_s
     texts = []
@@ -167,13 +185,13 @@ def _after_a_jump(record: Record, count: int, memory_s: float) -> str:
     return "; ".join(texts[1:])
 
 
-def speed() -> None:
-    block = samples(mann_stack.measured(*mann_stack.random_steps(100.0, 1000.0, seed=1)))
-    best = min(_seconds(block) for _ in range(5))
-    say(f"## {1e9 * best / block.size:.0f} ns per sample (run, least of 5)")
+def print_speed() -> None:
+    block = make_samples(mann_stack.measured(*mann_stack.random_steps(100.0, 1000.0, seed=1)))
+    best = min(_run_time_s(block) for _ in range(5))
+    print_line(f"## {1e9 * best / block.size:.0f} ns per sample (run, least of 5)")
 
 
-def _seconds(block: SampleBlock) -> float:
+def _run_time_s(block: SampleBlock) -> float:
     estimator = Estimator(PEM)
     started = time.perf_counter()
     estimator.run(block)
@@ -181,5 +199,13 @@ def _seconds(block: SampleBlock) -> float:
 
 
 if __name__ == "__main__":
-    for part in (identification, temperature, real_curves, wrong_start, learning, ablation, speed):
+    for part in (
+        print_identification,
+        print_temperature_effect,
+        print_real_curves,
+        print_wrong_start,
+        print_learning,
+        print_ablation,
+        print_speed,
+    ):
         part()

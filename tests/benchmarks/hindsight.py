@@ -1,12 +1,12 @@
-"""Share of SOCs within 2 std by hindsight (`fleet ask honest`) and in truth, on real captures:
-docs/fleet/questions.md.
+"""Fraction of SOCs within 2 std by later estimates (`fleet ask honest`) and by the true SOC, for docs/fleet/questions.md.
 
-Captures last hours, so six minutes stand for an hour. Each is entered as `make anywhere` does; each run is a pack.
+The captures last hours. Therefore six minutes replace an hour. The estimator starts as in `make anywhere`, and each run is a
+pack. Columns of the table:
 
-- hindsight: share within 2 std as `honest` has it
-- truth, there: the same against the truth, of the SOCs that hindsight can judge: a later one is surer
-- truth, all: of all
-- offset: mean of error over std there: what all have in common, and hindsight cannot see
+- hindsight: fraction within 2 std by `honest`
+- truth, there: fraction within 2 std by the true SOC, of the estimates that have a more certain later one
+- truth, all: fraction within 2 std by the true SOC, of all estimates
+- offset: mean of error over std of the estimates of "truth, there", a common error that later estimates cannot show
 """
 
 import sys
@@ -32,8 +32,9 @@ from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
 
 SLOT_S = 360.0
 LATER = (1, 3, 6, 12, 24)
-"""Distance from which `honest` looks back."""
-STORE = 10**9
+"""Distances of the later estimates with which `honest` compares [slots]."""
+STORE_ID = 10**9
+"""Identifier of the edge's block store: its creation time [ns since 1970]."""
 
 
 def limits(slot_s: float = SLOT_S) -> Limits:
@@ -41,7 +42,7 @@ def limits(slot_s: float = SLOT_S) -> Limits:
     return replace(LIMITS, least_seen_s=0.97 * slot_s)
 
 
-class Known(NamedTuple):
+class SlotEstimate(NamedTuple):
     """Estimate at the end of a slot, with its true error."""
 
     hour: Hour
@@ -62,43 +63,53 @@ def main() -> None:
 def _outcome(group: Group, folder: Path) -> list[str]:
     packs = [slots(f"p{n}", *run) for n, run in enumerate(runs(group, folder))]
     hours = folder / group.name.replace("/", " ")
-    write(hours, [known.hour for pack in packs for known in pack])
-    found = run_query(hours, "honest", limits=limits()).records
-    if not found:
+    write(hours, [estimate.hour for pack in packs for estimate in pack])
+    records = run_query(hours, "honest", limits=limits()).records
+    if not records:
         return ["0"]
-    there = np.array([x for pack in packs for x in judged(pack)])
-    every = np.array([known.error / (known.hour.soc_mean_std or np.nan) for pack in packs for known in pack])
-    judgements, within, of_all = found[0]["judgements"], found[0]["within_2_std"], np.mean(np.abs(every) <= 2.0)
-    same = (f"{100 * np.mean(np.abs(there) <= 2.0):.0f}", f"{there.mean():+.1f}") if there.size else ("", "")
-    return [str(judgements), f"{100 * within:.0f}", same[0], f"{100 * of_all:.0f}", same[1]]
+    errors_there = np.array([x for pack in packs for x in judged(pack)])
+    all_errors = np.array(
+        [estimate.error / (estimate.hour.soc_mean_std or np.nan) for pack in packs for estimate in pack]
+    )
+    judgements, within, inside_all = (
+        records[0]["judgements"],
+        records[0]["within_2_std"],
+        np.mean(np.abs(all_errors) <= 2.0),
+    )
+    columns_there = (
+        (f"{100 * np.mean(np.abs(errors_there) <= 2.0):.0f}", f"{errors_there.mean():+.1f}")
+        if errors_there.size
+        else ("", "")
+    )
+    return [str(judgements), f"{100 * within:.0f}", columns_there[0], f"{100 * inside_all:.0f}", columns_there[1]]
 
 
-def judged(pack: list[Known]) -> list[float]:
+def judged(pack: list[SlotEstimate]) -> list[float]:
     """Return error over standard deviation of the estimates that have a more certain later one."""
-    std = np.array([known.hour.soc_mean_std or np.nan for known in pack])
+    std = np.array([estimate.hour.soc_mean_std or np.nan for estimate in pack])
     return [
-        known.error / std[n]
-        for n, known in enumerate(pack)
+        estimate.error / std[n]
+        for n, estimate in enumerate(pack)
         if any(n + k < std.size and std[n + k] ** 2 < LIMITS.surer * std[n] ** 2 for k in LATER)
     ]
 
 
 def slots(
-    pack: str, cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float, slot_s: float = SLOT_S
-) -> list[Known]:
+    pack: str, cell: CellModel, samples: SampleBlock, truth: Floats, start_soc: float, slot_s: float = SLOT_S
+) -> list[SlotEstimate]:
     """Return the estimates at intervals of ``slot_s`` [s], and the errors of their SOC."""
-    estimator, sums, known = Estimator(cell, initial_soc=start_soc), np.zeros(1, HOUR_SUMS), list[Known]()
-    number = ((seen["time_s"] - seen["time_s"][0]) // slot_s).astype(int)
+    estimator, sums, estimates = Estimator(cell, initial_soc=start_soc), np.zeros(1, HOUR_SUMS), list[SlotEstimate]()
+    number = ((samples["time_s"] - samples["time_s"][0]) // slot_s).astype(int)
     for slot in range(number[-1]):
         first, end = np.searchsorted(number, [slot, slot + 1])
         if first == end:
             continue
         begin(sums, estimator.record[0])
-        add(sums, estimator.run(seen[first:end]), Block(STORE, 1, 1, 0.0, seen[first:end]), estimator)
+        add(sums, estimator.run(samples[first:end]), Block(STORE_ID, 1, 1, 0.0, samples[first:end]), estimator)
         hour = row(PackSettings(name=pack, cell=cell.cell.name[:30]), slot, sums, estimator)
         if hour.soc is not None and hour.soc_mean_std:
-            known.append(Known(hour, hour.soc - float(truth[end - 1])))
-    return known
+            estimates.append(SlotEstimate(hour, hour.soc - float(truth[end - 1])))
+    return estimates
 
 
 if __name__ == "__main__":

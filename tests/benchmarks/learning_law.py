@@ -38,12 +38,12 @@ from tests.estimator.random_steps import (
     RATED_A,
     RESOLUTION_V,
     TRUTH,
-    errors,
     file_off_by,
     held_currents,
     learner,
     measured,
     random_steps,
+    relative_errors,
 )
 
 STARTS = [factors for factors in itertools.product((0.5, 2.0), repeat=5) if factors.count(2.0) % 2 == 0]
@@ -84,7 +84,7 @@ def learned(
         for h, hours in enumerate(HOURS):
             until = int(3600 * hours)
             run(estimator.record, estimator.settings_record, block[before:until], trace)
-            found[n, h], before = errors(estimator, factors), until
+            found[n, h], before = relative_errors(estimator, factors), until
     return found
 
 
@@ -294,7 +294,10 @@ def guarantees() -> Iterator[tuple[str, str]]:
     factors = (2.0, 0.5, 1.0, 2.0, 0.5)
     constant = learner(file_off_by(*factors))
     constant.run(measured(np.full(4 * 7200, 0.1 * RATED_A), 1e-3, np.random.default_rng(1)))
-    yield "4 h of constant current: errors [%]", " ".join(f"{100.0 * e:.0f}" for e in errors(constant, factors))
+    yield (
+        "4 h of constant current: errors [%]",
+        " ".join(f"{100.0 * e:.0f}" for e in relative_errors(constant, factors)),
+    )
     for minutes, error in jump():
         yield f"R_s jumps to 1.5 times after 3 h: its error {minutes} min later [%]", f"{100.0 * error:.1f}"
 

@@ -1,4 +1,4 @@
-"""The load that benchmarks run on: the thesis's pack behind a board, simulated."""
+"""Simulated load of the benchmarks: current pulses of the thesis's pack behind a board."""
 
 import numpy as np
 
@@ -9,18 +9,21 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 CELL = "thunder_power_6s"
 RATE_HZ = 100
 VOLTAGE_STEP_V = 25.0 / 1024 / 16
-"""A 10-bit converter behind the 5:1 divider, sixteen conversions averaged."""
+"""Resolution of the mean of sixteen conversions of a 10-bit ADC of 5 V behind a 5:1 divider [V]."""
 CURRENT_STEP_A = 5.0 / 1024 / 0.1 / 16
-ON_A, HALF_PERIOD_S = 0.7, 60.0
-"""Sixteen hours of these pulses take the pack from SOC 0.90 to 0.05."""
+"""Resolution of the mean of sixteen conversions of the sensor's output, 0.1 V/A [A]."""
+ON_A = 0.7
+"""Current of a pulse [A]. Sixteen hours of pulses discharge the pack from SOC 0.90 to 0.05."""
+HALF_PERIOD_S = 60.0
+"""Duration of a pulse, and of the pause after it [s]."""
 
 
 def pulses(samples: int, rate_hz: int = RATE_HZ) -> SampleBlock:
-    """Pulses of current, 60 s on and 60 s off, noisy and rounded as a board's are.
+    """Return samples under current pulses with the noise and resolution of a board.
 
     Args:
-        samples: How many, dtype SAMPLE.
-        rate_hz: Samples per second.
+        samples: Number of samples.
+        rate_hz: Sample rate [Hz].
     """
     cell = load_cell(CELL)
     block = np.zeros(samples, dtype=SAMPLE)

@@ -1,6 +1,6 @@
-"""Attack by a lost sensor: while a pack is charged, its temperature and then its cell voltages become null.
+"""Attack by a lost sensor: while a pack is charged, its temperature and later its cell voltages become null.
 
-Service and Mosquitto are processes of their own. A hook that lists one critical alarm, and not ``sensor_fault``, must be run.
+Service and Mosquitto are separate processes. A hook that lists one critical alarm, and not ``sensor_fault``, must run.
 """
 
 import asyncio
@@ -25,8 +25,8 @@ PERIOD_S = 0.1
 LATE_S = 3.0
 """Maximum time from the end of the delay to the hook's program [s]."""
 LOSSES = {"t": "over_temperature", "cells": "cell_over_voltage"}
-"""Alarm that needs each quantity of the publisher."""
-PACK = """
+"""Quantities of the publisher, and the alarm that needs each."""
+PACK_TOML = """
 [pack]
 name = "attack"
 cell = "lfp"
@@ -48,7 +48,7 @@ folder = "{folder}"
 lost_s = {lost_s}
 sensor_fault = {{clear_delay_s = 1.0}}
 """
-HOOK = """
+HOOK_TOML = """
 [[alarms.hook]]
 alarms = ["{alarm}"]
 run = ["{program}"]
@@ -63,13 +63,13 @@ class Loss:
         alarm: Alarm that needs the quantity.
         fault_s: Time until ``sensor_fault`` [s].
         hook_s: Time until the hook's program ran [s].
-        ran: What the program was run for, until the quantity was back.
+        ran: Alarm and state of each run of the program, until the quantity was restored.
     """
 
     alarm: str
     fault_s: float
     hook_s: float
-    ran: tuple[str, ...]
+    runs_before: tuple[str, ...]
 
 
 async def attack(broker: Broker, folder: Path, lost_s: float) -> list[Loss]:
@@ -78,28 +78,28 @@ async def attack(broker: Broker, folder: Path, lost_s: float) -> list[Loss]:
     out.touch()
     program.write_text(f'#!/bin/sh\necho "$BMS_NAME $BMS_STATE" >> {out}\n')
     program.chmod(0o700)
-    text = PACK.format(url=broker.url, folder=folder, lost_s=lost_s)
+    text = PACK_TOML.format(url=broker.url, folder=folder, lost_s=lost_s)
     pack = folder / "attack.toml"
-    pack.write_text(text + "".join(HOOK.format(alarm=alarm, program=program) for alarm in LOSSES.values()))
+    pack.write_text(text + "".join(HOOK_TOML.format(alarm=alarm, program=program) for alarm in LOSSES.values()))
     values: dict[str, object] = {"u": 13.4, "i": CHARGE_A, "t": 25.0, "cells": [3.35] * 4}
     async with Listener(broker, "bms/attack/alarm/#") as live, _service(pack, folder), _publisher(broker, values):
-        return [await _lose(live, out, values, quantity, alarm) for quantity, alarm in LOSSES.items()]
+        return [await _lose_quantity(live, out, values, quantity, alarm) for quantity, alarm in LOSSES.items()]
 
 
-async def _lose(live: Listener, out: Path, values: dict[str, object], quantity: str, alarm: str) -> Loss:
+async def _lose_quantity(live: Listener, out: Path, values: dict[str, object], quantity: str, alarm: str) -> Loss:
     """Publish null for a quantity until its alarm's hook has run; then restore the quantity."""
-    fault, topic, ran = "bms/attack/alarm/sensor_fault", f"bms/attack/alarm/{alarm}", len(_lines(out))
-    await live.wait_json(topic, lambda told: told["watched"] and not told["active"])
+    fault, topic, runs_before = "bms/attack/alarm/sensor_fault", f"bms/attack/alarm/{alarm}", len(_lines(out))
+    await live.wait_json(topic, lambda message: message["watched"] and not message["active"])
     before, lost_at_s, begin = values[quantity], time.monotonic(), len(live.messages)
     values[quantity] = None
-    await live.wait_json(fault, lambda told: told["active"] and alarm in told["text"], begin)
+    await live.wait_json(fault, lambda message: message["active"] and alarm in message["text"], begin)
     fault_s = time.monotonic() - lost_at_s
-    await _until(out, ran + 1)
+    await _wait_for_lines(out, runs_before + 1)
     hook_s = time.monotonic() - lost_at_s
-    values[quantity], back = before, len(live.messages)
-    await _until(out, ran + 2)
-    await live.wait_json(fault, lambda told: not told["active"], back)
-    return Loss(alarm, fault_s, hook_s, tuple(_lines(out)[ran:]))
+    values[quantity], restored = before, len(live.messages)
+    await _wait_for_lines(out, runs_before + 2)
+    await live.wait_json(fault, lambda message: not message["active"], restored)
+    return Loss(alarm, fault_s, hook_s, tuple(_lines(out)[runs_before:]))
 
 
 @contextlib.asynccontextmanager
@@ -131,7 +131,7 @@ async def _publisher(broker: Broker, values: dict[str, object]) -> AsyncIterator
         await asyncio.gather(task, return_exceptions=True)
 
 
-async def _until(out: Path, lines: int) -> None:
+async def _wait_for_lines(out: Path, lines: int) -> None:
     async with asyncio.timeout(LONG_S):
         while len(_lines(out)) < lines:  # noqa: ASYNC110 - a program has no event
             await asyncio.sleep(0.01)
@@ -146,10 +146,10 @@ def rows(broker: Broker, folder: Path, lost_s: float) -> Iterator[Row]:
     latest_s = lost_s + LATE_S
     for loss in asyncio.run(attack(broker, folder, lost_s)):
         in_time = lost_s <= loss.fault_s <= latest_s and lost_s <= loss.hook_s <= latest_s
-        as_told = loss.ran == (f"{loss.alarm} raised", f"{loss.alarm} cleared")
+        ran_as_expected = loss.ran == (f"{loss.alarm} raised", f"{loss.alarm} cleared")
         yield Row(
             f"a charged pack loses what {loss.alarm} needs",
             f"alarm and hook after {lost_s:g} to {latest_s:g} s",
             f"sensor_fault after {loss.fault_s:.1f} s, hook after {loss.hook_s:.1f} s",
-            in_time and as_told,
+            in_time and ran_as_expected,
         )

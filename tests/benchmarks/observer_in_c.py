@@ -1,4 +1,4 @@
-"""Observer step in C: compiled from uas_step.c and called on the kernels' records."""
+"""Observer step in C, compiled from uas_step.c. It works on the records of the kernels."""
 
 import ctypes
 import subprocess
@@ -15,15 +15,15 @@ from bms_estimator.model.sample import SAMPLE
 
 SOURCE = Path(__file__).with_name("uas_step.c")
 COMPILER = ["cc", "-O3", "-march=native", "-std=gnu11", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared"]
-"""Like numba, optimize for this processor."""
+"""C compiler with options that optimize for this processor, as numba does."""
 C_TYPES = {"f8": "double", "i8": "int64_t", "u4": "uint32_t"}
 
 
 class ObserverInC:
-    """``run`` of the kernels, in C.
+    """``run`` of the kernels in C.
 
     Args:
-        folder: Where the library is built.
+        folder: Folder in which the library is built.
 
     Raises:
         FileNotFoundError: There is no C compiler.
@@ -44,7 +44,7 @@ class ObserverInC:
 
 
 def header() -> str:
-    """Return the record types as C structures, which have the alignment of numpy's."""
+    """Return the record types as C structures with the alignment of numpy."""
     constants = {
         "OCV_POINTS": OCV_POINTS,
         "INVERSE_ERROR_V": INVERSE_ERROR_V,

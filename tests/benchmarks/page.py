@@ -1,6 +1,6 @@
-"""Cost of the live page in a browser: first paint, CPU and memory at 10 Hz; ``make page ARGS=minutes``.
+"""Benchmark of the live page in a browser: first paint, CPU and memory; ``make page ARGS=minutes``.
 
-A real Chromium on the page of the real service, whose pack publishes ten states a second.
+A real Chromium shows the page of the real service, whose pack publishes ten states a second.
 """
 
 import asyncio
@@ -18,21 +18,27 @@ from tests.page.house import Service, simulated
 
 MINUTES = 5.0
 SETTLE_S = 20.0
+"""Time from the first paint to the measurement [s]."""
 STEP_S = 30.0
-MAX_CPU, MAX_PAINT_S, MAX_GROWTH_MIB = 0.15, 1.0, 4.0
+"""Interval of the heap measurements [s]."""
+MAX_CPU = 0.15
+"""Limit of the CPU time of Chromium as a fraction of a core."""
+MAX_PAINT_S = 1.0
+MAX_GROWTH_MIB = 4.0
+"""Limit of the growth of the JavaScript heap [MiB]."""
 FIRST_PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
 
 
-def processes(of: int) -> list[psutil.Process]:
+def process_tree(pid: int) -> list[psutil.Process]:
     """Return a process and all its descendants."""
-    parent = psutil.Process(of)
+    parent = psutil.Process(pid)
     return [parent, *parent.children(recursive=True)]
 
 
-def cpu_s(of: list[psutil.Process]) -> float:
+def cpu_s(processes: list[psutil.Process]) -> float:
     """Return the total CPU time of processes [s]."""
     total = 0.0
-    for process in of:
+    for process in processes:
         try:
             times = process.cpu_times()
         except psutil.NoSuchProcess:
@@ -41,38 +47,48 @@ def cpu_s(of: list[psutil.Process]) -> float:
     return total
 
 
-def say(text: str) -> None:
+def print_line(text: str) -> None:
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
 
 
 async def measure(service: Service, minutes: float) -> None:
     """Measure one page for ``minutes``."""
-    async with chromium() as browser, tab(browser, service.url) as opened:
-        await opened.until_status("live")
-        await opened.until("() => performance.getEntriesByName('first-contentful-paint').length")
-        say(f"first paint {await opened.page.evaluate(FIRST_PAINT) / 1e3:.2f} s (below {MAX_PAINT_S:g} s)")
-        session = await opened.page.context.new_cdp_session(opened.page)
+    async with chromium() as browser, tab(browser, service.url) as page_tab:
+        await page_tab.until_status("live")
+        await page_tab.until("() => performance.getEntriesByName('first-contentful-paint').length")
+        print_line(f"first paint {await page_tab.page.evaluate(FIRST_PAINT) / 1e3:.2f} s (below {MAX_PAINT_S:g} s)")
+        session = await page_tab.page.context.new_cdp_session(page_tab.page)
         await asyncio.sleep(SETTLE_S)
-        own = [p for p in processes(psutil.Process().pid) if "chrom" in p.name()]
-        renderers = [p for p in own if "--type=renderer" in p.cmdline()]
-        begin_s, all_s, renderer_s, server_s = time.monotonic(), cpu_s(own), cpu_s(renderers), cpu_s(_of(service))
-        heaps = []
+        chromium_processes = [p for p in process_tree(psutil.Process().pid) if "chrom" in p.name()]
+        renderers = [p for p in chromium_processes if "--type=renderer" in p.cmdline()]
+        begin_s, chromium_before_s, renderer_before_s, service_before_s = (
+            time.monotonic(),
+            cpu_s(chromium_processes),
+            cpu_s(renderers),
+            cpu_s(service_processes(service)),
+        )
+        heaps_mib = []
         while time.monotonic() - begin_s < 60.0 * minutes:
             await asyncio.sleep(STEP_S)
             await session.send("HeapProfiler.collectGarbage")
-            heaps.append((await session.send("Runtime.getHeapUsage"))["usedSize"] / 2**20)
-        span_s = time.monotonic() - begin_s
-        parts = {"renderer": cpu_s(renderers) - renderer_s, "all of Chromium": cpu_s(own) - all_s}
-        parts["the service, estimator and all"] = cpu_s(_of(service)) - server_s
-        for name, took_s in parts.items():
-            say(f"{name}: {took_s / span_s:.1%} of a core over {span_s / 60.0:.1f} min")
-        say(f"limit of all of Chromium: {MAX_CPU:.0%}")
-        say(f"JavaScript heap: {heaps[0]:.1f} MiB at first, {heaps[-1]:.1f} at last, {max(heaps):.1f} at most")
-        say(f"growth allowed: {MAX_GROWTH_MIB:g} MiB")
+            heaps_mib.append((await session.send("Runtime.getHeapUsage"))["usedSize"] / 2**20)
+        elapsed_s = time.monotonic() - begin_s
+        cpu_s_by_part = {
+            "renderer": cpu_s(renderers) - renderer_before_s,
+            "all of Chromium": cpu_s(chromium_processes) - chromium_before_s,
+        }
+        cpu_s_by_part["the service, estimator and all"] = cpu_s(service_processes(service)) - service_before_s
+        for name, used_s in cpu_s_by_part.items():
+            print_line(f"{name}: {used_s / elapsed_s:.1%} of a core over {elapsed_s / 60.0:.1f} min")
+        print_line(f"limit of all of Chromium: {MAX_CPU:.0%}")
+        print_line(
+            f"JavaScript heap: {heaps_mib[0]:.1f} MiB at first, {heaps_mib[-1]:.1f} at last, {max(heaps_mib):.1f} at most"
+        )
+        print_line(f"growth allowed: {MAX_GROWTH_MIB:g} MiB")
 
 
-def _of(service: Service) -> list[psutil.Process]:
+def service_processes(service: Service) -> list[psutil.Process]:
     return [psutil.Process(service.process.pid)]
 
 

@@ -1,4 +1,4 @@
-"""Cost of a block of a fleet's pack in a worker, in total and by part, and its memory and disk space."""
+"""Benchmark of a worker: CPU time of a block, in total and by part, and memory and checkpoint size of a pack."""
 
 import sys
 import time
@@ -20,21 +20,25 @@ from bms_estimator.telemetry.remaining_charge import remaining_charge
 from bms_estimator.telemetry.state import make_state_payload
 
 PACKS, MINUTES, SAMPLES = 100, 90, 60
-STORE = 480_000 * 3600 * 10**9
+HOUR = 480_000
+"""Hour of the blocks [h since 1970]."""
+STORE_ID = HOUR * 3600 * 10**9
+"""Identifier of the edge's block store: its creation time [ns since 1970]."""
 ROUNDS, CALLS = 5, 400
 MAX_US = 250.0
-SETTINGS, PACK = Settings(), load_cell(CELL)
+"""Limit of the CPU time of a block [us]."""
+SETTINGS, CELL_MODEL = Settings(), load_cell(CELL)
 
 
 def rows() -> Iterator[Row]:
     """Measure CPU time in total and by part; each part is the minimum of some rounds."""
     samples = pulses(MINUTES * SAMPLES, rate_hz=1)
     blocks = [_block(samples, minute) for minute in range(MINUTES)]
-    partition = Partition(0, lambda _: (SETTINGS, PACK))
-    each_us = _whole(partition, blocks)
+    partition = Partition(0, lambda _: (SETTINGS, CELL_MODEL))
+    each_us = _block_us(partition, blocks)
     yield Row(f"a block of {SAMPLES} samples, all in", f"below {MAX_US:.0f} us", f"{each_us:.0f} us", each_us < MAX_US)
-    for what, us in _parts(partition, samples, blocks):
-        yield Row(f"  {what}", "-", f"{us:.1f} us", None)
+    for part_name, us in _part_us(partition, samples, blocks):
+        yield Row(f"  {part_name}", "-", f"{us:.1f} us", None)
     packs = partition.snapshot().packs
     bytes_per_pack = sum(map(sys.getsizeof, packs.values())) / PACKS
     begin_s = time.process_time()
@@ -51,12 +55,14 @@ def rows() -> Iterator[Row]:
 
 def _block(samples: SampleBlock, minute: int) -> bytes:
     part = samples[minute * SAMPLES : (minute + 1) * SAMPLES]
-    return encode(Block(STORE, minute + 1, 1, STORE / 1e9 + float(part["time_s"][-1]), part))
+    return encode(Block(STORE_ID, minute + 1, 1, STORE_ID / 1e9 + float(part["time_s"][-1]), part))
 
 
-def _whole(partition: Partition, blocks: list[bytes]) -> float:
-    """Return the time of one block, among those of all packs in turn [us]: the median of all minutes, and a share
-    of the full hour."""
+def _block_us(partition: Partition, blocks: list[bytes]) -> float:
+    """Return the CPU time of one block, with the blocks of all packs in turn [us].
+
+    It is the median of all minutes plus a 60th of the additional time at the full hour.
+    """
     minutes_s, sequence = [], 0
     for data in blocks:
         begin_s = time.process_time()
@@ -64,15 +70,15 @@ def _whole(partition: Partition, blocks: list[bytes]) -> float:
             sequence += 1
             partition.take(f"pack{pack}", data, sequence)
         minutes_s.append(time.process_time() - begin_s)
-    usual_s = np.median(minutes_s[1:])
-    hourly_s = max(minutes_s[60] - usual_s, 0.0) / 60
-    return float(1e6 * (usual_s + hourly_s) / PACKS)
+    median_s = np.median(minutes_s[1:])
+    hourly_s = max(minutes_s[60] - median_s, 0.0) / 60
+    return float(1e6 * (median_s + hourly_s) / PACKS)
 
 
-def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
+def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
     """Yield the time of each part, on the state before the last block [us]."""
     work_record, pack_type = partition._work, partition._type_by_pack["pack0"]
-    estimator, wall_s = pack_type.estimator, STORE / 1e9 + samples.size
+    estimator, wall_s = pack_type.estimator, STORE_ID / 1e9 + samples.size
     packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
     work_record.put(packed)
     before, trace = estimator.record.copy(), estimator.run(block.samples).copy()
@@ -92,26 +98,26 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
         estimator.record[...] = before
         estimator.run(block.samples)
 
-    put_back_us = _us(lambda: estimator.record.__setitem__(..., before))
-    yield "its bytes", _us(lambda: decode(blocks[-1]))
-    yield "the state unpacked", _us(lambda: work_record.put(packed))
-    yield "the estimator", _us(step) - put_back_us
-    yield "the hour's sums", _us(lambda: hour_summary.add(work_record.record["hour"], trace, block, estimator))
-    yield "what has flowed", _us(lambda: (pack_type.meter.add(trace), pack_type.meter.update_totals()))
-    yield "topic state", _us(state)
-    yield "the state packed", _us(work_record.take)
-    parameters_us = _us(lambda: make_parameters_payload(estimator, wall_s).model_dump_json())
-    row_us = _us(
-        lambda: hour_summary.row(pack_type.settings, 480_000, work_record.record["hour"], estimator).model_dump_json()
+    put_back_us = _call_us(lambda: estimator.record.__setitem__(..., before))
+    yield "its bytes", _call_us(lambda: decode(blocks[-1]))
+    yield "the state unpacked", _call_us(lambda: work_record.put(packed))
+    yield "the estimator", _call_us(step) - put_back_us
+    yield "the hour's sums", _call_us(lambda: hour_summary.add(work_record.record["hour"], trace, block, estimator))
+    yield "what has flowed", _call_us(lambda: (pack_type.meter.add(trace), pack_type.meter.update_totals()))
+    yield "topic state", _call_us(state)
+    yield "the state packed", _call_us(work_record.take)
+    parameters_us = _call_us(lambda: make_parameters_payload(estimator, wall_s).model_dump_json())
+    row_us = _call_us(
+        lambda: hour_summary.row(pack_type.settings, HOUR, work_record.record["hour"], estimator).model_dump_json()
     )
     yield "topic parameters and the row of an hour, a 60th of it", (parameters_us + row_us) / 60
 
 
-def _us(call: Callable[[], object]) -> float:
-    least_s = float("inf")
+def _call_us(call: Callable[[], object]) -> float:
+    min_s = float("inf")
     for _ in range(ROUNDS):
         begin_s = time.process_time()
         for _ in range(CALLS):
             call()
-        least_s = min(least_s, time.process_time() - begin_s)
-    return 1e6 * least_s / CALLS
+        min_s = min(min_s, time.process_time() - begin_s)
+    return 1e6 * min_s / CALLS

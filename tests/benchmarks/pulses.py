@@ -1,8 +1,9 @@
-"""R_s beside what pulses of the same captures show.
+"""Comparison of the estimated R_s with the resistance of current steps in the captures.
 
-A pulse is a step of the current by more than C/5 that is held before and behind it; it shows the jump of the voltage over
-that of the current, over two rows where there are more than two a second behind it: logged current and voltage may be one row apart.
-Nine pulses around are taken together (median), since one alone is off by up to 16 %. Judged from 15 min on.
+A pulse is a step of the current by more than C/5 between two constant currents. Its resistance is the change of the voltage
+divided by that of the current. With more than two rows a second the change is over two rows, because logged current and
+voltage may be one row apart. A running median over nine pulses is used, because a single pulse has errors of up to 16 %.
+Results are compared from 15 min after the start on.
 """
 
 from collections.abc import Iterator
@@ -18,42 +19,50 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import FROM_START, GROUPS, WRONG, Group, cell_file, chosen, load
 
-MIN_C, HELD_SHARE = 0.2, 0.1
-MAX_STEP_S, SLOW_S = 1.6, 0.5
+MIN_C = 0.2
+"""Minimum change of the current in a pulse [C]."""
+HELD_SHARE = 0.1
+"""Maximum change of the current before and after a pulse, as a fraction of the pulse."""
+MAX_STEP_S = 1.6
+"""Maximum time between the two rows of a pulse [s]."""
+SLOW_S = 0.5
+"""Row interval above which the change is over a single row [s]."""
 AROUND = 9
+"""Number of pulses of the running median."""
 AFTER_S = 900.0
+"""Time after the start that is not compared [s]."""
 
 
 def pulse_table(folder: Path, wanted: list[str]) -> Table:
-    """Print the table for every group without foreign captures or sensor errors."""
+    """Return the table of every matching group without sensor errors and without charges."""
     table = Table(title="R_s against pulses: ratio of the medians; within 10 %, inside 2 std [% of pulses]")
     for column in ("group", "pulses", "step s", "pulse mOhm", "ratio", "within 10 %", "inside", "std %"):
         table.add_column(column, justify="left" if column == "group" else "right")
     for group in chosen(GROUPS, wanted):
         sensors_right = group.gain == group.capacity == 1.0 and group.offset_a == 0.0
         if sensors_right and group.cut != FROM_START and not group.charging:
-            table.add_row(group.name, *cells_of(group, folder))
+            table.add_row(group.name, *table_cells(group, folder))
     return table
 
 
-def cells_of(group: Group, folder: Path) -> Iterator[str]:
+def table_cells(group: Group, folder: Path) -> Iterator[str]:
     """Yield the cells of one table row."""
-    cell, shown, said, std, step_s = cell_file(group.recipe, folder), [], [], [], 0.0
+    cell, pulse_ohm, estimated_ohm, std, step_s = cell_file(group.recipe, folder), [], [], [], 0.0
     for name, capacity_ah, initial_soc in group.captures:
         samples = load(name, capacity_ah, initial_soc)[0]
         rows, ohm = pulses(samples, capacity_ah)
         if not rows.size:
             continue
         trace = Estimator(cell, initial_soc=initial_soc + WRONG[0]).run(samples)
-        shown.append(median_filter(ohm, AROUND, mode="nearest"))
+        pulse_ohm.append(median_filter(ohm, AROUND, mode="nearest"))
         time_s = samples["time_s"][rows]
-        said.append(np.interp(time_s, trace["time_s"], trace["r_s_ohm"]))
+        estimated_ohm.append(np.interp(time_s, trace["time_s"], trace["r_s_ohm"]))
         std.append(np.interp(time_s, trace["time_s"], trace["r_s_std_ohm"]))
         step_s = float(np.median(np.diff(samples["time_s"])))
-    if sum(map(len, shown)) < AROUND:
+    if sum(map(len, pulse_ohm)) < AROUND:
         yield "none"
         return
-    pulse, r_s, r_s_std = np.concatenate(shown), np.concatenate(said), np.concatenate(std)
+    pulse, r_s, r_s_std = np.concatenate(pulse_ohm), np.concatenate(estimated_ohm), np.concatenate(std)
     yield f"{pulse.size}"
     yield f"{step_s:.1f}"
     yield f"{1e3 * np.median(pulse):.1f}"
@@ -68,11 +77,11 @@ def pulses(samples: SampleBlock, capacity_ah: float) -> tuple[NDArray[np.intp], 
     time_s, current_a, voltage_v = (samples[n] for n in ("time_s", "current_a", "voltage_v"))
     change_a, step_s = np.diff(current_a), np.diff(time_s)
     inner = np.arange(1, change_a.size - 2)
-    most_a = HELD_SHARE * np.abs(change_a[inner])
-    held = (np.abs(change_a[inner - 1]) < most_a) & (np.abs(change_a[inner + 1]) < most_a)
-    large = np.abs(change_a[inner]) > MIN_C * capacity_ah
-    soon = (step_s[inner] > 0.0) & (step_s[inner] < MAX_STEP_S) & (time_s[inner] > time_s[0] + AFTER_S)
-    rows = inner[held & large & soon]
-    over = np.where(step_s[rows + 1] > SLOW_S, 1, 2)
-    ohm = -(voltage_v[rows + over] - voltage_v[rows]) / (current_a[rows + over] - current_a[rows])
+    max_change_a = HELD_SHARE * np.abs(change_a[inner])
+    is_constant_around = (np.abs(change_a[inner - 1]) < max_change_a) & (np.abs(change_a[inner + 1]) < max_change_a)
+    is_large = np.abs(change_a[inner]) > MIN_C * capacity_ah
+    is_valid_time = (step_s[inner] > 0.0) & (step_s[inner] < MAX_STEP_S) & (time_s[inner] > time_s[0] + AFTER_S)
+    rows = inner[is_constant_around & is_large & is_valid_time]
+    row_count = np.where(step_s[rows + 1] > SLOW_S, 1, 2)
+    ohm = -(voltage_v[rows + row_count] - voltage_v[rows]) / (current_a[rows + row_count] - current_a[rows])
     return rows, ohm

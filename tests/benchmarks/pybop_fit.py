@@ -10,24 +10,31 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 
 LOWEST_SOC = 0.1
-FULL = 1.0 - 1e-3  # closer to 1 the current noise at rest would end the simulation at once
+MAX_INITIAL_SOC = 1.0 - 1e-3
+"""Maximum initial SOC. At an SOC nearer to 1 the current noise at rest would end the simulation."""
 SPAN = 4.0
 """Factor of the bounds around the start, as for the observer's parameters."""
 
 
-NEVER_V = 1e3
-"""Cut-off that no simulation reaches, because the optimizer tries extreme values."""
-CHANGE_C, EVERY_S = 0.02, 10.0
-"""Maximum interval between kept rows; both ends of a larger current change are kept too."""
+UNREACHED_V = 1e3
+"""Voltage limit that no simulation reaches, not even with the extreme values that the optimizer tries [V]."""
+CHANGE_C = 0.02
+"""Minimum current change of which both rows are used [C]."""
+EVERY_S = 10.0
+"""Maximum interval between used rows [s]."""
 MAX_ROWS = 7_000
+"""Maximum number of rows. A fit to more rows takes more than about a minute."""
 
 
-def thinned(samples: SampleBlock, change_a: float) -> SampleBlock:
-    """Return about a tenth of the rows of a test at 1 Hz, with all current steps, so that a fit takes one minute instead of five."""
+def thin_out(samples: SampleBlock, change_a: float) -> SampleBlock:
+    """Return about a tenth of the rows of a test at 1 Hz, with all current steps.
+
+    A fit to them takes one minute instead of five.
+    """
     changed = np.abs(np.diff(samples["current_a"])) > change_a
-    kept = np.concatenate([[True], changed]) | np.concatenate([changed, [True]])
-    kept |= np.diff(samples["time_s"] // EVERY_S, prepend=-1.0) > 0.0
-    return samples[kept]
+    is_used = np.concatenate([[True], changed]) | np.concatenate([changed, [True]])
+    is_used |= np.diff(samples["time_s"] // EVERY_S, prepend=-1.0) > 0.0
+    return samples[is_used]
 
 
 def fit(
@@ -35,20 +42,20 @@ def fit(
 ) -> tuple[float, float, float, float, float] | None:
     """Fit R_s, R_1 [ohm], C_1 [F], R_2 [ohm], C_2 [F] by least squares to a capture that begins at rest.
 
-    SOC below 0.1 is left out: constant elements know nothing of it.
+    Samples below SOC 0.1 are not used, because constant elements cannot describe them.
 
     Args:
         cell: Capacity, limits and OCV.
-        samples: Of the capture.
-        initial_soc: At its first sample.
-        start: Elements by their names at PyBOP.
+        samples: Samples of the capture.
+        initial_soc: SOC at the first sample.
+        start: Initial elements by their names in PyBOP.
         seed: Seed of the random numbers that CMA-ES draws.
 
     Returns:
-        None where it would take more than a minute or so: a capture without longer rests or steps cannot be thinned.
+        None if the fit would take more than about a minute, because a capture without long rests or steps has many rows.
     """
     soc = soc_by_counting(samples, cell.cell.capacity_ah, initial_soc)
-    samples = thinned(samples[soc > LOWEST_SOC], CHANGE_C * cell.cell.capacity_ah)
+    samples = thin_out(samples[soc > LOWEST_SOC], CHANGE_C * cell.cell.capacity_ah)
     if samples.size > MAX_ROWS:
         return None
     ocv_v = ocv_grid(cell)[0]
@@ -57,11 +64,11 @@ def fit(
     values = model.default_parameter_values.copy()
     values.update(
         {
-            "Initial SoC": min(initial_soc, FULL),
+            "Initial SoC": min(initial_soc, MAX_INITIAL_SOC),
             "Cell capacity [A.h]": cell.cell.capacity_ah,
             "Nominal cell capacity [A.h]": cell.cell.capacity_ah,
-            "Upper voltage cut-off [V]": NEVER_V,
-            "Lower voltage cut-off [V]": -NEVER_V,
+            "Upper voltage cut-off [V]": UNREACHED_V,
+            "Lower voltage cut-off [V]": -UNREACHED_V,
             "Open-circuit voltage [V]": lambda soc: pybamm.Interpolant(grid, ocv_v, soc),
             "Element-1 initial overpotential [V]": 0.0,
             "Element-2 initial overpotential [V]": 0.0,

@@ -1,4 +1,4 @@
-"""Groups of real captures, and their cell files made by this project's commands."""
+"""Groups of real captures, and their cell files by this project's commands."""
 
 import subprocess
 import sys
@@ -26,8 +26,7 @@ PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
 
 @dataclass(frozen=True)
 class Recipe:
-    """Recipe of a cell file: by `ocv`, and by `identify` if there are captures for it; a generic one has chemistry
-    and capacity only."""
+    """Captures from which `ocv` and `identify` compute a cell file, or the generic cell that is used instead."""
 
     capacity_ah: float
     ocv: tuple[str, ...] = ()
@@ -71,7 +70,7 @@ class Group:
     capacity: float = 1.0
     """Declared divided by true capacity."""
     charging: bool = False
-    """Fraction of the charge after the lowest SOC."""
+    """True: the estimator starts in the charge after the lowest SOC, and ``cut`` is a fraction of that charge."""
 
 
 NCR_CHANGING = (
@@ -156,14 +155,14 @@ GROUPS = (
 
 
 def chosen(groups: Iterable[Group], parts: list[str]) -> list[Group]:
-    """Return the items whose name contains one of ``parts``; all without parts."""
+    """Return the groups whose name contains one of ``parts``, or all groups if there are no parts."""
     if not DATA.is_dir():
         sys.exit(f"{DATA}: the captures are not there")
     return [g for g in groups if not parts or any(part in g.name for part in parts)]
 
 
 def runs(group: Group, folder: Path) -> Iterator[tuple[CellModel, SampleBlock, Floats, float]]:
-    """Return cell file, samples, true SOC and initial SOC of each capture and start."""
+    """Yield cell file, samples, true SOC and initial SOC of each capture and start."""
     true_ah = group.recipe.capacity_ah
     cell = cell_file(group.recipe, folder)
     if group.capacity != 1.0:
@@ -179,35 +178,35 @@ def runs(group: Group, folder: Path) -> Iterator[tuple[CellModel, SampleBlock, F
 
 
 def first_sample(samples: SampleBlock, group: Group) -> int:
-    """Return the first sample of the estimator."""
-    drawn_ah = charge_ah(samples)
-    lowest = int(np.argmax(drawn_ah)) if group.charging else 0
-    moved_ah = np.abs(drawn_ah[lowest:] - drawn_ah[lowest])
-    return lowest + int(np.argmax(moved_ah >= group.cut * moved_ah[-1]))
+    """Return the index of the first sample of the estimator."""
+    discharged_ah = charge_ah(samples)
+    lowest = int(np.argmax(discharged_ah)) if group.charging else 0
+    charge_from_lowest_ah = np.abs(discharged_ah[lowest:] - discharged_ah[lowest])
+    return lowest + int(np.argmax(charge_from_lowest_ah >= group.cut * charge_from_lowest_ah[-1]))
 
 
 @cache
 def cell_file(recipe: Recipe, folder: Path) -> CellModel:
-    """Return the cell file by `ocv`, then `identify`; a rejected file is not used, and printed."""
+    """Return the cell file by `ocv` and `identify`. If `identify` fails, its error is printed and the file of `ocv` used."""
     if recipe.generic:
         return load_cell(recipe.generic, recipe.capacity_ah)
-    named = *recipe.ocv, *recipe.identify
-    stem = f"{named[0].replace('/', '_')}_{len(named)}_{named[-1].replace('/', '_')}"
-    curve, whole = folder / f"{stem}_ocv.toml", folder / f"{stem}.toml"
-    told = () if recipe.measured else ("--capacity-ah", recipe.capacity_ah)
-    command("ocv", *map(path_of, recipe.ocv), *told, "--out", curve)
+    captures = *recipe.ocv, *recipe.identify
+    stem = f"{captures[0].replace('/', '_')}_{len(captures)}_{captures[-1].replace('/', '_')}"
+    ocv_file, identified_file = folder / f"{stem}_ocv.toml", folder / f"{stem}.toml"
+    capacity_option = () if recipe.measured else ("--capacity-ah", recipe.capacity_ah)
+    command("ocv", *map(path_of, recipe.ocv), *capacity_option, "--out", ocv_file)
     if not recipe.identify:
-        return load_cell(curve)
-    refused = command("identify", *map(path_of, recipe.identify), "--cell", curve, "--out", whole)
-    return load_cell(curve if refused else whole)
+        return load_cell(ocv_file)
+    identify_error = command("identify", *map(path_of, recipe.identify), "--cell", ocv_file, "--out", identified_file)
+    return load_cell(ocv_file if identify_error else identified_file)
 
 
 def command(*arguments: object) -> str:
     """Run the program; return its error text, empty if it succeeded."""
-    done = subprocess.run([PROGRAM, *map(str, arguments)], capture_output=True, text=True, check=False)
-    if done.returncode:
-        sys.stderr.write(f"{arguments[0]} gave no file: {done.stderr.strip().splitlines()[-1]}\n")
-    return done.stderr if done.returncode else ""
+    process = subprocess.run([PROGRAM, *map(str, arguments)], capture_output=True, text=True, check=False)
+    if process.returncode:
+        sys.stderr.write(f"{arguments[0]} gave no file: {process.stderr.strip().splitlines()[-1]}\n")
+    return process.stderr if process.returncode else ""
 
 
 def path_of(name: str) -> Path:
@@ -220,14 +219,14 @@ def load(name: str, capacity_ah: float, initial_soc: float) -> tuple[SampleBlock
     """Return samples without invalid voltages, and the true SOC at each."""
     rows = load_capture(path_of(name)).rows
     rows = rows[(rows["voltage_v"] > LOWEST_V) & (rows["voltage_v"] < HIGHEST_V)]
-    counter = DATA / f"{name}.soc.gz"
-    if counter.exists():
-        time_s, soc = np.genfromtxt(counter, delimiter=",", skip_header=1).T
+    counter_file = DATA / f"{name}.soc.gz"
+    if counter_file.exists():
+        time_s, soc = np.genfromtxt(counter_file, delimiter=",", skip_header=1).T
         return rows, np.interp(rows["time_s"], time_s, soc)
     return rows, initial_soc - charge_ah(rows) / capacity_ah
 
 
 def charge_ah(samples: SampleBlock) -> Floats:
-    """Return the charge drawn before each sample [Ah], shape (n,); the current is constant between samples."""
-    moved_as = samples["current_a"][:-1] * np.clip(np.diff(samples["time_s"]), 0.0, None)
-    return np.concatenate([[0.0], np.cumsum(moved_as)]) / 3600.0
+    """Return the charge discharged before each sample [Ah], shape (n,). The current is constant between samples."""
+    charge_as = samples["current_a"][:-1] * np.clip(np.diff(samples["time_s"]), 0.0, None)
+    return np.concatenate([[0.0], np.cumsum(charge_as)]) / 3600.0

@@ -1,18 +1,17 @@
-"""Effect of a source's rate, steps and delay on the SOC and its interval, on cells that differ from the estimator's
-model.
+"""Effect of sample rate, resolution and delay of a source on the SOC and its interval, on cells that differ from the model.
 
-Each row is one kind of source; a run is one simulated cell (``tests.estimator.anywhere``: its cell file errs as much as it
-says), under levels of some seconds or as in a house, met in mid-load with an SOC told 0.2 too low or 0.2 too high. Judged
-from 15 min on, above SOC 0.05:
+Each row is a kind of source. A run is one simulated cell of ``tests.estimator.anywhere``, whose cell file has errors of the
+declared size. The load has levels of some seconds, or is that of a house. The estimator starts in mid-load with an SOC 0.2 too
+low or 0.2 too high. Results are scored from 15 min on, above SOC 0.05:
 
-- RMSE: of the SOC over all runs, and of the worst [%]
-- inside: share of time that the truth is inside soc +- 2 soc_std, of all runs and of the worst [%]
+- RMSE: error of the SOC, of all runs and of the worst run [%]
+- inside: fraction of time with the true SOC inside soc +- 2 soc_std, of all runs and of the worst run [%]
 - std: mean of soc_std [%]
-- score: interval score of that band as of 95 %: its width plus 40 times what lies outside; smaller is better [%]
+- score: interval score of this interval as a 95 % interval: width plus 40 times the distance outside; smaller is better [%]
 
     make resolution ARGS="--undeclared"
 
-``--undeclared``: the estimator is not told what the source resolves, as it was before there was anything to tell.
+With ``--undeclared`` the estimator has the default sampling settings instead of those of the source.
 """
 
 import sys
@@ -36,7 +35,7 @@ TRUTH_HZ = 10
 SEEDS = range(1, 9)
 KELVIN_STEP = 1.0
 NOISE_V = 5e-4
-LATE = 0.02
+JITTER = 0.02
 """Jitter of the sample times [periods]."""
 
 
@@ -50,8 +49,9 @@ class Source:
     delay_s: float = 0.0
     """Age of a sample's current minus that of its voltage [s]."""
     volt_step: float = 1e-3
-    """Capacity of one cell [Ah]."""
+    """Resolution of the voltage [V]."""
     capacity_ah: float = 3.0
+    """Capacity of one cell [Ah]."""
     house: bool = False
     """True: hours of small loads and a night of standby; False: a drive."""
     standby_a: float = 0.0
@@ -96,7 +96,7 @@ SOURCES = (
 
 def main() -> None:
     """Print the table of the rows whose name contains an argument, or all."""
-    told = "--undeclared" not in sys.argv
+    is_declared = "--undeclared" not in sys.argv
     wanted = [argument for argument in sys.argv[1:] if not argument.startswith("--")]
     table = Table(title="RMSE/worst, inside/worst, std, score in %")
     table.add_column("source")
@@ -104,25 +104,25 @@ def main() -> None:
         table.add_column(column, justify="right")
     for source in SOURCES:
         if not wanted or any(name in source.name for name in wanted):
-            table.add_row(source.name, *cells_of(list(scores(source, told=told))))
+            table.add_row(source.name, *table_cells(list(scores(source, is_declared=is_declared))))
     Console(width=None if sys.stdout.isatty() else 130).print(table)
 
 
-def cells_of(found: list[Score]) -> Iterator[str]:
+def table_cells(results: list[Score]) -> Iterator[str]:
     """Yield the cells of one table row."""
-    rmse, cover = [s.rmse for s in found], [s.cover for s in found]
+    rmse, cover = [s.rmse for s in results], [s.cover for s in results]
     yield f"{np.sqrt(np.mean(np.square(rmse))):.2f}/{max(rmse):.2f}"
     yield f"{np.mean(cover):.1f}/{min(cover):.0f}"
-    yield f"{np.mean([s.std for s in found]):.2f}"
-    yield f"{np.mean([s.score for s in found]):.2f}"
+    yield f"{np.mean([s.std for s in results]):.2f}"
+    yield f"{np.mean([s.score for s in results]):.2f}"
 
 
-def scores(source: Source, *, told: bool = True, seeds: Iterable[int] = SEEDS) -> Iterator[Score]:
+def scores(source: Source, *, is_declared: bool = True, seeds: Iterable[int] = SEEDS) -> Iterator[Score]:
     """Return the scores of each run of a kind of source."""
     for case in cases_of(source, seeds):
-        samples, soc = seen(case, source)
+        samples, soc = sample_source(case, source)
         for wrong in WRONG:
-            sampling = {"sampling": source.sampling} if told else {}
+            sampling = {"sampling": source.sampling} if is_declared else {}
             estimator = Estimator(
                 cell_file(case),
                 voltage_resolution_v=source.volt_step,
@@ -158,35 +158,42 @@ def current_of(case: Case, source: Source, rate_hz: int) -> Floats:
     return np.repeat(level_a + source.standby_a, rate_hz)
 
 
-def seen(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
+def sample_source(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
     """Return the samples of the source, and the SOC at each."""
     rng = np.random.default_rng(1000 + case.seed)
     rate_hz = max(TRUTH_HZ, round(source.rate_hz))
     current_a = current_of(case, source, rate_hz)
     shift = rng.integers(rate_hz)
     current_a = np.concatenate([np.full(shift, current_a[0]), current_a])  # no sample falls on a change of level
-    t = case.truth
-    curves = t.ocv_v, t.per_kelvin_v, t.hysteresis_v, t.ohm
+    truth = case.truth
+    curves = truth.ocv_v, truth.per_kelvin_v, truth.hysteresis_v, truth.ohm
     temperature_c = np.full(current_a.size, case.temperature_c)
-    voltage_v, soc = simulate(1.0 / rate_hz, current_a, temperature_c, case.soc, -1.0, t.capacity_ah, *curves)
-    step, late = round(rate_hz / source.rate_hz), round(source.delay_s * rate_hz)
-    at = np.arange(round(3600 * case.unseen_h * rate_hz), current_a.size, step)
-    late_by = round(LATE * step)
-    at = np.clip(at + rng.integers(-late_by, late_by + 1, at.size), 0, current_a.size - 1)
-    empty = (soc[at] < 0.02) | (voltage_v[at] < (2.5 if case.truth.ocv_v is OXIDE.ocv_v else 2.0))
-    at = at[: int(np.argmax(empty))] if empty.any() else at
-    samples = np.zeros(at.size, dtype=SAMPLE)
-    samples["time_s"] = at / rate_hz
-    shown_a = current_a[np.clip(at - late, 0, current_a.size - 1)] + rng.normal(
-        0.0, 2e-3 * source.capacity_ah / 3.0, at.size
+    voltage_v, soc = simulate(1.0 / rate_hz, current_a, temperature_c, case.soc, -1.0, truth.capacity_ah, *curves)
+    step, delay_steps = round(rate_hz / source.rate_hz), round(source.delay_s * rate_hz)
+    sample_indices = np.arange(round(3600 * case.unseen_h * rate_hz), current_a.size, step)
+    max_jitter_steps = round(JITTER * step)
+    sample_indices = np.clip(
+        sample_indices + rng.integers(-max_jitter_steps, max_jitter_steps + 1, sample_indices.size),
+        0,
+        current_a.size - 1,
     )
-    shown_a[np.abs(shown_a) < source.dead_band_a] = 0.0
-    samples["current_a"] = np.round(shown_a / source.ampere_step) * source.ampere_step
+    empty = (soc[sample_indices] < 0.02) | (
+        voltage_v[sample_indices] < (2.5 if case.truth.ocv_v is OXIDE.ocv_v else 2.0)
+    )
+    sample_indices = sample_indices[: int(np.argmax(empty))] if empty.any() else sample_indices
+    samples = np.zeros(sample_indices.size, dtype=SAMPLE)
+    samples["time_s"] = sample_indices / rate_hz
+    reported_a = current_a[np.clip(sample_indices - delay_steps, 0, current_a.size - 1)] + rng.normal(
+        0.0, 2e-3 * source.capacity_ah / 3.0, sample_indices.size
+    )
+    reported_a[np.abs(reported_a) < source.dead_band_a] = 0.0
+    samples["current_a"] = np.round(reported_a / source.ampere_step) * source.ampere_step
     samples["voltage_v"] = (
-        np.round((voltage_v[at] + rng.normal(0.0, NOISE_V, at.size)) / source.volt_step) * source.volt_step
+        np.round((voltage_v[sample_indices] + rng.normal(0.0, NOISE_V, sample_indices.size)) / source.volt_step)
+        * source.volt_step
     )
     samples["temperature_c"] = case.temperature_c
-    return samples, soc[at]
+    return samples, soc[sample_indices]
 
 
 if __name__ == "__main__":

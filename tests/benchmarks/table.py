@@ -10,7 +10,7 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Row:
-    """Row: quantity, target, measured value, and whether the target is met (None: no target)."""
+    """Row: quantity, target, measured value, and True if the target is met (None: no target)."""
 
     what: str
     target: str

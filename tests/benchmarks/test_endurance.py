@@ -1,14 +1,14 @@
-"""Short run of ``make load``."""
+"""Short runs of two parts of ``make load``: serial bytes, and the attack by a lost sensor."""
 
 from pathlib import Path
 
-from tests.benchmarks.endurance import fed
+from tests.benchmarks.endurance import process_bytes
 from tests.benchmarks.lost_sensor import LOSSES, attack
 from tests.mosquitto import Broker
 
 
 def test_ten_minutes_of_serial_bytes_are_estimated() -> None:
-    decoder, estimator, _, _ = fed(100, 600.0)
+    decoder, estimator, _, _ = process_bytes(100, 600.0)
     assert decoder.counters["frames_received"] == estimator.state["samples"][0] == 60_000
     assert decoder.counters["frames_lost"] == decoder.counters["clock_jumps"] == 0
 

@@ -1,4 +1,4 @@
-"""Equal results of the C version and the kernel."""
+"""Equal results of the observer in C and of the kernel."""
 
 import shutil
 import sys
@@ -20,19 +20,19 @@ from observer_in_c import ObserverInC
 @pytest.mark.parametrize(
     "settings",
     [ObserverSettings(), ObserverSettings(dead_zone_v=0.0), ObserverSettings(law="scheme-3", nussbaum="k2-cos")],
-    ids=["default", "as printed", "scheme 3"],
+    ids=["default", "no dead zone", "scheme 3"],
 )
-def test_c_and_kernel_agree(settings, tmp_path):
+def test_the_observer_in_c_equals_the_kernel(settings, tmp_path):
     if shutil.which("cc") is None:
         pytest.skip("no C compiler (apt install gcc)")
     block = pulses(60_000)
     block["voltage_v"][20_000:20_010] = np.nan
-    estimator, twin = (Estimator(load_cell(CELL), settings, identifier=None) for _ in range(2))
+    estimator, c_estimator = (Estimator(load_cell(CELL), settings, identifier=None) for _ in range(2))
     expected = estimator.run(block)
     trace = np.zeros(block.size, dtype=TRACE)
-    rows = ObserverInC(tmp_path).run(twin.state, twin.settings, block, trace)
+    rows = ObserverInC(tmp_path).run(c_estimator.state, c_estimator.settings, block, trace)
     assert rows == expected.size == block.size - 10
     for name in ("soc", "voltage_estimate_v", "innovation_v", "nussbaum_gain", "k", "delta_1", "stability_margin"):
         np.testing.assert_allclose(trace[name][:rows], expected[name], rtol=1e-9, atol=1e-12, err_msg=name)
     assert np.array_equal(trace["lock"][:rows], expected["lock"])
-    assert twin.state["dropped_not_finite"][0] == 10
+    assert c_estimator.state["dropped_not_finite"][0] == 10

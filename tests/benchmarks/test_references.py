@@ -1,4 +1,4 @@
-"""References of the comparison, tested on a cell with known elements."""
+"""References of the comparison with other methods: resistances and time constants of a cell with known elements."""
 
 import numpy as np
 import pytest
@@ -40,35 +40,35 @@ def relaxation_test(rest_s: int = 900, resolution_v: float = 1e-3) -> Block:
 
 
 def test_rc_products_from_rests_within_five_percent():
-    found = relaxations(relaxation_test(), CAPACITY_AH)
-    assert found.soc.size >= 15
-    assert np.median(found.tau_ts_s) == pytest.approx(TAU_TS, rel=0.05)
-    assert np.median(found.tau_tl_s) == pytest.approx(TAU_TL, rel=0.05)
+    result = relaxations(relaxation_test(), CAPACITY_AH)
+    assert result.soc.size >= 15
+    assert np.median(result.tau_ts_s) == pytest.approx(TAU_TS, rel=0.05)
+    assert np.median(result.tau_tl_s) == pytest.approx(TAU_TL, rel=0.05)
 
 
 def test_rc_products_without_noise_within_one_percent():
-    found = relaxations(relaxation_test(resolution_v=1e-7), CAPACITY_AH)
-    assert found.soc.size == 17
-    assert found.tau_ts_s == pytest.approx(TAU_TS, rel=0.01)
-    assert found.tau_tl_s == pytest.approx(TAU_TL, rel=0.01)
+    result = relaxations(relaxation_test(resolution_v=1e-7), CAPACITY_AH)
+    assert result.soc.size == 17
+    assert result.tau_ts_s == pytest.approx(TAU_TS, rel=0.01)
+    assert result.tau_tl_s == pytest.approx(TAU_TL, rel=0.01)
 
 
-def test_short_rest_and_single_exponential_give_nothing():
+def test_a_short_rest_or_a_single_exponential_gives_no_time_constants():
     assert relaxations(relaxation_test(rest_s=500), CAPACITY_AH).soc.size == 0
     time_s = np.arange(1.0, 900.0)
     assert two_exponentials(time_s, 3.7 - 0.02 * np.exp(-time_s / 100.0)) is None
 
 
 def test_series_resistance_from_pulses_within_two_percent():
-    found = pulse_resistance(relaxation_test(), CAPACITY_AH)
-    assert found.ohm.size >= 30
-    ohmic = R_S + R_TS * (1.0 - np.exp(-1.0 / TAU_TS)) + R_TL * (1.0 - np.exp(-1.0 / TAU_TL))  # at 1 Hz
-    assert np.median(found.ohm) == pytest.approx(ohmic, rel=0.02)
+    result = pulse_resistance(relaxation_test(), CAPACITY_AH)
+    assert result.ohm.size >= 30
+    expected_ohm = R_S + R_TS * (1.0 - np.exp(-1.0 / TAU_TS)) + R_TL * (1.0 - np.exp(-1.0 / TAU_TL))  # at 1 Hz
+    assert np.median(result.ohm) == pytest.approx(expected_ohm, rel=0.02)
 
 
 def test_pulses_with_a_voltage_one_row_late():
     time_s, current_a = [], []
-    for n in range(12):  # as an HPPC is logged
+    for n in range(12):  # at 1 Hz in rests and 10 Hz in pulses, as an HPPC is logged
         rest_s, pulse_s = np.arange(0.0, 600.0), np.arange(600.0, 610.0, 0.1)
         time_s.append(620.0 * n + np.r_[rest_s, pulse_s, pulse_s + 10.0])
         current_a.append(np.r_[np.zeros(600), np.full(100, 3.0), np.zeros(100)])
@@ -77,21 +77,21 @@ def test_pulses_with_a_voltage_one_row_late():
     samples = np.zeros(time_s.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"] = time_s, current_a
     samples["voltage_v"] = np.r_[voltage_v[0], voltage_v[:-1]]
-    found = pulse_resistance(Block(samples, soc), CAPACITY_AH)
-    assert found.ohm.size >= 20
-    assert found.ohm == pytest.approx(R_S, rel=0.02)
+    result = pulse_resistance(Block(samples, soc), CAPACITY_AH)
+    assert result.ohm.size >= 20
+    assert result.ohm == pytest.approx(R_S, rel=0.02)
 
 
 def test_step_of_resistance_is_visible_in_later_pulses():
     block = relaxation_test()
-    jumped, jump_s = with_jump(block, 0.04)
-    before, after = (pulse_resistance(b, CAPACITY_AH) for b in (block, jumped))
-    late = before.time_s > jump_s + 6000.0  # a median of nine pulses is past the jump
-    assert late.sum() >= 5
-    assert (after.ohm - before.ohm)[late] == pytest.approx(0.04, rel=0.05)
-    early = before.time_s < jump_s - 6000.0
-    assert early.sum() >= 5
-    assert np.array_equal(after.ohm[early], before.ohm[early])
+    with_step, jump_s = with_jump(block, 0.04)
+    before, after = (pulse_resistance(b, CAPACITY_AH) for b in (block, with_step))
+    after_step = before.time_s > jump_s + 6000.0  # all nine pulses of the median are after the step
+    assert after_step.sum() >= 5
+    assert (after.ohm - before.ohm)[after_step] == pytest.approx(0.04, rel=0.05)
+    before_step = before.time_s < jump_s - 6000.0
+    assert before_step.sum() >= 5
+    assert np.array_equal(after.ohm[before_step], before.ohm[before_step])
 
 
 def test_settling_time_ends_only_when_the_value_stays():
@@ -99,7 +99,7 @@ def test_settling_time_ends_only_when_the_value_stays():
     ratio = np.where(time_s < 1000.0, 1.0, 1.0 - 0.5 * np.exp(-(time_s - 1000.0) / 200.0))
     settled_s = settled_after(time_s, ratio, 1000.0)
     assert settled_s == pytest.approx(200.0 * np.log(5.0), abs=10.0)
-    ratio[250] = 2.0  # at 2500 s it leaves again, long after it settled
+    ratio[250] = 2.0  # a deviation at 2500 s, long after the value has settled
     assert settled_after(time_s, ratio, 1000.0) == settled_s
     assert settled_after(time_s, np.where(time_s < 1000.0, 1.0, 0.5), 1000.0) == np.inf
     assert settled_after(time_s, np.where(time_s < 1000.0, 2.0, 1.0), 1000.0) is None

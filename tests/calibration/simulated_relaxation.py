@@ -4,16 +4,23 @@ import numpy as np
 
 from tests.calibration.simulated_load import capture
 
-LOAD_A, LOAD_S, REST_S, FIRST_REST_S = 1.5, 360, 900, 60
+LOAD_A = 1.5
+LOAD_S = 360
+"""Duration of a load, which discharges 5 % of the charge of the cell of 3 Ah [s]."""
+REST_S = 900
+FIRST_REST_S = 60
 
 
 def schedule(*, load_a=LOAD_A, load_s=LOAD_S, rest_s=REST_S, rounds=30):
-    """Return the current of a short rest and of loads with a rest after each [A]. 19 rounds empty the cell."""
+    """Return the current at 1 Hz: a short rest, then ``rounds`` times a load followed by a rest [A].
+
+    19 rounds empty the cell of 3 Ah. ``capture`` ends there and omits the other rounds.
+    """
     return np.r_[np.zeros(FIRST_REST_S), np.tile(np.r_[np.full(load_s, load_a), np.zeros(rest_s)], rounds)]
 
 
 def relaxation(**options):
-    """Return samples of a relaxation test of a full cell at 1 Hz with 0.5 mV of noise."""
+    """Return samples of a relaxation test of a full cell at 1 Hz, by default with 0.5 mV of noise."""
     noise = {key: options.pop(key) for key in ("noise_v", "seed") if key in options}
     return capture(schedule(**options), soc=1.0, **noise)
 
@@ -27,10 +34,10 @@ def rests_too_short():
 
 
 def glitched(share, seed=5):
-    """Return samples with some at 0 V, as with a loose wire."""
+    """Return a relaxation test in which the fraction ``share`` of the voltages is 0 V, as with a loose wire."""
     samples = relaxation()
-    hit = np.random.default_rng(seed).random(samples.size) < share
-    samples["voltage_v"][hit] = 0.0
+    is_glitch = np.random.default_rng(seed).random(samples.size) < share
+    samples["voltage_v"][is_glitch] = 0.0
     return samples
 
 
@@ -61,4 +68,4 @@ BAD = {
     "span": (small_span, 3.0, "points span SOC 0.93 to 1.00 only"),
     "0 V": (mostly_zero, 3.0, "of 24144 samples are glitches, the first at 2 s with 0.000 V where the median is 3.6"),
 }
-"""Function of the capture, capacity [Ah], and text of the error."""
+"""Invalid captures by fault: function that simulates the capture, capacity [Ah], and part of the error message."""

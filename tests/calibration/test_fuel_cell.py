@@ -18,39 +18,39 @@ DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 TRUTH = np.array([1.0, 1.3, 0.9, 1.05, 1.6, 0.8, 1.1, 1.4, *[1.0] * 8])
 """True parameters relative to those of the file."""
 IMPEDANCE_OHM = 0.061
-"""High frequency resistance of the cell of ``nafion112_oxygen``, 1 cm2, by impedance: its data paper."""
+"""High-frequency resistance of the cell of ``nafion112_oxygen``, 1 cm2, by impedance, from the paper of the data set."""
 
 
-def of_the_model(truth: FuelCellModel, *, seed: int, highest_a: float = 8.0) -> list[Source]:
+def simulate_sources(truth: FuelCellModel, *, seed: int, highest_a: float = 8.0) -> list[Source]:
     """Return a curve and a record of 10 s at 500 Hz, simulated by the model with 3 mV of noise."""
-    dice, theta = np.random.default_rng(seed), np.zeros(8)
+    rng, theta = np.random.default_rng(seed), np.zeros(8)
     time_s, current_a = mann_stack.random_steps(10.0, 500.0, seed=seed, highest_a=highest_a)
-    warm = np.full(CURVE_A.size, np.nan), np.full(time_s.size, np.nan)
-    curve_v, _ = polarisation(truth.a, theta, CURVE_A, warm[0])
-    record_v, _ = open_loop(truth.a, theta, time_s, current_a, warm[1])
+    no_temperature = np.full(CURVE_A.size, np.nan), np.full(time_s.size, np.nan)
+    curve_v, _ = polarisation(truth.a, theta, CURVE_A, no_temperature[0])
+    record_v, _ = open_loop(truth.a, theta, time_s, current_a, no_temperature[1])
     return [
-        Source("curve", None, CURVE_A, curve_v + dice.normal(0.0, 0.003, CURVE_A.size), warm[0]),
-        Source("steps", time_s, current_a, record_v + dice.normal(0.0, 0.003, time_s.size), warm[1]),
+        Source("curve", None, CURVE_A, curve_v + rng.normal(0.0, 0.003, CURVE_A.size), no_temperature[0]),
+        Source("steps", time_s, current_a, record_v + rng.normal(0.0, 0.003, time_s.size), no_temperature[1]),
     ]
 
 
 def test_identified_parameters_are_within_their_errors() -> None:
-    """Seven parameters of five stacks: errors match their std on average and for each parameter."""
+    """Seven parameters of five stacks are identified. Their errors match their std on average and for each parameter."""
     truth = PEM.identified(PEM.a * TRUTH, {})
-    scores = []
+    errors_over_std = []
     for seed in range(5):
-        fit = fit_fuel_cell(of_the_model(truth, seed=seed), PEM)
+        fit = fit_fuel_cell(simulate_sources(truth, seed=seed), PEM)
         assert fit.undetermined == {}
         assert fit.rms_v["steps"] == pytest.approx(0.003, rel=0.05)
         for key in KEYS:
-            off = np.log(getattr(fit.model.fuel_cell, key) / getattr(truth.fuel_cell, key))
-            scores.append(off / fit.model.std[key])
-    assert np.abs(scores).max() < 3.5
-    assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
+            ln_error = np.log(getattr(fit.model.fuel_cell, key) / getattr(truth.fuel_cell, key))
+            errors_over_std.append(ln_error / fit.model.std[key])
+    assert np.abs(errors_over_std).max() < 3.5
+    assert 0.5 < np.sqrt(np.mean(np.square(errors_over_std))) < 1.5
 
 
 def test_a_curve_alone_does_not_determine_the_double_layer() -> None:
-    fit = fit_fuel_cell(of_the_model(PEM, seed=1)[:1], PEM)
+    fit = fit_fuel_cell(simulate_sources(PEM, seed=1)[:1], PEM)
     assert "steps of the current" in fit.undetermined["c_dl_farad"]
     assert fit.model.fuel_cell.c_dl_farad == PEM.fuel_cell.c_dl_farad
     assert "c_dl_farad" not in fit.model.std
@@ -58,15 +58,15 @@ def test_a_curve_alone_does_not_determine_the_double_layer() -> None:
 
 
 def test_steps_far_from_the_limit_do_not_determine_the_concentration_loss() -> None:
-    fit = fit_fuel_cell(of_the_model(PEM, seed=2, highest_a=2.0)[1:], PEM)
+    fit = fit_fuel_cell(simulate_sources(PEM, seed=2, highest_a=2.0)[1:], PEM)
     assert "concentration_v" in fit.undetermined
     assert "near the limiting one" in fit.undetermined["concentration_v"]
     assert fit.model.fuel_cell.c_dl_farad == pytest.approx(0.067, rel=3.0 * fit.model.std["c_dl_farad"])
 
 
 def test_a_single_current_determines_only_the_total_loss() -> None:
-    """The data determine a single number, the total loss."""
-    record = of_the_model(PEM, seed=3)[1]
+    """At a single current the losses cannot be separated."""
+    record = simulate_sources(PEM, seed=3)[1]
     constant = np.full(record.current_a.size, 3.0)
     voltage_v = np.random.default_rng(0).normal(9.4, 0.003, constant.size)
     fit = fit_fuel_cell([Source("constant", record.time_s, constant, voltage_v, record.temperature_c)], PEM)
@@ -80,29 +80,33 @@ def test_data_without_information_are_rejected() -> None:
 
 
 def test_a_stack_with_unmodelled_effects_is_predicted_to_some_millivolts() -> None:
-    """The stack has a drying membrane, delayed oxygen and self-heating. Parameters from a curve and a minute of steps
-    predict another minute."""
+    """The stack has a drying membrane, delayed oxygen and self-heating.
+
+    Parameters from a curve and a minute of steps predict another minute.
+    """
     curve = mann_stack.curve(CURVE_A)
     sources = [Source("curve", None, curve.current_a, curve.voltage_v, curve.temperature_c)]
     for seed in (1, 5):
         r = mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=seed), seed=seed).every(5)
         sources.append(Source(f"steps {seed}", r.time_s, r.current_a, r.voltage_v, r.temperature_c))
-    *told, held_back = sources
-    fit = fit_fuel_cell(told, PEM)
+    *fitted_sources, other_source = sources
+    fit = fit_fuel_cell(fitted_sources, PEM)
     before_v, after_v = (
-        np.sqrt(np.mean((held_back.voltage_v - held_back.predict(m.a, np.zeros(8))[0]) ** 2)) for m in (PEM, fit.model)
+        np.sqrt(np.mean((other_source.voltage_v - other_source.predict(m.a, np.zeros(8))[0]) ** 2))
+        for m in (PEM, fit.model)
     )
     assert after_v < 0.016
     assert after_v < before_v
-    assert fit.model.fuel_cell.r_ohm > 1.1 * r.r_ohm.mean(), (
-        "what docs/theory/fuel-cell.md says of it: more than the membrane's"
-    )
+    # The resistance includes other losses than that of the membrane (docs/theory/fuel-cell.md).
+    assert fit.model.fuel_cell.r_ohm > 1.1 * r.r_ohm.mean()
     assert fit.model.fuel_cell.r_ohm < 1.35 * r.r_ohm.mean()
 
 
 def test_a_real_polarisation_curve_gives_the_resistance_of_impedance() -> None:
-    """H2/O2, Nafion 112, 25 psig, 100 % RH. Below 0.1 A/cm2 the voltage falls by 50 mV within 34 mA, which does not
-    follow Tafel's equation."""
+    """The cell has H2/O2, Nafion 112, 25 psig and 100 % RH.
+
+    Below 0.1 A/cm2 the voltage falls by 50 mV within 34 mA, which does not follow Tafel's equation.
+    """
     columns = read_polarisation(DATA / "nafion112_oxygen.csv")
     assert columns is not None
     current_a, voltage_v, temperature_c = columns[columns[:, 0] > 0.1].T.copy()
@@ -118,8 +122,7 @@ def test_a_real_polarisation_curve_gives_the_resistance_of_impedance() -> None:
 
 
 def test_a_flooding_cell_on_air_does_not_determine_the_resistance() -> None:
-    """Its resistance cannot be determined from a curve with a residual of 23 mV: the reason is given, and the
-    file's value kept."""
+    """A curve with a residual of 23 mV does not determine the resistance. The reason is reported."""
     columns = read_polarisation(DATA / "nafion112_air.csv")
     assert columns is not None
     current_a, voltage_v, temperature_c = columns[columns[:, 0] > 0.1].T.copy()

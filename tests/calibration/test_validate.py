@@ -1,3 +1,5 @@
+"""Validation of a cell file on a capture: errors, initial SOC, warnings, and rejected captures."""
+
 import numpy as np
 import pytest
 
@@ -21,67 +23,67 @@ def with_series_resistance(extra_ohm):
 
 
 def test_the_true_cell_has_the_noise_as_error():
-    found = validate(Columns(capture(steps(), noise_v=1e-3), "steps"), TRUTH)
-    assert found.initial_soc == pytest.approx(0.98, abs=1e-3)
-    assert found.initial_soc_from == "first rest"
-    assert found.above.voltage_rms_v == pytest.approx(1e-3, rel=0.05)
-    assert found.above.mean_abs_percent < found.all.mean_abs_percent * 1.5 < 0.05
-    assert found.warnings == ()
+    result = validate(Columns(capture(steps(), noise_v=1e-3), "steps"), TRUTH)
+    assert result.initial_soc == pytest.approx(0.98, abs=1e-3)
+    assert result.initial_soc_from == "first rest"
+    assert result.above.voltage_rms_v == pytest.approx(1e-3, rel=0.05)
+    assert result.above.mean_abs_percent < result.all.mean_abs_percent * 1.5 < 0.05
+    assert result.warnings == ()
 
 
 def test_an_additional_series_resistance_is_measured():
-    found = validate(Columns(capture(steps(), cell=with_series_resistance(0.005)), "steps"), TRUTH)
-    assert found.extra_ohm == pytest.approx(0.005, abs=1e-4)
-    assert found.without_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < found.above.voltage_rms_v
-    assert found.resting.voltage_rms_v < 1e-3 < found.loaded.voltage_rms_v
+    result = validate(Columns(capture(steps(), cell=with_series_resistance(0.005)), "steps"), TRUTH)
+    assert result.extra_ohm == pytest.approx(0.005, abs=1e-4)
+    assert result.without_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < result.above.voltage_rms_v
+    assert result.resting.voltage_rms_v < 1e-3 < result.loaded.voltage_rms_v
 
 
 def test_temperature_and_hysteresis_are_subtracted_once():
-    """A discharge at -15 C with a file that contains hysteresis and temperature coefficient."""
+    """A discharge at -15 C is validated with a file that contains hysteresis and temperature coefficient."""
     samples = ladder_capture(steps(), -15.0)
     samples["voltage_v"] -= 40.0 * 2e-4 + 0.01 * arrhenius(HYSTERESIS_J, -15.0)
     grid_v = ocv_grid(TRUTH)[0]
     soc = np.linspace(0.0, 1.0, grid_v.size)
-    told = TableOcv(
+    ocv = TableOcv(
         form="table",
         soc=tuple(soc),
         ocv_v=tuple(grid_v),
         hysteresis_v=(0.01,) * soc.size,
         per_kelvin_v=(2e-4,) * soc.size,
     )
-    found = validate(
-        Columns(samples, "cold"), TRUTH.model_copy(update={"ocv": told, "ladder": LADDER}), initial_soc=0.98
+    result = validate(
+        Columns(samples, "cold"), TRUTH.model_copy(update={"ocv": ocv, "ladder": LADDER}), initial_soc=0.98
     )
-    turned = (found.soc < 0.7) & (found.soc > 0.35)
-    assert np.sqrt(np.mean(found.error_v[turned] ** 2)) < 1.5e-3
+    after_transition = (result.soc < 0.7) & (result.soc > 0.35)
+    assert np.sqrt(np.mean(result.error_v[after_transition] ** 2)) < 1.5e-3
 
 
-def test_initial_soc_can_be_given():
+def test_a_given_initial_soc_is_used():
     samples = capture(steps())
-    found = validate(Columns(samples, "steps"), TRUTH, initial_soc=0.9)
-    assert (found.initial_soc, found.initial_soc_from) == (0.9, "given")
-    assert found.above.voltage_rms_v > 10e-3
+    result = validate(Columns(samples, "steps"), TRUTH, initial_soc=0.9)
+    assert (result.initial_soc, result.initial_soc_from) == (0.9, "given")
+    assert result.above.voltage_rms_v > 10e-3
 
 
 def test_a_capture_that_starts_under_load_starts_at_its_voltage_with_the_ohmic_drop():
-    found = validate(Columns(capture(constant(), soc=0.8), "constant"), TRUTH)
-    assert found.initial_soc_from == "first sample under load"
-    assert found.initial_soc == pytest.approx(0.8, abs=0.005)
+    result = validate(Columns(capture(constant(), soc=0.8), "constant"), TRUTH)
+    assert result.initial_soc_from == "first sample under load"
+    assert result.initial_soc == pytest.approx(0.8, abs=0.005)
 
 
-def test_samples_below_soc_0_1_count_only_in_the_total_error():
-    found = validate(Columns(capture(steps()), "steps"), TRUTH)
-    assert found.all.samples == found.time_s.size == found.error_v.size
-    assert found.above.samples == int((found.soc > 0.1).sum()) < found.all.samples
-    assert found.resting.samples + found.loaded.samples == found.above.samples
+def test_samples_below_soc_0_1_are_only_in_the_total_error():
+    result = validate(Columns(capture(steps()), "steps"), TRUTH)
+    assert result.all.samples == result.time_s.size == result.error_v.size
+    assert result.above.samples == int((result.soc > 0.1).sum()) < result.all.samples
+    assert result.resting.samples + result.loaded.samples == result.above.samples
 
 
 def test_glitches_are_left_out_and_counted():
     samples = capture(steps())
     samples["voltage_v"][[500, 900, 5000]] = [0.0, 1.0, np.nan]
-    found = validate(Columns(samples, "steps"), TRUTH)
-    assert found.glitches == 3
-    assert found.above.voltage_rms_v < 1e-3
+    result = validate(Columns(samples, "steps"), TRUTH)
+    assert result.glitches == 3
+    assert result.above.voltage_rms_v < 1e-3
 
 
 def test_a_capture_of_another_cell_is_rejected_with_its_numbers():
@@ -93,7 +95,7 @@ def test_a_capture_of_another_cell_is_rejected_with_its_numbers():
         validate(Columns(capture(steps()), "steps"), TRUTH, initial_soc=0.6)
 
 
-def test_too_few_samples_cause_an_error_of_their_own():
+def test_too_few_samples_are_rejected():
     with pytest.raises(UserError, match=r"^steps: 3 good samples are too few, at least 5 are needed$"):
         validate(Columns(capture(steps())[:3], "steps"), TRUTH)
 
@@ -101,40 +103,40 @@ def test_too_few_samples_cause_an_error_of_their_own():
 def test_a_wrong_sign_causes_a_warning_with_its_size():
     samples = capture(steps(duration_s=6000), soc=0.5)
     samples["current_a"] *= -1.0
-    found = validate(Columns(samples, "steps"), TRUTH)
-    assert "sign is wrong" in found.warnings[0]
-    assert np.isfinite(found.all.voltage_rms_v)
-    assert found.all.voltage_rms_v > 0.1
+    result = validate(Columns(samples, "steps"), TRUTH)
+    assert "sign is wrong" in result.warnings[0]
+    assert np.isfinite(result.all.voltage_rms_v)
+    assert result.all.voltage_rms_v > 0.1
 
 
-def test_simulation_continues_below_delta_and_below_empty():
+def test_simulation_continues_below_delta2_and_below_empty():
     current_a = np.r_[np.zeros(10), np.full(9000, 1.3)]
     samples = capture(current_a, soc=0.98)
-    longer = np.concatenate([samples, samples[-600:]])
-    longer["time_s"] = np.arange(longer.size)
-    found = validate(Columns(longer, "empty"), TRUTH)
-    assert found.final_soc < 0.0
-    assert np.isfinite(found.error_v).all()
+    with_discharge_below_empty = np.concatenate([samples, samples[-600:]])
+    with_discharge_below_empty["time_s"] = np.arange(with_discharge_below_empty.size)
+    result = validate(Columns(with_discharge_below_empty, "empty"), TRUTH)
+    assert result.final_soc < 0.0
+    assert np.isfinite(result.error_v).all()
 
 
 def test_a_charge_from_empty_is_validated(data):
-    cycles = load_capture(data / "leaf" / "cc_1c.csv.gz")
-    first = Columns(cycles.rows[cycles["time_s"] < END_OF_CHARGE_S], "charge")
-    found = validate(first, load_cell("leaf"))
-    assert found.initial_soc < 0.02
-    assert found.final_soc > 0.98
-    assert found.above.voltage_rms_v == pytest.approx(6.32e-3, abs=0.05e-3)
-    assert found.warnings == ()
+    recording = load_capture(data / "leaf" / "cc_1c.csv.gz")
+    charge = Columns(recording.rows[recording["time_s"] < END_OF_CHARGE_S], "charge")
+    result = validate(charge, load_cell("leaf"))
+    assert result.initial_soc < 0.02
+    assert result.final_soc > 0.98
+    assert result.above.voltage_rms_v == pytest.approx(6.32e-3, abs=0.05e-3)
+    assert result.warnings == ()
 
 
 def test_errors_of_the_leaf_cell_on_its_own_pulses(data):
-    """Errors on the capture to which the cell file was fitted, due to the form of the elements."""
-    found = validate(load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz"), load_cell("leaf"))
-    assert (found.initial_soc, found.final_soc) == pytest.approx((1.0, 0.001), abs=0.0005)
-    assert (found.above.samples, found.all.samples) == (11715, 13000)
-    above, whole = (
+    """The cell file was fitted to this capture, so that the errors are due to the form of the elements."""
+    result = validate(load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz"), load_cell("leaf"))
+    assert (result.initial_soc, result.final_soc) == pytest.approx((1.0, 0.001), abs=0.0005)
+    assert (result.above.samples, result.all.samples) == (11715, 13000)
+    above, all_soc = (
         (1e3 * errors.voltage_rms_v, errors.mean_abs_percent, errors.max_abs_percent)
-        for errors in (found.above, found.all)
+        for errors in (result.above, result.all)
     )
     assert above == pytest.approx((6.45, 0.0999, 0.915), rel=0.005)
-    assert whole == pytest.approx((16.14, 0.1996, 4.644), rel=0.005)
+    assert all_soc == pytest.approx((16.14, 0.1996, 4.644), rel=0.005)

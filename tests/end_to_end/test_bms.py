@@ -1,4 +1,4 @@
-"""End-to-end test with a BMS: simulated pack -> JK-BMS -> serial line -> program -> broker."""
+"""End-to-end test with a BMS: simulated pack, JK-BMS, serial line, program, and broker."""
 
 import asyncio
 import contextlib
@@ -16,14 +16,15 @@ from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
 CELLS, LOAD_A, START_SOC = 16, 20.0, 0.6
-SAMPLES = 5
+MIN_SAMPLES = 5
+"""Number of samples after which the published state is checked."""
 
 
 async def test_soc_and_cells_of_a_jk_are_published(tmp_path: Path, broker: Broker) -> None:
-    signal_of_pack = SimulatedPack(load_cell("lfp", 100.0).pack(CELLS, 1), constant(LOAD_A), soc=START_SOC)
-    bms = SimulatedBms("jk", signal_of_pack, cells=CELLS, soc=lambda: signal_of_pack.soc)
+    simulated_pack = SimulatedPack(load_cell("lfp", 100.0).pack(CELLS, 1), constant(LOAD_A), soc=START_SOC)
+    simulated_bms = SimulatedBms("jk", simulated_pack, cells=CELLS, soc=lambda: simulated_pack.soc)
     pack = tmp_path / "pack.toml"
-    with bms:
+    with simulated_bms:
         pack.write_text(f"""
 [pack]
 cell = "lfp"
@@ -31,29 +32,29 @@ capacity_ah = 100.0
 series = {CELLS}
 initial_soc = {START_SOC}
 [sensor]
-port = "{bms.path}"
+port = "{simulated_bms.path}"
 protocol = "jk"
 [mqtt]
 url = "{broker.url}"
 [state]
 folder = "{tmp_path / "state"}"
 """)
-        speaking = asyncio.create_task(bms.run())
+        running = asyncio.create_task(simulated_bms.run())
         async with Listener(broker, "bms/#") as listener:
             process = await asyncio.create_subprocess_exec(
                 str(PROGRAM), "run", str(pack), stdout=asyncio.subprocess.DEVNULL
             )
             try:
-                state = await listener.wait_json("bms/pack/state", lambda s: s["frames_received"] >= SAMPLES)
+                state = await listener.wait_json("bms/pack/state", lambda s: s["frames_received"] >= MIN_SAMPLES)
                 await listener.wait("bms/pack/sensor/availability", lambda p: p == b"online")
             finally:
                 with contextlib.suppress(ProcessLookupError):
                     process.send_signal(signal.SIGTERM)
                 assert await asyncio.wait_for(process.wait(), LONG_S) == 0
-        speaking.cancel()
-        await asyncio.gather(speaking, return_exceptions=True)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
     assert state["current_a"] == pytest.approx(LOAD_A, abs=0.01)
-    assert state["soc"] == pytest.approx(signal_of_pack.soc, abs=0.02)
+    assert state["soc"] == pytest.approx(simulated_pack.soc, abs=0.02)
     assert state["temperature_c"] == 25.0
     assert len(state["cells_v"]) == CELLS
     assert math.fsum(state["cells_v"]) == pytest.approx(state["voltage_v"], abs=0.02)

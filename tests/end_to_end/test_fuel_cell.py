@@ -1,4 +1,4 @@
-"""End-to-end test with a fuel cell: simulated stack -> board -> serial line -> program -> broker."""
+"""End-to-end test with a fuel cell: simulated stack, board, serial line, program, and broker."""
 
 import asyncio
 import contextlib
@@ -19,12 +19,13 @@ from tests import mann_stack
 from tests.end_to_end.test_whole_way import program
 from tests.mosquitto import Broker, Listener
 
-SAMPLES = 500
+MIN_SAMPLES = 500
 LSB_V = 25.0 / 1024.0
+"""Resolution of the board's voltage [V]."""
 
 
-def stack() -> list[Reading]:
-    """Return a minute at 100 Hz, the board's rate."""
+def simulate_stack() -> list[Reading]:
+    """Return readings of a simulated stack for a minute at 100 Hz, the rate of the board."""
     time_s, current_a = mann_stack.random_steps(60.0, 100.0, seed=2, highest_a=4.0)
     record = mann_stack.measured(time_s, current_a, noise_v=0.0)
     columns = (record.current_a, record.voltage_v, record.temperature_c)
@@ -32,7 +33,7 @@ def stack() -> list[Reading]:
 
 
 async def test_a_fuel_cell_is_served_and_resumes_after_a_restart(tmp_path: Path, broker: Broker) -> None:
-    readings, pack, capture = stack(), tmp_path / "pack.toml", tmp_path / "line.bms"
+    readings, pack, capture = simulate_stack(), tmp_path / "pack.toml", tmp_path / "line.bms"
     with VirtualBoard(lambda at_s: readings[min(int(100.0 * at_s), len(readings) - 1)]) as board:
         pack.write_text(f"""
 [pack]
@@ -48,7 +49,7 @@ folder = "{tmp_path / "state"}"
 """)
         running = asyncio.create_task(board.run())
         async with Listener(broker, "bms/#") as listener, program(pack, "--record", str(capture)):
-            await listener.wait_json("bms/pack/health", lambda h: h["samples"]["samples"] > SAMPLES)
+            await listener.wait_json("bms/pack/health", lambda h: h["samples"]["samples"] > MIN_SAMPLES)
             parameters = await listener.wait_json("bms/pack/parameters", lambda p: p["elements"])
         running.cancel()
         with contextlib.suppress(asyncio.CancelledError):
@@ -76,5 +77,5 @@ folder = "{tmp_path / "state"}"
     assert saved.state["learning.theta"].tobytes() == replayed.record["learning"]["theta"].tobytes(), "to the last bit"
     assert restore_state(resumed, saved.state, 10.0) == ""
     np.testing.assert_array_equal(resumed.record["learning"]["theta"], replayed.record["learning"]["theta"])
-    insane = {**saved.state, "learning.theta": np.full_like(saved.state["learning.theta"], np.nan)}
-    assert restore_state(new_estimator(settings, cell), insane, 10.0) == "theta of the learning is not finite"
+    not_finite = {**saved.state, "learning.theta": np.full_like(saved.state["learning.theta"], np.nan)}
+    assert restore_state(new_estimator(settings, cell), not_finite, 10.0) == "theta of the learning is not finite"

@@ -1,4 +1,7 @@
-"""End-to-end test of delta1, delta2 and N of Algorithm 1: serial line -> program -> broker -> topic."""
+"""End-to-end test of delta1, delta2 and N of Algorithm 1 of the thesis, from the serial line to the topic.
+
+Numbers in parentheses are equations of the thesis.
+"""
 
 import asyncio
 import contextlib
@@ -18,26 +21,36 @@ from tests.patience import LONG_S
 from tests.serial_line import Line
 
 CELL = load_cell("chen_mora")
-STEP_S, START_SOC, LAMBDA = 0.1, 0.5, 50_000.0
-"""Sample period [s], initial SOC, and lambda of (3.10). lambda is large, so that N falls within seconds."""
+STEP_S = 0.1
+"""Sample period [s]."""
+START_SOC = 0.5
+LAMBDA = 50_000.0
+"""lambda of (3.10). With this large value, N falls within seconds."""
 N_ERROR = 0.005
-"""Tolerance of N. The program uses one decay rate of e over a sample, with an error of 0.5 % of k; N falls by 0.5 here."""
+"""Tolerance of N.
+
+The program uses one decay rate of e over a sample, which causes an error of 0.5 % of k. N falls by 0.5 in this test.
+"""
 REPEAT_S = 0.05
 """Interval at which the first line is repeated until the program reads the port [s]."""
 
 
-def rows() -> list[tuple[float, float, float]]:
-    """Time [s], current [A], voltage [V] of each line: the voltage is 0.25 V off the observer's start, then a load step."""
+def make_rows() -> list[tuple[float, float, float]]:
+    """Return time [s], current [A] and voltage [V] of each line.
+
+    The initial voltage differs by 0.25 V from that of the observer. A step of the load follows at 2 s.
+    """
     return [
         (n * STEP_S, 0.1 if n < 20 else 0.4, round(4.05 - 0.001 * n - (0.02 if n >= 20 else 0.0), 4)) for n in range(40)
     ]
 
 
-def text(row: tuple[float, float, float]) -> bytes:
+def format_line(row: tuple[float, float, float]) -> bytes:
+    """Return a line of the text protocol."""
     return b"time_s=%.1f I=%.1f V=%.4f\r\n" % row
 
 
-def element(a: np.ndarray, first: int, soc: float, sign: float) -> float:
+def element_at(a: np.ndarray, first: int, soc: float, sign: float) -> float:
     """Return an element by (2.5) to (2.8)."""
     return float(sign * a[first] * math.exp(-a[first + 1] * soc) + a[first + 2])
 
@@ -48,37 +61,38 @@ def mittag_leffler(k: float) -> float:
 
 
 def algorithm_1(samples: list[tuple[float, float, float]]) -> Iterator[tuple[float, float, float]]:
-    """delta1, delta2 and N after each sample: (3.1) to (3.3), (3.12), (3.13), (3.15), (3.18), (4.1) in small steps.
+    """Yield delta1, delta2 and N after each sample.
 
-    N and y are held over a sample, as the program holds them.
+    (3.1) to (3.3), (3.12), (3.13), (3.15), (3.18) and (4.1) are solved in small steps. N and y are constant over a sample, as
+    in the program.
     """
     bounds = [CELL.bounds(i) for i in range(1, 13)]
     limit = np.array([0.0, *(b.limit for b in bounds)])
     rate = np.array([1.0, *(b.rate for b in bounds)])
     a = np.array([0.0, *(b.limit if b.initial is None else b.initial for b in bounds)])
-    soc, x2, x3, k, before_a = START_SOC, 0.0, 0.0, 0.0, samples[0][1]
+    soc, x2, x3, k, previous_a = START_SOC, 0.0, 0.0, 0.0, samples[0][1]
     a16, a17, a18, a19, a20, a21 = CELL.a[16:22]
-    steps = 4000
-    dt_s = STEP_S / steps
+    substeps = 4000
+    dt_s = STEP_S / substeps
     for n, (_, current_a, voltage_v) in enumerate(samples):
         if n:
-            soc -= 0.5 * (before_a + current_a) * STEP_S / (CELL.cell.capacity_ah * 3600.0)
+            soc -= 0.5 * (previous_a + current_a) * STEP_S / (CELL.cell.capacity_ah * 3600.0)
             e_o = -a16 * math.exp(-a17 * soc) + a18 + a19 * soc - a20 * soc**2 + a21 * soc**3
-            tau_ts = element(a, 1, soc, 1.0) * element(a, 7, soc, -1.0)
-            tau_tl = element(a, 4, soc, 1.0) * element(a, 10, soc, -1.0)
+            tau_ts = element_at(a, 1, soc, 1.0) * element_at(a, 7, soc, -1.0)
+            tau_tl = element_at(a, 4, soc, 1.0) * element_at(a, 10, soc, -1.0)
             gain = mittag_leffler(k)
-            for _ in range(steps):
+            for _ in range(substeps):
                 e = voltage_v - e_o + x2 + x3
                 x2 += dt_s * (-x2 / tau_ts - gain * e)
                 x3 += dt_s * (-x3 / tau_tl - gain * e)
                 k += dt_s * e * e
                 a += dt_s * (e * e + rate * (limit - a))
-        before_a = current_a
+        previous_a = current_a
         yield -math.log(a[9] / a[7]) / a[8], -math.log(a[12] / a[10]) / a[11], mittag_leffler(k)
 
 
 @contextlib.asynccontextmanager
-async def program(folder: Path, line: Line, broker: Broker) -> AsyncIterator[None]:
+async def run_program(folder: Path, line: Line, broker: Broker) -> AsyncIterator[None]:
     pack = folder / "pack.toml"
     pack.write_text(f"""
 [pack]
@@ -112,29 +126,29 @@ folder = "{folder / "state"}"
 
 
 async def state_after(listener: Listener, row: tuple[float, float, float]) -> Any:
-    """Return the state that was published with this line as the latest."""
+    """Return the first published state whose newest sample is this line."""
     return await listener.wait_json("bms/pack/state", lambda s: s["board_time_s"] == pytest.approx(row[0], abs=1e-6))
 
 
 async def test_published_delta_1_delta_2_and_n_follow_algorithm_1_from_the_received_bytes(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
-    samples, expected = rows(), list(algorithm_1(rows()))
+    samples, expected = make_rows(), list(algorithm_1(make_rows()))
     line.plug()
 
-    async def repeat() -> None:
+    async def repeat_first_line() -> None:
         while True:
-            line.write(text(samples[0]))
+            line.write(format_line(samples[0]))
             await asyncio.sleep(REPEAT_S)
 
-    async with Listener(broker, "bms/#") as listener, program(tmp_path, line, broker):
-        repeating = asyncio.create_task(repeat())
+    async with Listener(broker, "bms/#") as listener, run_program(tmp_path, line, broker):
+        repeating = asyncio.create_task(repeat_first_line())
         await state_after(listener, samples[0])
         repeating.cancel()
         published = []
         first = 1
         for last in (1, 2, 12, 39):
-            line.write(b"".join(map(text, samples[first : last + 1])))
+            line.write(b"".join(map(format_line, samples[first : last + 1])))
             published.append((last, await state_after(listener, samples[last])))
             first = last + 1
     for last, state in published:

@@ -1,4 +1,4 @@
-"""End-to-end test: simulated cell -> board -> serial line -> program -> broker -> subscriber."""
+"""End-to-end test: simulated cell, board, serial line, program, broker, and subscriber."""
 
 import asyncio
 import contextlib
@@ -27,11 +27,12 @@ from tests.patience import LONG_S
 from tests.simavr_board import SimavrBoard, write_readings
 
 LSB_V, LSB_A = 25.0 / 1024.0, 5.0 / 1024.0 / 0.1
+"""Resolution of the board's voltage [V] and current [A]."""
 START_SOC = 0.9
 LOAD_A = 0.3
 RUN_S = 14.0
 EDGE_S = 0.3
-"""Tolerance for the clocks of board and cell, plus a publish window [s]."""
+"""Difference between the clocks of board and cell, plus a publish window [s]."""
 
 
 class Truth:
@@ -50,12 +51,15 @@ class Truth:
         self.voltage_v = np.array([r.voltage_v for r in self.readings])
 
     def signal(self, at_s: float) -> Reading:
+        """Return the reading at a time [s]."""
         return self.readings[min(round(at_s / 0.02), len(self.readings) - 1)]
 
     def at(self, values: np.ndarray, at_s: float) -> float:
+        """Return a true value at a time [s]."""
         return float(np.interp(at_s, self.time_s, values))
 
     def steady(self, at_s: float) -> bool:
+        """Return True if the current is constant within ``EDGE_S`` of a time [s]."""
         near = np.abs(self.time_s - at_s) < EDGE_S
         return bool(np.ptp(self.current_a[near]) == 0.0)
 
@@ -72,6 +76,7 @@ class Plug:
         self.path = path
 
     def into(self, pseudo_terminal: str) -> None:
+        """Connect the board of a pseudo-terminal to the port."""
         self.path.unlink(missing_ok=True)
         self.path.symlink_to(pseudo_terminal)
 
@@ -120,7 +125,7 @@ class Board(NamedTuple):
 
 
 @contextlib.asynccontextmanager
-async def a_board(kind: str, truth: Truth, folder: Path) -> AsyncIterator[Board]:
+async def run_board(kind: str, truth: Truth, folder: Path) -> AsyncIterator[Board]:
     if kind == "python":
         with VirtualBoard(truth.signal) as board, contextlib.ExitStack() as stack:
             yield Board(board.path, lambda: stack.callback(asyncio.create_task(board.run()).cancel))
@@ -137,10 +142,10 @@ def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-async def test_published_values_are_the_simulated_ones_within_the_resolution_of_the_converter(
+async def test_published_values_equal_the_simulated_ones_within_the_resolution_of_the_adc(
     kind: str, truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
 ) -> None:
-    async with a_board(kind, truth, tmp_path) as board, Listener(broker, "bms/#") as listener:
+    async with run_board(kind, truth, tmp_path) as board, Listener(broker, "bms/#") as listener:
         plug.into(board.path)
         async with program(pack_file(tmp_path, plug, broker)):
             await listener.wait("bms/pack/availability", lambda p: p == b"online")
@@ -172,30 +177,30 @@ async def test_the_service_continues_without_board_and_without_broker(
     kind: str, truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
 ) -> None:
     async with Listener(broker, "bms/#") as listener, contextlib.AsyncExitStack() as stack:
-        async with a_board(kind, truth, tmp_path) as board:
+        async with run_board(kind, truth, tmp_path) as board:
             plug.into(board.path)
             board.power_up()
             await stack.enter_async_context(program(pack_file(tmp_path, plug, broker)))
             before = await listener.wait_json("bms/pack/state", lambda s: s["frames_received"] > 100)
         await listener.wait("bms/pack/sensor/availability", lambda p: p == b"offline")
-        async with a_board(kind, truth, tmp_path) as board:
+        async with run_board(kind, truth, tmp_path) as board:
             plug.into(board.path)
             board.power_up()
             await listener.wait_json("bms/pack/health", lambda h: h["sensor_online"] and h["reconnects"] >= 1)
-            again = await listener.wait_json(
+            after_reconnection = await listener.wait_json(
                 "bms/pack/state", lambda s: s["frames_received"] > before["frames_received"] + 100
             )
-            assert again["lock"]
-            assert again["board_time_s"] > before["board_time_s"]
+            assert after_reconnection["lock"]
+            assert after_reconnection["board_time_s"] > before["board_time_s"]
             broker.stop()
-            await asyncio.sleep(1.0)  # duration without the board
+            await asyncio.sleep(1.0)  # duration without the broker
             broker.start()
             async with Listener(broker, "bms/#") as later:
                 after = await later.wait_json(
-                    "bms/pack/state", lambda s: s["frames_received"] > again["frames_received"] + 80
+                    "bms/pack/state", lambda s: s["frames_received"] > after_reconnection["frames_received"] + 80
                 )
                 assert await later.wait("bms/pack/availability") == b"online"
-            assert after["frames_lost"] == again["frames_lost"]
+            assert after["frames_lost"] == after_reconnection["frames_lost"]
 
 
 async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
@@ -206,18 +211,18 @@ async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
         plug.into(board.path)
         running = asyncio.create_task(board.run())
         async with Listener(broker, "bms/#") as listener, program(pack, "--record", str(capture)):
-            for number, event in enumerate(events(board), start=1):
-                await listener.wait_json("bms/pack/health", at_least(60 * number))
+            for number, event in enumerate(line_events(board), start=1):
+                await listener.wait_json("bms/pack/health", has_frames(60 * number))
                 event()
             await listener.wait_json("bms/pack/health", lambda h: h["line"]["resets"] and h["samples"]["samples"] > 450)
         running.cancel()
     settings, cell = load_pack(pack)
     live = CheckpointFile(tmp_path / "state", settings, cell).load().state
     replayed = new_estimator(settings, cell)
-    recorded = RawCapture(capture)
-    for block in recorded:
+    capture_file = RawCapture(capture)
+    for block in capture_file:
         replayed.run(block)
-    counters = recorded.decoder.counters
+    counters = capture_file.decoder.counters
     assert counters["frames_lost"] > 0
     assert counters["crc_errors"] > 0
     assert counters["resets"] == 1
@@ -226,11 +231,11 @@ async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
         assert live[name].tobytes() == field.tobytes(), name
 
 
-def events(board: VirtualBoard) -> list[Callable[[], None]]:
-    """Return the events on the line, in order."""
+def line_events(board: VirtualBoard) -> list[Callable[[], None]]:
+    """Return functions that cause each fault of the line and, last, a reset of the board."""
     faults = [lambda f=f: board.inject(f, 3) for f in BoardFault]  # type: ignore[misc]
     return [*faults, lambda: board.reset(ResetCause.BROWN_OUT)]
 
 
-def at_least(frames: int) -> Callable[[Any], bool]:
+def has_frames(frames: int) -> Callable[[Any], bool]:
     return lambda health: health["line"]["frames_received"] >= frames

@@ -12,12 +12,13 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
 
 TRUTH = load_cell("chen_mora").model_copy(update={"adaptation": {}})
-"""True cell with default bounds, because those of Table 5 do not contain wrong files."""
+"""True cell with default bounds, because the bounds of Table 5 of the thesis exclude the parameters of wrong files."""
 RATED_A = 0.275
-HEIGHTS_C = (-1.0, -0.5, 0.0, 0.0, 0.5, 1.0)
+"""Current of 1 C [A]."""
+STEPS_C = (-1.0, -0.5, 0.0, 0.0, 0.5, 1.0)
 HOLD_S = (20, 400)
 """Range of the duration of a step [s]."""
-LOW, HIGH = 0.3, 0.85
+MIN_SOC, MAX_SOC = 0.3, 0.85
 FIRST_SOC = 0.6
 RESOLUTION_V = 5e-4
 
@@ -35,14 +36,17 @@ def file_off_by(*factors: float) -> CellModel:
 
 
 def held_currents(hours: float, rng: np.random.Generator) -> np.ndarray:
-    """Return one current for each half second [A]; steps are midway between whole seconds."""
+    """Return random currents held for a random time, one for each half second [A].
+
+    Steps are midway between whole seconds, because the first half second has no current.
+    """
     n, soc = int(hours * 7200), FIRST_SOC
     current_a, i = np.zeros(n), 1
     while i < n:
         half_seconds = 2 * int(rng.integers(*HOLD_S))
-        c = rng.choice(HEIGHTS_C)
+        c = rng.choice(STEPS_C)
         drop = c * half_seconds / 7200
-        if not LOW < soc - drop < HIGH:
+        if not MIN_SOC < soc - drop < MAX_SOC:
             c, drop = -c, -drop
         current_a[i : i + half_seconds] = c * RATED_A
         soc, i = soc - drop, i + half_seconds
@@ -66,12 +70,12 @@ def measured(current_a: np.ndarray, noise_v: float, rng: np.random.Generator, ce
 
 
 def learner(file: CellModel, soc: float = FIRST_SOC, **observer: float) -> Estimator:
-    """Return the learning law alone, starting at ``soc``."""
+    """Return an estimator with the learning law and without the filter, starting at ``soc``."""
     settings = ObserverSettings.model_validate({"law": "learning", **observer})
     return Estimator(file, settings, identifier=None, initial_soc=soc, voltage_resolution_v=RESOLUTION_V)
 
 
-def errors(estimator: Estimator, factors: Sequence[float]) -> np.ndarray:
-    """Return the relative errors of what was learned from a file with wrong ``factors``; shape (5,)."""
+def relative_errors(estimator: Estimator, factors: Sequence[float]) -> np.ndarray:
+    """Return the relative errors of the learned parameters, for a file with wrong ``factors``; shape (5,)."""
     theta = estimator.record[0]["learning"]["theta"][: len(NAMES)]
     return np.abs(np.exp(theta) * np.asarray(factors) - 1.0)

@@ -9,6 +9,10 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 TRUTH = load_cell("ncr18650").model_copy(update={"ladder": None})
 NOISE_V = 3e-4
+RESOLUTION_V = 1e-3
+LEVELS_A = [0.0, 0.0, 0.75, 1.5, 3.0, -0.5]
+"""Currents of the pulses. Rests are twice as frequent as any other level."""
+LEVEL_S = 60
 
 
 def wrong_cell(factor: float) -> CellModel:
@@ -25,15 +29,17 @@ def wrong_cell(factor: float) -> CellModel:
 def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleBlock, np.ndarray]:
     """Return samples of random pulses and rests at 1 Hz that empty the true cell, and its true SOC."""
     rng = np.random.default_rng(seed)
-    seconds = int(3600 * hours)
-    return measured(np.repeat(rng.choice([0.0, 0.0, 0.75, 1.5, 3.0, -0.5], seconds // 60), 60), soc, rng)
+    levels_a = rng.choice(LEVELS_A, int(3600 * hours) // LEVEL_S)
+    return measured(np.repeat(levels_a, LEVEL_S), soc, rng)
 
 
 def measured(
     current_a: np.ndarray, soc: float, rng: np.random.Generator, *, step_s: float = 1.0
 ) -> tuple[SampleBlock, np.ndarray]:
-    """Return a sensor's samples of the true cell, from rest at ``soc``, under a current each ``step_s`` [A], and
-    its true SOC."""
+    """Return a sensor's samples of the true cell, which starts from rest at ``soc``, and its true SOC.
+
+    Each element of ``current_a`` [A] flows for ``step_s``.
+    """
     block = np.zeros(current_a.size, dtype=SAMPLE)
     block["temperature_c"] = 25.0
     block["time_s"] = step_s * np.arange(block.size)
@@ -45,5 +51,6 @@ def measured(
         block["voltage_v"][n] = chen_mora.ocv(x[0], ocv_v, slope_v) - x[1] - x[2] - i * chen_mora.r_s(x[0], a)
         true_soc[n] = x[0]
         x = chen_mora.cell_step(x, i, step_s, capacity_as, a)
-    block["voltage_v"] = np.round((block["voltage_v"] + rng.normal(0, NOISE_V, block.size)) / 1e-3) * 1e-3
+    noisy_v = block["voltage_v"] + rng.normal(0, NOISE_V, block.size)
+    block["voltage_v"] = np.round(noisy_v / RESOLUTION_V) * RESOLUTION_V
     return block, true_soc

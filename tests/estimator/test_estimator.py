@@ -1,4 +1,4 @@
-"""Identical results of ``step`` and ``run``, and handling of invalid samples."""
+"""Results of ``step`` and ``run``, invalid samples, counted charge, and shipped cells."""
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 
 
 def noisy_load(n: int = 5000) -> SampleBlock:
+    """Return random samples with irregular times, of which some have no voltage or a voltage of 0."""
     rng = np.random.default_rng(7)
     samples = np.zeros(n, dtype=SAMPLE)
     samples["time_s"] = np.cumsum(rng.choice([0.01, 0.02, 1.0, 7.0], n))
@@ -25,29 +26,31 @@ def noisy_load(n: int = 5000) -> SampleBlock:
 
 def test_step_and_run_are_bit_identical_for_any_block_size() -> None:
     samples = noisy_load()
-    whole, stepped, pieces = (Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None) for _ in range(3))
-    whole.run(samples)
+    in_one_block, stepped, in_blocks = (
+        Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None) for _ in range(3)
+    )
+    in_one_block.run(samples)
     for x in samples:
         stepped.step(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), int(x["status"]))
     for part in np.array_split(samples, 37):
-        pieces.run(part)
-    assert whole.state.tobytes() == stepped.state.tobytes() == pieces.state.tobytes()
+        in_blocks.run(part)
+    assert in_one_block.state.tobytes() == stepped.state.tobytes() == in_blocks.state.tobytes()
 
 
 def test_a_restored_state_resumes_identically() -> None:
     samples = noisy_load()
-    straight = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
-    straight.run(samples)
+    uninterrupted = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
+    uninterrupted.run(samples)
     first = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
     first.run(samples[:2000])
     second = Estimator(load_cell("ncr18650"), identifier=None)
     second.state[:] = first.state
     second.run(samples[2000:])
-    assert straight.state.tobytes() == second.state.tobytes()
+    assert uninterrupted.state.tobytes() == second.state.tobytes()
 
 
 @pytest.mark.parametrize(
-    ("time_s", "current_a", "voltage_v", "status", "verdict", "counter"),
+    ("time_s", "current_a", "voltage_v", "status", "outcome", "counter"),
     [
         (2.0, 0.1, float("nan"), 0, SampleOutcome.NOT_FINITE, "dropped_not_finite"),
         (2.0, float("inf"), 3.7, 0, SampleOutcome.NOT_FINITE, "dropped_not_finite"),
@@ -60,19 +63,19 @@ def test_a_restored_state_resumes_identically() -> None:
     ],
 )
 def test_a_bad_sample_is_dropped_counted_and_changes_nothing_else(
-    time_s: float, current_a: float, voltage_v: float, status: int, verdict: SampleOutcome, counter: str
+    time_s: float, current_a: float, voltage_v: float, status: int, outcome: SampleOutcome, counter: str
 ) -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     estimator.step(0.0, 0.1, 3.7)
     estimator.step(1.0, 0.1, 3.7)
     before = estimator.state.copy()
-    assert estimator.step(time_s, current_a, voltage_v, int(status)) is verdict
+    assert estimator.step(time_s, current_a, voltage_v, int(status)) is outcome
     before[counter] += 1
     assert before.tobytes() == estimator.state.tobytes()
 
 
 def test_outcomes_are_indexed_by_their_value() -> None:
-    assert [SAMPLE_OUTCOMES[verdict] for verdict in SampleOutcome] == list(SampleOutcome)
+    assert [SAMPLE_OUTCOMES[outcome] for outcome in SampleOutcome] == list(SampleOutcome)
 
 
 def test_a_clock_set_back_is_counted_and_loses_a_single_step() -> None:
@@ -95,10 +98,11 @@ def test_slow_sampling_does_not_count_as_gaps() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 10.0, 20.0, 30.0, 90.0, 100.0):
         estimator.step(time_s, 1.0, 3.7)
-    assert estimator.state["gaps"][0] == 2  # the first step, which is indistinguishable from a gap, and the long one
+    # The first step counts, because the sample period is not known yet. The step of 60 s is the second gap.
+    assert estimator.state["gaps"][0] == 2
 
 
-def test_the_current_over_an_unmeasured_hour_is_the_smaller_of_both_ends() -> None:
+def test_the_smaller_current_of_both_ends_is_counted_over_a_gap() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s, current_a in ((0.0, 1.0), (1800.0, 0.2), (3600.0, -1.0)):
         estimator.step(time_s, current_a, 3.7)
@@ -109,7 +113,8 @@ def test_one_wrong_time_stamp_does_not_empty_the_cell() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 1.0, 1e9, 2.0, 3.0):
         estimator.step(time_s, 0.3, 3.7)
-    assert estimator.state["soc_coulomb"][0] == pytest.approx(0.4, abs=1e-3)  # an hour's charge
+    # The charge over a gap is limited to that of one hour: 0.3 A * 1 h / 3 Ah.
+    assert estimator.state["soc_coulomb"][0] == pytest.approx(0.5 - 0.1, abs=1e-3)
 
 
 def test_soc_starts_from_the_open_circuit_voltage_when_not_given() -> None:
@@ -127,13 +132,13 @@ def test_shipped_cells_load_and_step(name: str) -> None:
     assert Estimator(cell, identifier=None).step(0.0, 0.0, cell.cell.nominal_voltage_v) is SampleOutcome.ACCEPTED
 
 
-def test_printed_settings_of_table_5_fail_condition_1_of_the_lemma() -> None:
-    """Erratum 6: P9.l9 = 89000 is not below P7.l7 = 87500."""
+def test_settings_of_table_5_violate_condition_1_of_lemma_4_1_1() -> None:
+    """Erratum 6 of the thesis: P9.l9 = 89000 is not below P7.l7 = 87500."""
     cell = load_cell("chen_mora")
     assert [(c.name, c.left, c.right) for c in failed_conditions(cell)] == [("1: P9.l9 < P7.l7", 89000.0, 87500.0)]
     assert sum(c.holds for c in lemma_conditions(cell)) == 5
 
 
-def test_default_bounds_satisfy_the_lemma() -> None:
+def test_default_bounds_satisfy_lemma_4_1_1() -> None:
     cell = load_cell("chen_mora").model_copy(update={"adaptation": {}})
     assert failed_conditions(cell) == []

@@ -1,4 +1,4 @@
-"""Invalid input: the estimate stays finite, diagnostics report the fault, and the estimate recovers."""
+"""Invalid input: the estimate stays finite, diagnostics report the fault, and the SOC is correct again afterwards."""
 
 from collections.abc import Callable
 from functools import cache
@@ -18,73 +18,82 @@ FAULT_S = 3600.0, 7200.0
 CAPACITY_AH = 3.0
 FIRST_SOC = {"cell1_random_steps": 0.98, "cell5_hppc": 0.98}
 """Initial SOC of captures that do not start full."""
-CHANGING = ["cell5_random_steps", "cell1_dst", "cell1_hppc"]
-PIECE = 20
+CHANGING_LOADS = ["cell5_random_steps", "cell1_dst", "cell1_hppc"]
+BLOCK_SAMPLES = 20
 """Number of samples between two evaluations of the diagnostics."""
 Fault = Callable[[SampleBlock, np.ndarray], None]
 
 
-def good(block: SampleBlock, during: np.ndarray) -> None:
-    """Return the samples without a fault."""
+def leave_unchanged(block: SampleBlock, during: np.ndarray) -> None:
+    """Leave the samples without a fault."""
 
 
-def flipped(block: SampleBlock, during: np.ndarray) -> None:
+def reverse_current(block: SampleBlock, during: np.ndarray) -> None:
+    """Reverse the sign of the current, as a sensor with swapped terminals."""
     block["current_a"][during] *= -1.0
 
 
-def offset(block: SampleBlock, during: np.ndarray) -> None:
-    """Return samples with an offset of 1 % of a range of 5 A."""
+def add_offset(block: SampleBlock, during: np.ndarray) -> None:
+    """Add an offset of 1 % of a range of 5 A."""
     block["current_a"][during] += 0.05
 
 
-def now_and_then(during: np.ndarray) -> np.ndarray:
+def random_samples(during: np.ndarray) -> np.ndarray:
+    """Return a mask of 1 % of the samples of ``during``."""
     return during & (np.random.default_rng(1).random(during.size) < 0.01)
 
 
-def glitches(block: SampleBlock, during: np.ndarray) -> None:
-    """Return samples with voltage glitches within the range of the cell."""
-    block["voltage_v"][now_and_then(during)] = 2.6
+def add_voltage_glitches(block: SampleBlock, during: np.ndarray) -> None:
+    """Replace some voltages by one within the range of the cell."""
+    block["voltage_v"][random_samples(during)] = 2.6
 
 
-def spikes(block: SampleBlock, during: np.ndarray) -> None:
-    block["current_a"][now_and_then(during)] = 4.6
+def add_current_spikes(block: SampleBlock, during: np.ndarray) -> None:
+    """Replace some currents by one within the range of the sensor."""
+    block["current_a"][random_samples(during)] = 4.6
 
 
-def stuck(block: SampleBlock, during: np.ndarray) -> None:
-    """Return a capture with a stuck voltage: a broken wire, or an old value repeated."""
+def hold_voltage(block: SampleBlock, during: np.ndarray) -> None:
+    """Hold the voltage, as with a broken wire or a device that repeats an old value."""
     block["voltage_v"][during] = block["voltage_v"][np.argmax(during)]
 
 
-def dead(block: SampleBlock, during: np.ndarray) -> None:
-    """Return samples of a dead current sensor."""
+def set_current_to_zero(block: SampleBlock, during: np.ndarray) -> None:
+    """Set the current to zero, as of a failed current sensor."""
     block["current_a"][during] = 0.0
 
 
-def repeated(block: SampleBlock, during: np.ndarray) -> None:
-    """Return samples in which every second time stamp repeats the previous one."""
-    twice = np.flatnonzero(during)[1::2]
-    block["time_s"][twice] = block["time_s"][twice - 1]
+def repeat_time_stamps(block: SampleBlock, during: np.ndarray) -> None:
+    """Replace every second time stamp by the previous one."""
+    every_second = np.flatnonzero(during)[1::2]
+    block["time_s"][every_second] = block["time_s"][every_second - 1]
 
 
-rows = cache(lambda path: load_capture(path).rows)
-"""Samples of a capture file."""
+@cache
+def load_samples(path: Path) -> SampleBlock:
+    """Return the samples of a capture file."""
+    return load_capture(path).rows
 
 
 class Run:
-    """Run over a capture with a fault and an initial SOC 0.2 too low: time [s], error of the SOC, std, diagnostics."""
+    """Time [s], error of the SOC, its std and the diagnostics over a capture with a fault.
 
-    def __init__(self, path: Path, cell: CellModel, fault: Fault = good, wrong: float = -0.2) -> None:
-        block = rows(path).copy()
+    The initial SOC is wrong by ``soc_error``.
+    """
+
+    def __init__(self, path: Path, cell: CellModel, fault: Fault = leave_unchanged, soc_error: float = -0.2) -> None:
+        block = load_samples(path).copy()
         block = block[(block["voltage_v"] > 2.0) & (block["voltage_v"] < 4.4)]
-        when_s = block["time_s"] - block["time_s"][0]
-        moved_ah = np.r_[0.0, np.cumsum(block["current_a"][:-1] * np.clip(np.diff(when_s), 0.0, None))] / 3600.0
+        elapsed_s = block["time_s"] - block["time_s"][0]
+        step_s = np.clip(np.diff(elapsed_s), 0.0, None)
+        discharged_ah = np.r_[0.0, np.cumsum(block["current_a"][:-1] * step_s)] / 3600.0
         self.soc = FIRST_SOC.get(path.name.partition(".")[0], 1.0 if block["voltage_v"][0] > 4.0 else 0.0)
-        self.soc = self.soc - moved_ah / CAPACITY_AH
-        fault(block, (when_s >= FAULT_S[0]) & (when_s < FAULT_S[1]))
-        self.estimator = Estimator(cell, initial_soc=min(max(self.soc[0] + wrong, 0.0), 1.0))
+        self.soc = self.soc - discharged_ah / CAPACITY_AH
+        fault(block, (elapsed_s >= FAULT_S[0]) & (elapsed_s < FAULT_S[1]))
+        self.estimator = Estimator(cell, initial_soc=min(max(self.soc[0] + soc_error, 0.0), 1.0))
         traces, suspects = [], []
-        for first in range(0, block.size, PIECE):
-            traces.append(self.estimator.run(block[first : first + PIECE]).copy())
+        for first in range(0, block.size, BLOCK_SAMPLES):
+            traces.append(self.estimator.run(block[first : first + BLOCK_SAMPLES]).copy())
             suspects += [int(self.estimator.record["checks"]["suspects"][0])] * traces[-1].size
         trace = np.concatenate(traces)
         self.time_s, self.suspects = trace["time_s"] - block["time_s"][0], np.array(suspects)
@@ -92,17 +101,18 @@ class Run:
         self.error, self.std = trace["soc"] - self.soc, trace["soc_std"]
 
     def after(self, time_s: float) -> np.ndarray:
+        """Return a mask of the samples after ``time_s`` [s] with an SOC above 0.05."""
         return (self.time_s > time_s) & (self.soc > 0.05)
 
-    def covered(self, after_s: float = 900.0) -> float:
-        """Return the share of samples whose error is within two std."""
+    def coverage(self, after_s: float = 900.0) -> float:
+        """Return the fraction of samples whose error is within two std."""
         judged = self.after(after_s)
         return float(np.mean(np.abs(self.error[judged]) < 2.0 * self.std[judged]))
 
 
 @cache
-def run_with_hour_of(fault: Fault, path: Path) -> Run:
-    """Return the run over a capture with this fault."""
+def run_with_fault_of_an_hour(fault: Fault, path: Path) -> Run:
+    """Return the run over a capture with ``fault`` from the first to the second hour."""
     return Run(path, TRUTH, fault)
 
 
@@ -115,55 +125,66 @@ def capture(captures: Path, name: str) -> Path:
     return captures / f"{name}.csv.gz"
 
 
-@pytest.mark.parametrize("name", CHANGING)
-@pytest.mark.parametrize("fault", [flipped, offset, glitches, spikes, repeated, stuck, dead])
+@pytest.mark.parametrize("name", CHANGING_LOADS)
+@pytest.mark.parametrize(
+    "fault",
+    [
+        reverse_current,
+        add_offset,
+        add_voltage_glitches,
+        add_current_spikes,
+        repeat_time_stamps,
+        hold_voltage,
+        set_current_to_zero,
+    ],
+)
 def test_the_soc_recovers_after_an_hour_of_bad_input(captures: Path, name: str, fault: Fault) -> None:
-    """The SOC is correct again within an hour of good input, and stays correct."""
-    run = run_with_hour_of(fault, capture(captures, name))
+    """The SOC is correct again within an hour of valid input, and stays correct."""
+    run = run_with_fault_of_an_hour(fault, capture(captures, name))
     assert np.isfinite(run.error).all()
     assert np.abs(run.error[run.after(FAULT_S[1] + 3600.0)]).max() < 0.025
-    assert run.covered() > (0.9 if fault is flipped else 0.95)
+    assert run.coverage() > (0.9 if fault is reverse_current else 0.95)
 
 
-@pytest.mark.parametrize("name", CHANGING)
+@pytest.mark.parametrize("name", CHANGING_LOADS)
 @pytest.mark.parametrize(
     ("fault", "suspect"),
     [
-        (flipped, InputFault.SIGN_OF_CURRENT),
-        (glitches, InputFault.OUTLIERS),
-        (stuck, InputFault.VOLTAGE),
-        (dead, InputFault.CURRENT),
+        (reverse_current, InputFault.SIGN_OF_CURRENT),
+        (add_voltage_glitches, InputFault.OUTLIERS),
+        (hold_voltage, InputFault.VOLTAGE),
+        (set_current_to_zero, InputFault.CURRENT),
     ],
 )
 def test_a_temporary_fault_is_reported_and_then_cleared(
     captures: Path, name: str, fault: Fault, suspect: InputFault
 ) -> None:
-    run = run_with_hour_of(fault, capture(captures, name))
-    named = run.suspects & suspect != 0
-    assert named[(run.time_s > FAULT_S[0]) & (run.time_s < FAULT_S[1])].any()
-    assert not named[run.time_s < FAULT_S[0]].any()
+    run = run_with_fault_of_an_hour(fault, capture(captures, name))
+    reported = run.suspects & suspect != 0
+    assert reported[(run.time_s > FAULT_S[0]) & (run.time_s < FAULT_S[1])].any()
+    assert not reported[run.time_s < FAULT_S[0]].any()
     assert run.suspects[-1] == 0
 
 
-@pytest.mark.parametrize("name", CHANGING)
+@pytest.mark.parametrize("name", CHANGING_LOADS)
 @pytest.mark.parametrize("offset_a", [0.05, -0.05])
 def test_an_offset_of_the_current_is_learned(captures: Path, name: str, offset_a: float) -> None:
-    """1 % of a range of 5 A: 1.7 % of the capacity in an hour."""
+    """The offset is 1 % of a range of 5 A and shifts the counted SOC by 1.7 % in an hour."""
 
-    def off(block: SampleBlock, _: np.ndarray) -> None:
+    def add_offset_throughout(block: SampleBlock, _: np.ndarray) -> None:
         block["current_a"] += offset_a
 
-    run = Run(capture(captures, name), TRUTH, off)
+    run = Run(capture(captures, name), TRUTH, add_offset_throughout)
     assert np.abs(run.error[run.after(900.0)]).max() < 0.025
-    assert run.covered() > 0.95
+    assert run.coverage() > 0.95
 
 
-@pytest.mark.parametrize("name", CHANGING)
+@pytest.mark.parametrize("name", CHANGING_LOADS)
 def test_an_implausible_offset_is_reported(captures: Path, name: str) -> None:
-    def off(block: SampleBlock, _: np.ndarray) -> None:
+    def add_large_offset(block: SampleBlock, _: np.ndarray) -> None:
         block["current_a"] += 0.15
 
-    run = Run(capture(captures, name), TRUTH, off)
+    run = Run(capture(captures, name), TRUTH, add_large_offset)
     assert run.suspects[-1] & (InputFault.OFFSET | InputFault.CAPACITY)
     assert np.abs(run.error[run.after(3600.0)]).max() < 0.03
 
@@ -174,10 +195,10 @@ def test_a_capacity_20_percent_too_small_is_reported(captures: Path, name: str) 
     run = Run(capture(captures, name), TRUTH.model_copy(update={"cell": smaller}))
     assert run.suspects[-1] & InputFault.CAPACITY
     assert np.abs(run.error[run.after(3600.0)]).max() < 0.03
-    assert run.covered() > 0.95
+    assert run.coverage() > 0.95
 
 
-@pytest.mark.parametrize("name", CHANGING)
+@pytest.mark.parametrize("name", CHANGING_LOADS)
 def test_the_ocv_of_another_chemistry_is_reported(captures: Path, name: str) -> None:
     """The wrong curve is that of LFP, with a plateau at 3.3 V."""
     soc = np.linspace(0.0, 1.0, 51)
@@ -187,10 +208,10 @@ def test_the_ocv_of_another_chemistry_is_reported(captures: Path, name: str) -> 
     assert run.suspects[-1] == InputFault.OCV
 
 
-@pytest.mark.parametrize("wrong", [-0.2, pytest.param(0.2, marks=pytest.mark.thorough)])
-def test_good_captures_cause_no_diagnostics(captures: Path, wrong: float) -> None:
+@pytest.mark.parametrize("soc_error", [-0.2, pytest.param(0.2, marks=pytest.mark.thorough)])
+def test_good_captures_cause_no_diagnostics(captures: Path, soc_error: float) -> None:
     for path in sorted(captures.glob("*.csv.gz")):
-        run = Run(path, TRUTH, wrong=wrong)
+        run = Run(path, TRUTH, soc_error=soc_error)
         assert not run.suspects.any(), path.name
 
 
@@ -200,16 +221,16 @@ def test_captures_of_a_leaf_cause_no_diagnostics(data: Path) -> None:
 
 
 def test_the_true_soc_is_inside_the_interval_after_a_gap_of_an_hour(captures: Path) -> None:
-    """The current in the gap is unknown, and the std includes that."""
+    """The current in the gap is unknown, so that the std grows."""
     block = load_capture(capture(captures, "cell5_random_steps")).rows
-    when_s = block["time_s"] - block["time_s"][0]
-    before, after = when_s < FAULT_S[0], when_s >= FAULT_S[1]
-    soc = 1.0 - np.r_[0.0, np.cumsum(block["current_a"][:-1] * np.diff(when_s))] / 3600.0 / CAPACITY_AH
+    elapsed_s = block["time_s"] - block["time_s"][0]
+    before, after = elapsed_s < FAULT_S[0], elapsed_s >= FAULT_S[1]
+    soc = 1.0 - np.r_[0.0, np.cumsum(block["current_a"][:-1] * np.diff(elapsed_s))] / 3600.0 / CAPACITY_AH
     estimator = Estimator(TRUTH, initial_soc=0.8)
-    known = estimator.run(block[before])["soc_std"][-1]
+    std_before = estimator.run(block[before])["soc_std"][-1]
     trace = estimator.run(block[after])
     error = trace["soc"] - soc[after]
-    assert trace["soc_std"][0] > known
+    assert trace["soc_std"][0] > std_before
     assert np.mean(np.abs(error) < 2.0 * trace["soc_std"]) > 0.95
     assert np.abs(error[3600:][soc[after][3600:] > 0.05]).max() < 0.025
 
@@ -227,9 +248,9 @@ def test_the_estimate_recovers_after_hours_of_random_input(load) -> None:
     garbage["temperature_c"] = rng.normal(0.0, 100.0, garbage.size) ** 3
     estimator = Estimator(TRUTH, initial_soc=0.5)
     assert np.isfinite(estimator.run(garbage)["soc"]).all()
-    back = load[0].copy()
-    back["time_s"] += garbage["time_s"][-1] + 1.0
-    trace = estimator.run(back)
+    valid = load[0].copy()
+    valid["time_s"] += garbage["time_s"][-1] + 1.0
+    trace = estimator.run(valid)
     assert np.isfinite(trace["soc_std"]).all()
     assert np.abs(trace["soc"] - load[1])[5400:].max() < 0.05
 
@@ -258,10 +279,10 @@ def test_single_outliers_are_rejected_but_a_new_level_is_accepted(load) -> None:
     assert glitched.record["counters"][0].tolist() == (2, 0, 0)
     assert glitched.state["soc"][0] == pytest.approx(clean.state["soc"][0], abs=1e-3)
     block["voltage_v"][500:] = 2.9
-    moved = Estimator(TRUTH, initial_soc=0.95)
-    moved.run(block)
-    assert moved.record["counters"]["gated"][0] == 4
-    assert moved.record["counters"]["reopened"][0] == 1
+    shifted = Estimator(TRUTH, initial_soc=0.95)
+    shifted.run(block)
+    assert shifted.record["counters"]["gated"][0] == 4
+    assert shifted.record["counters"]["reopened"][0] == 1
 
 
 def test_every_diagnostic_contains_a_remedy() -> None:

@@ -23,10 +23,9 @@ def test_a_file_without_a_ladder_gets_one_equivalent_to_its_rc_pairs() -> None:
     soc, a, elements = float(estimator.state["soc"][0]), CELL.a, present_elements(estimator.record[0])
     r_ts, r_tl = chen_mora.r_ts(soc, a), chen_mora.r_tl(soc, a)
     assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=1e-3)
-    both = elements["r_ts_ohm"].value + elements["r_tl_ohm"].value
-    assert both == pytest.approx(
-        (1.0 + BEYOND_BRANCHES) * (r_ts + r_tl), rel=0.05
-    )  # the filter assumes a load before the first sample
+    pairs_ohm = elements["r_ts_ohm"].value + elements["r_tl_ohm"].value
+    # The tolerance covers the load that the filter assumes before the first sample.
+    assert pairs_ohm == pytest.approx((1.0 + BEYOND_BRANCHES) * (r_ts + r_tl), rel=0.05)
     assert elements["r_ts_ohm"].value == pytest.approx(r_ts, rel=0.15)
     assert elements["c_ts_farad"].value == pytest.approx(chen_mora.c_ts(soc, a), rel=0.15)
     assert estimator.settings_record["filter"]["r_std"][0] == BRANCHES_STD
@@ -43,15 +42,17 @@ def test_a_ladder_of_two_rc_pairs_has_their_resistances_over_soc() -> None:
 
 
 def test_resistances_of_two_rc_pairs_grow_in_the_cold_as_in_measured_cells() -> None:
-    """In two fits the resistances are 2.4 times as large at 0 C as at 25 C in the middle, and more towards empty:
-    4.6 (NCA) and 2.7 times (LFP) at SOC 0.1."""
+    """Two fits of measured cells give the limits of the ratio of the resistances at 0 C to those at 25 C.
+
+    At SOC 0.5 the ratio is 2.4. At SOC 0.1 it is 4.6 (NCA) and 2.7 (LFP).
+    """
     p = Estimator(CELL.model_copy(update={"ladder": None})).settings_record[0]["filter"]
-    grown = {}
+    cold_ratio = {}
     for soc in (0.5, 0.1):
         weak, strong = (float(p[name][round(soc * (GRID - 1))].sum()) for name in ("weak_ohm", "strong_ohm"))
-        grown[soc] = (weak * arrhenius(WEAK_J, 0.0) + strong * arrhenius(STRONG_J, 0.0)) / (weak + strong)
-    assert 2.0 < grown[0.5] < 2.8
-    assert 1.2 * grown[0.5] < grown[0.1] < 4.6
+        cold_ratio[soc] = (weak * arrhenius(WEAK_J, 0.0) + strong * arrhenius(STRONG_J, 0.0)) / (weak + strong)
+    assert 2.0 < cold_ratio[0.5] < 2.8
+    assert 1.2 * cold_ratio[0.5] < cold_ratio[0.1] < 4.6
 
 
 def test_a_ladder_of_a_pack_is_interpolated() -> None:
@@ -66,14 +67,14 @@ def test_a_ladder_of_a_pack_is_interpolated() -> None:
 
 def test_a_configured_hysteresis_raises_a_curve_after_discharge() -> None:
     soc, ocv_v = (0.0, 0.3, 0.7, 1.0), (3.0, 3.25, 3.3, 3.5)
-    after = CELL.model_copy(update={"ocv": TableOcv(form="table", soc=soc, ocv_v=ocv_v)})
-    midway = CELL.model_copy(
+    discharge_curve_cell = CELL.model_copy(update={"ocv": TableOcv(form="table", soc=soc, ocv_v=ocv_v)})
+    mean_curve_cell = CELL.model_copy(
         update={"ocv": TableOcv(form="table", soc=soc, ocv_v=ocv_v, hysteresis_v=(0.005, 0.01, 0.01, 0.005))}
     )
-    told = IdentifierSettings(hysteresis_v=0.03)
-    for cell, lifted_v in ((after, 0.015), (midway, 0.0)):
+    configured = IdentifierSettings(hysteresis_v=0.03)
+    for cell, lifted_v in ((discharge_curve_cell, 0.015), (mean_curve_cell, 0.0)):
         without = Estimator(cell).settings_record[0]["filter"]
-        p = Estimator(cell, identifier=told).settings_record[0]["filter"]
+        p = Estimator(cell, identifier=configured).settings_record[0]["filter"]
         assert p["ocv_v"] - without["ocv_v"] == pytest.approx(lifted_v)
         assert p["hysteresis_v"] == pytest.approx(0.015)
     assert without["hysteresis_v"].max() == pytest.approx(0.01)
@@ -83,8 +84,8 @@ def test_a_std_of_0_disables_a_state_and_the_offset_std_is_in_amperes() -> None:
     off = IdentifierSettings(current_offset_std_a=0.0, capacity_std=0.0)
     p = Estimator(CELL, identifier=off).settings_record[0]["filter"]
     assert (p["offset_c"], p["capacity_std"]) == (0.0, 0.0)
-    told = IdentifierSettings(current_offset_std_a=0.1, soc_std=0.05)
-    p = Estimator(CELL, identifier=told).settings_record[0]["filter"]
+    configured = IdentifierSettings(current_offset_std_a=0.1, soc_std=0.05)
+    p = Estimator(CELL, identifier=configured).settings_record[0]["filter"]
     assert p["offset_c"] * p["capacity_as"] / 3600.0 == pytest.approx(0.1)
     assert p["soc_std"] == 0.05
     assert p["capacity_std"] > 0.0

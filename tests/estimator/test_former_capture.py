@@ -1,4 +1,4 @@
-"""Captures of the first version give the values of that version."""
+"""Regression test: the estimate from a capture of version 0.1.0 equals that of version 0.1.0."""
 
 import json
 from pathlib import Path
@@ -8,13 +8,13 @@ import pytest
 from bms_estimator import estimate, load_capture, load_cell
 
 ROUNDING = 1e-9
-"""Relative tolerance, because other processors round differently."""
+"""Relative tolerance for the different rounding of other processors."""
 
 
-def test_a_capture_of_the_first_version_gives_the_values_of_that_version(data: Path) -> None:
-    recorded = data / "simulated" / "board_0_1_0.bms"
-    then = json.loads(recorded.with_suffix(".json").read_text())
-    now = estimate(load_capture(recorded), load_cell("chen_mora"))
-    assert now.rows.size == then["samples"]
-    for row, place in zip(then["rows"], (0, now.rows.size // 2, -1), strict=True):
-        assert {name: float(now[name][place]) for name in row} == pytest.approx(row, rel=ROUNDING)
+def test_the_estimate_from_a_capture_of_version_0_1_0_is_unchanged(data: Path) -> None:
+    path = data / "simulated" / "board_0_1_0.bms"
+    expected = json.loads(path.with_suffix(".json").read_text())
+    trace = estimate(load_capture(path), load_cell("chen_mora"))
+    assert trace.rows.size == expected["samples"]
+    for row, index in zip(expected["rows"], (0, trace.rows.size // 2, -1), strict=True):
+        assert {name: float(trace[name][index]) for name in row} == pytest.approx(row, rel=ROUNDING)

@@ -1,4 +1,4 @@
-"""Fuel cells in the estimator."""
+"""Estimator of a fuel cell: learned parameters, payloads, and invalid samples."""
 
 import math
 
@@ -20,19 +20,21 @@ from tests import mann_stack
 PEM = load_fuel_cell("pem_30w")
 
 
-def block(record: mann_stack.Record) -> SampleBlock:
+def make_samples(record: mann_stack.Record) -> SampleBlock:
+    """Return the samples of a simulated record."""
     samples = np.zeros(record.time_s.size, SAMPLE)
     for name in ("time_s", "current_a", "voltage_v", "temperature_c"):
         samples[name] = getattr(record, name)
     return samples
 
 
-def own_block(truth: np.ndarray, duration_s: float, *, seed: int = 0) -> SampleBlock:
+def simulate_model(truth: np.ndarray, duration_s: float, *, seed: int = 0) -> SampleBlock:
     """Return samples of the model itself with ``truth`` times the file's parameters."""
-    return block(mann_stack.model_itself(PEM.a * truth, duration_s, seed=seed))
+    return make_samples(mann_stack.model_itself(PEM.a * truth, duration_s, seed=seed))
 
 
-def learned(estimator: Estimator) -> dict[str, float]:
+def learned_parameters(estimator: Estimator) -> dict[str, float]:
+    """Return the present parameters of the learning law by name."""
     return dict(zip(NAMES, estimator.state["a"][0][1:8], strict=True))
 
 
@@ -45,7 +47,7 @@ def ten_minutes() -> mann_stack.Record:
 
 
 def test_run_and_step_leave_the_same_state_to_the_last_bit(ten_minutes: mann_stack.Record) -> None:
-    samples = block(ten_minutes)[:3000]
+    samples = make_samples(ten_minutes)[:3000]
     samples["voltage_v"][100] = np.nan
     samples["voltage_v"][200] = 25.0
     samples["temperature_c"][300:500] = np.nan
@@ -68,7 +70,7 @@ def test_values_that_a_stack_does_not_have_are_nan_in_the_trace_and_null_in_payl
     ten_minutes: mann_stack.Record,
 ) -> None:
     estimator = Estimator(PEM)
-    trace = estimator.run(block(ten_minutes)[:500])
+    trace = estimator.run(make_samples(ten_minutes)[:500])
     for name in ("soc", "soc_coulomb", "soc_std", "soc_ocv", "delta_1", "delta_2", "stability_margin"):
         assert np.isnan(trace[name]).all(), name
     assert np.isfinite(trace["voltage_estimate_v"]).all()
@@ -84,15 +86,15 @@ def test_values_that_a_stack_does_not_have_are_nan_in_the_trace_and_null_in_payl
 
 def test_a_growing_resistance_is_learned() -> None:
     """One parameter increases by 35 % after ten minutes. Within ten minutes all parameters are learned again."""
-    estimator, grown = Estimator(PEM), np.ones(16)
-    grown[1 + NAMES.index("r_ohm")] = 1.35
-    first, then = own_block(np.ones(16), 600.0), own_block(grown, 600.0, seed=1)
+    estimator, changed_parameters = Estimator(PEM), np.ones(16)
+    changed_parameters[1 + NAMES.index("r_ohm")] = 1.35
+    first, then = simulate_model(np.ones(16), 600.0), simulate_model(changed_parameters, 600.0, seed=1)
     then["time_s"] += 600.0
     estimator.run(first)
-    assert learned(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.05)
+    assert learned_parameters(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.05)
     trace = estimator.run(then)
-    assert learned(estimator)["r_ohm"] == pytest.approx(1.35 * PEM.fuel_cell.r_ohm, rel=0.05)
-    assert learned(estimator)["tafel_slope_v"] == pytest.approx(PEM.fuel_cell.tafel_slope_v, rel=0.03)
+    assert learned_parameters(estimator)["r_ohm"] == pytest.approx(1.35 * PEM.fuel_cell.r_ohm, rel=0.05)
+    assert learned_parameters(estimator)["tafel_slope_v"] == pytest.approx(PEM.fuel_cell.tafel_slope_v, rel=0.03)
     first_v, last_v = (np.sqrt(np.mean(trace["innovation_v"][part] ** 2)) for part in (slice(500), slice(-6000, None)))
     assert first_v > 0.1
     assert last_v < 0.01
@@ -102,11 +104,11 @@ def test_the_voltage_of_a_stack_with_unmodelled_effects_is_tracked(ten_minutes: 
     """A contact resistance of 60 mohm at 300 s causes an error of 180 mV, which falls to 20 mV within four minutes. The
     resistance is within 10 %."""
     estimator, late = Estimator(PEM), slice(-6000, None)
-    trace = estimator.run(block(ten_minutes))
+    trace = estimator.run(make_samples(ten_minutes))
     grown_v = trace["innovation_v"][(ten_minutes.time_s > 300.0) & (ten_minutes.time_s < 310.0)]
     assert np.sqrt(np.mean(grown_v**2)) > 0.1
     assert np.sqrt(np.mean(trace["innovation_v"][late] ** 2)) < 0.025
-    assert learned(estimator)["r_ohm"] == pytest.approx(ten_minutes.r_ohm[late].mean(), rel=0.1)
+    assert learned_parameters(estimator)["r_ohm"] == pytest.approx(ten_minutes.r_ohm[late].mean(), rel=0.1)
     assert (trace["lock"][late] == 1).all()
 
 
@@ -114,16 +116,16 @@ def test_wrong_parameters_are_learned_and_reported_as_identified() -> None:
     """Samples of the model with initial parameter errors of 5 to 50 %: all are within 3 % after ten minutes."""
     truth = np.array([1.0, 1.5, 0.9, 1.05, 1.3, *[1.0] * 11])
     estimator = Estimator(PEM, voltage_resolution_v=1e-3)
-    trace = estimator.run(own_block(truth, 600.0))
+    trace = estimator.run(simulate_model(truth, 600.0))
     assert np.sqrt(np.mean(trace["innovation_v"][-6000:] ** 2)) < 0.008
-    found = learned(estimator)
-    for name, factor, within in (
+    parameters = learned_parameters(estimator)
+    for name, factor, tolerance in (
         ("r_ohm", 1.5, 0.03),
         ("tafel_slope_v", 0.9, 0.01),
         ("activation_v", 1.05, 0.005),
         ("c_dl_farad", 1.3, 0.03),
     ):
-        assert found[name] == pytest.approx(factor * PEM.a[1 + NAMES.index(name)], rel=within), name
+        assert parameters[name] == pytest.approx(factor * PEM.a[1 + NAMES.index(name)], rel=tolerance), name
     published = fuel_cell_parameters(estimator, 0.0)
     assert published["r_ohm"].valid
     assert published["r_ohm"].std is not None
@@ -131,40 +133,40 @@ def test_wrong_parameters_are_learned_and_reported_as_identified() -> None:
     assert "known to" in str(published["concentration_v"].reason)
 
 
-@pytest.mark.parametrize(("held", "printed"), [(0.0, 0.0), (math.nan, None), (math.inf, None)])
-def test_a_replay_prints_numbers_or_none(held: float, printed: float | None) -> None:
+@pytest.mark.parametrize(("state_value", "printed"), [(0.0, 0.0), (math.nan, None), (math.inf, None)])
+def test_a_replay_prints_numbers_or_none(state_value: float, printed: float | None) -> None:
     estimator = Estimator(PEM)
-    estimator.run(own_block(np.ones(16), 2.0))
-    estimator.state["a"][0, 1] = held
+    estimator.run(simulate_model(np.ones(16), 2.0))
+    estimator.state["a"][0, 1] = state_value
     r_ohm = Summary().result(estimator, 1, 1.0).parameters["r_ohm"]
     assert (r_ohm.value, r_ohm.std) == (printed, printed)
 
 
 def test_without_a_load_only_the_voltage_is_learned() -> None:
-    samples = own_block(np.ones(16), 60.0)
+    samples = simulate_model(np.ones(16), 60.0)
     samples["current_a"], samples["voltage_v"] = 0.0, 13.1
     estimator = Estimator(PEM)
     estimator.run(samples)
-    found = learned(estimator)
+    parameters = learned_parameters(estimator)
     for name in ("r_ohm", "c_dl_farad"):
-        assert found[name] == pytest.approx(PEM.a[1 + NAMES.index(name)], rel=0.02), name
+        assert parameters[name] == pytest.approx(PEM.a[1 + NAMES.index(name)], rel=0.02), name
     assert not fuel_cell_parameters(estimator, 0.0)["r_ohm"].valid
 
 
 def test_a_stack_is_learned_again_after_random_sensor_values() -> None:
-    samples = own_block(np.ones(16), 720.0)
-    broken = slice(6000, 12000)
-    samples["voltage_v"][broken] = np.random.default_rng(1).uniform(2.0, 18.0, 6000)
+    samples = simulate_model(np.ones(16), 720.0)
+    faulty = slice(6000, 12000)
+    samples["voltage_v"][faulty] = np.random.default_rng(1).uniform(2.0, 18.0, 6000)
     estimator = Estimator(PEM)
     trace = estimator.run(samples)
-    assert np.sqrt(np.mean(trace["innovation_v"][broken] ** 2)) > 1.0
+    assert np.sqrt(np.mean(trace["innovation_v"][faulty] ** 2)) > 1.0
     assert np.sqrt(np.mean(trace["innovation_v"][-6000:] ** 2)) < 0.01
-    assert learned(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.1)
+    assert learned_parameters(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.1)
 
 
 @pytest.mark.parametrize("field", ["theta", "x", "dx", "information", "pull", "temperature_c"])
 def test_a_non_finite_state_is_initialized_again(field: str) -> None:
-    samples = own_block(np.ones(16), 90.0)
+    samples = simulate_model(np.ones(16), 90.0)
     estimator = Estimator(PEM)
     estimator.run(samples[:1000])
     estimator.record[0]["learning"][field] = np.nan
@@ -177,21 +179,21 @@ def test_a_non_finite_state_is_initialized_again(field: str) -> None:
 @pytest.mark.parametrize("celsius", [-273.15, -300.0, -127.0, 1e6, np.inf])
 @pytest.mark.parametrize("first", [0, 500])
 def test_an_implausible_temperature_is_not_used(first: int, celsius: float) -> None:
-    samples = own_block(np.ones(16), 10.0)
-    without, told = Estimator(PEM), Estimator(PEM)
+    samples = simulate_model(np.ones(16), 10.0)
+    without, with_temperature = Estimator(PEM), Estimator(PEM)
     expected_v = without.run(samples)["voltage_estimate_v"].copy()
     samples["temperature_c"][first : first + 2] = celsius
-    np.testing.assert_array_equal(told.run(samples)["voltage_estimate_v"], expected_v)
+    np.testing.assert_array_equal(with_temperature.run(samples)["voltage_estimate_v"], expected_v)
     assert np.isfinite(expected_v).all()
 
 
 def test_a_current_with_the_wrong_sign_does_not_change_parameters() -> None:
-    samples = own_block(np.ones(16), 60.0)
+    samples = simulate_model(np.ones(16), 60.0)
     estimator = Estimator(PEM)
     estimator.run(samples[:2000])
     samples["current_a"][2000:5000] *= -1.0
     estimator.run(samples[2000:5000])
-    assert learned(estimator)["tafel_slope_v"] == pytest.approx(PEM.fuel_cell.tafel_slope_v, rel=0.02)
-    assert learned(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.05)
+    assert learned_parameters(estimator)["tafel_slope_v"] == pytest.approx(PEM.fuel_cell.tafel_slope_v, rel=0.02)
+    assert learned_parameters(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.05)
     trace = estimator.run(samples[5000:])
     assert np.sqrt(np.mean(trace["innovation_v"][100:] ** 2)) < 0.02

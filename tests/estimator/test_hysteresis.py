@@ -1,4 +1,4 @@
-"""Simulated cell with the flat OCV of LFP, 30 mV higher after charge than after discharge."""
+"""OCV hysteresis of a simulated cell with the flat OCV of LFP, which is 30 mV higher after charge than after discharge."""
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ SOC = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.65, 0.7, 0.8, 0.9,
 OCV_V = (2.6, 2.95, 3.1, 3.19, 3.215, 3.235, 3.262, 3.274, 3.278, 3.282, 3.29, 3.308, 3.312, 3.315, 3.32, 3.335, 3.4)
 CELL = load_cell("ncr18650").model_copy(update={"ladder": None, "ocv": TableOcv(form="table", soc=SOC, ocv_v=OCV_V)})
 HYSTERESIS_V = 0.03
-TURN_SOC = 0.05
-"""Charge between the OCV after discharge and that after charge [SOC]."""
+HYSTERESIS_SOC = 0.05
+"""Charge constant of the transition from the OCV after discharge to the OCV after charge [SOC]."""
 CAPACITY_AS = CELL.cell.capacity_ah * 3600.0
 
 
@@ -34,7 +34,7 @@ def load_a(rng: np.random.Generator, cycles: int) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def cycled(seed: int) -> tuple[SampleBlock, np.ndarray]:
+def simulate_cycles(seed: int) -> tuple[SampleBlock, np.ndarray]:
     """Return samples with 0.5 mV of noise and 1 mV resolution, and the true SOC."""
     rng = np.random.default_rng(seed)
     current_a = load_a(rng, 4)
@@ -46,13 +46,13 @@ def cycled(seed: int) -> tuple[SampleBlock, np.ndarray]:
         block["voltage_v"][n] = ocv(x[0], *grid) + branch * HYSTERESIS_V - x[1] - x[2] - i * r_s(x[0], CELL.a)
         soc[n] = x[0]
         x = cell_step(x, i, 1.0, CAPACITY_AS, CELL.a)
-        branch += (1.0 - np.exp(-abs(i) / CAPACITY_AS / TURN_SOC)) * (float(i < 0.0) - branch)
+        branch += (1.0 - np.exp(-abs(i) / CAPACITY_AS / HYSTERESIS_SOC)) * (float(i < 0.0) - branch)
     block["voltage_v"] = np.round(block["voltage_v"] + rng.normal(0.0, 5e-4, current_a.size), 3)
     return block, soc
 
 
-def errors(block: SampleBlock, soc: np.ndarray, hysteresis_v: float) -> tuple[float, float]:
-    """Return the RMS error of the SOC after two hours, and the share of time inside two standard deviations."""
+def score_run(block: SampleBlock, soc: np.ndarray, hysteresis_v: float) -> tuple[float, float]:
+    """Return the RMS error of the SOC after two hours, and the fraction of time inside two standard deviations."""
     estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=hysteresis_v), initial_soc=1.0)
     trace = estimator.run(block)[7200:]
     error = trace["soc"] - soc[7200:]
@@ -60,16 +60,16 @@ def errors(block: SampleBlock, soc: np.ndarray, hysteresis_v: float) -> tuple[fl
 
 
 def test_a_configured_hysteresis_improves_soc_and_coverage() -> None:
-    loads = [cycled(seed) for seed in range(1, 4)]
-    told, untold = (np.mean([errors(*load, v) for load in loads], axis=0) for v in (HYSTERESIS_V, 0.0))
-    assert told[0] < 0.012
-    assert told[0] < 0.8 * untold[0]
-    assert told[1] > 0.95
+    loads = [simulate_cycles(seed) for seed in range(1, 4)]
+    configured, not_configured = (np.mean([score_run(*load, v) for load in loads], axis=0) for v in (HYSTERESIS_V, 0.0))
+    assert configured[0] < 0.012
+    assert configured[0] < 0.8 * not_configured[0]
+    assert configured[1] > 0.95
 
 
 @pytest.mark.parametrize("steps_s", [(1.0,), (10.0,), (1.0, 7.0), (1.0, 1.0, 1.0, 8.0)])
 def test_regeneration_does_not_reverse_the_hysteresis(steps_s: tuple[float, ...]) -> None:
-    """Half an hour of 1.5 C and -1 C alternately, 20 s each: the throughput is five times the net discharge."""
+    """For half an hour, 1.5 C and -1 C alternate every 20 s. The charge throughput is five times the net discharge."""
     estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=0.0), initial_soc=0.8)
     time_s = np.concatenate([[0.0], np.cumsum(np.resize(steps_s, round(1800.0 / np.mean(steps_s))))])
     current_a = CELL.cell.capacity_ah * np.where(time_s % 40.0 < 20.0, 1.5, -1.0)
@@ -78,17 +78,17 @@ def test_regeneration_does_not_reverse_the_hysteresis(steps_s: tuple[float, ...]
         estimator.step(t, i, 3.3 - 0.03 * i)
         h[n] = f["mean"][f["best"], HYST]
     length = float(estimator.settings_record[0]["filter"]["hysteresis_soc"])
-    moved_as = 0.5 * (current_a[1:] + current_a[:-1]) * np.diff(time_s)
-    counted = hysteresis(time_s, -np.r_[0.0, np.cumsum(moved_as)] / CAPACITY_AS, length, 0.0)
+    charge_as = 0.5 * (current_a[1:] + current_a[:-1]) * np.diff(time_s)
+    expected = hysteresis(time_s, -np.r_[0.0, np.cumsum(charge_as)] / CAPACITY_AS, length, 0.0)
     late = time_s > 1200.0
     assert h.min() >= -1.0
-    assert counted[late].mean() < -0.75
-    assert h[late].mean() == pytest.approx(counted[late].mean(), abs=0.1)
+    assert expected[late].mean() < -0.75
+    assert h[late].mean() == pytest.approx(expected[late].mean(), abs=0.1)
 
 
 def test_hysteresis_grows_in_the_cold() -> None:
-    """Return the filter's prediction after a charge minus that after a discharge."""
-    seen_v = {}
+    """The hysteresis is the filter's prediction after a charge minus its prediction after a discharge."""
+    predicted_v = {}
     for h in (-1.0, 1.0):
         for celsius in (-15.0, 25.0):
             estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=HYSTERESIS_V), initial_soc=0.5)
@@ -97,8 +97,8 @@ def test_hysteresis_grows_in_the_cold() -> None:
             f["count"], f["mean"][:, HYST], f["covariance"][:, HYST] = 1, h, 0.0
             f["covariance"][:, :, HYST] = 0.0
             estimator.step(1.0, 0.0, 3.28, 0, celsius)
-            seen_v[h, celsius] = f["voltage_v"]
-    gap_v = {celsius: seen_v[1.0, celsius] - seen_v[-1.0, celsius] for celsius in (-15.0, 25.0)}
-    assert gap_v[25.0] == pytest.approx(HYSTERESIS_V, rel=0.01)
-    assert gap_v[-15.0] / gap_v[25.0] == pytest.approx(arrhenius(HYSTERESIS_J, -15.0), rel=0.01)
-    assert 1.5 < gap_v[-15.0] / gap_v[25.0] < 1.8
+            predicted_v[h, celsius] = f["voltage_v"]
+    difference_v = {celsius: predicted_v[1.0, celsius] - predicted_v[-1.0, celsius] for celsius in (-15.0, 25.0)}
+    assert difference_v[25.0] == pytest.approx(HYSTERESIS_V, rel=0.01)
+    assert difference_v[-15.0] / difference_v[25.0] == pytest.approx(arrhenius(HYSTERESIS_J, -15.0), rel=0.01)
+    assert 1.5 < difference_v[-15.0] / difference_v[25.0] < 1.8

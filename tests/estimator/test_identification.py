@@ -1,4 +1,4 @@
-"""Identifier and observer together: learned values are handed over, limited, saved and restored."""
+"""Identifier and observer together: identified values limit the adaptive law, and are saved and restored."""
 
 import numpy as np
 import pytest
@@ -14,31 +14,31 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 
-ON = IdentifierSettings()
+IDENTIFIER = IdentifierSettings()
 
 
 @pytest.fixture(scope="module")
-def load() -> tuple[SampleBlock, np.ndarray]:
+def load_and_soc() -> tuple[SampleBlock, np.ndarray]:
     return pulses()
 
 
-def test_step_and_run_leave_the_same_record_to_the_last_bit(load) -> None:
-    block = load[0][:3000].copy()
+def test_step_and_run_leave_the_same_record_to_the_last_bit(load_and_soc) -> None:
+    block = load_and_soc[0][:3000].copy()
     block["temperature_c"] = np.where(
         block["time_s"] % 7.0 == 0.0, np.nan, 25.0 + 10.0 * np.sin(block["time_s"] / 300.0)
     )
-    whole, stepped, pieces = (Estimator(TRUTH, identifier=ON, initial_soc=0.8) for _ in range(3))
-    whole.run(block)
+    in_one_block, stepped, in_blocks = (Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=0.8) for _ in range(3))
+    in_one_block.run(block)
     for row in block:
         stepped.step(row["time_s"], row["current_a"], row["voltage_v"], 0, row["temperature_c"])
     for part in np.array_split(block, 17):
-        pieces.run(part)
-    assert whole.record.tobytes() == stepped.record.tobytes() == pieces.record.tobytes()
+        in_blocks.run(part)
+    assert in_one_block.record.tobytes() == stepped.record.tobytes() == in_blocks.record.tobytes()
 
 
-def test_a_wrong_soc_and_wrong_resistances_are_corrected(load) -> None:
-    block, true_soc = load
-    estimator = Estimator(wrong_cell(2.0), identifier=ON, initial_soc=0.8)
+def test_a_wrong_soc_and_wrong_resistances_are_corrected(load_and_soc) -> None:
+    block, true_soc = load_and_soc
+    estimator = Estimator(wrong_cell(2.0), identifier=IDENTIFIER, initial_soc=0.8)
     trace = estimator.run(block)
     late = slice(1800, None)
     error = trace["soc"] - true_soc
@@ -52,9 +52,9 @@ def test_a_wrong_soc_and_wrong_resistances_are_corrected(load) -> None:
         assert elements[name].relative_std < 0.4
 
 
-def test_the_limits_of_the_adaptive_law_are_the_identified_values(load) -> None:
-    estimator = Estimator(wrong_cell(2.0), identifier=ON, initial_soc=0.8)
-    estimator.run(load[0])
+def test_parameters_of_the_adaptive_law_converge_to_the_identified_values(load_and_soc) -> None:
+    estimator = Estimator(wrong_cell(2.0), identifier=IDENTIFIER, initial_soc=0.8)
+    estimator.run(load_and_soc[0])
     record, a = estimator.record[0], estimator.state[0]["a"]
     for soc in (0.3, 0.6, 0.9):
         assert chen_mora.r_s(soc, a) == pytest.approx(chen_mora.r_s(soc, TRUTH.a), rel=0.03)
@@ -66,104 +66,107 @@ def test_the_limits_of_the_adaptive_law_are_the_identified_values(load) -> None:
         assert a[i] == pytest.approx(min(max(fit.value, bounds.lower), bounds.upper), rel=1e-3)
 
 
-def test_identified_values_are_limited_by_the_configured_bounds(load) -> None:
+def test_identified_values_are_limited_by_the_configured_bounds(load_and_soc) -> None:
     cell = wrong_cell(1.0).model_copy(
         update={"adaptation": {"a3": TRUTH.bounds(3).model_copy(update={"upper": 0.01, "lower": 0.009})}}
     )
-    estimator = Estimator(cell, identifier=ON, initial_soc=1.0)
-    estimator.run(load[0])
+    estimator = Estimator(cell, identifier=IDENTIFIER, initial_soc=1.0)
+    estimator.run(load_and_soc[0])
     assert fitted_parameter(estimator.record[0], 3).value > 0.01
     assert estimator.state[0]["a"][3] == pytest.approx(0.01, rel=1e-3)
 
 
-def test_a_bound_on_one_parameter_does_not_change_the_element_at_visited_soc(load) -> None:
-    """The bound limits the amplitude of R_s far below its true value. Exponent and offset compensate at visited SOCs."""
+def test_a_bound_on_one_parameter_does_not_change_the_element_at_visited_soc(load_and_soc) -> None:
+    """The bound on a15 is far below its true value. The other parameters of R_s compensate for it at visited SOCs."""
     bound = TRUTH.bounds(15).model_copy(update={"upper": 0.08, "lower": 0.07})
-    estimator = Estimator(TRUTH.model_copy(update={"adaptation": {"a15": bound}}), identifier=ON, initial_soc=1.0)
-    estimator.run(load[0])
+    estimator = Estimator(
+        TRUTH.model_copy(update={"adaptation": {"a15": bound}}), identifier=IDENTIFIER, initial_soc=1.0
+    )
+    estimator.run(load_and_soc[0])
     a, soc = estimator.state[0]["a"], float(estimator.state["soc"][0])
     assert a[15] <= 0.08
     assert chen_mora.r_s(soc, a) > 0.08
 
 
-def test_a_fit_that_is_negative_at_the_present_soc_is_not_handed_over(load) -> None:
-    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
-    estimator.run(load[0])
+def test_a_fit_with_negative_capacitances_at_the_present_soc_is_not_used_by_the_law(load_and_soc) -> None:
+    estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
+    estimator.run(load_and_soc[0])
     record, soc = estimator.record[0], float(estimator.state["soc"][0])
     targets = record["observer"]["target"].copy()
     estimator.settings_record["lower"][0, 7:13], estimator.settings_record["upper"][0, 7:13] = 0.0, np.inf
-    record["fit"]["a"][7:13] = [2e5, 1.0, 1e3, 1e6, 1.0, 1e4]  # delta = 5.3 and 4.6
+    record["fit"]["a"][7:13] = [2e5, 1.0, 1e3, 1e6, 1.0, 1e4]  # delta1 = 5.3, delta2 = 4.6
     for e in CAPACITANCES:
         set_adaptation_targets(record, estimator.settings_record[0], e)
     assert soc < 4.6
     assert np.array_equal(record["observer"]["target"], targets)
 
 
-def test_an_unmeasured_gap_adds_nothing_to_the_map(load) -> None:
-    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
-    estimator.run(load[0][:5000])
+def test_an_unmeasured_gap_adds_nothing_to_the_map(load_and_soc) -> None:
+    estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
+    estimator.run(load_and_soc[0][:5000])
     before, gap_s = estimator.record[0]["map"]["weight"].copy(), 36000.0
     unlearned_s = estimator.record[0]["unlearned_s"].copy()
-    later = load[0][5000:5300].copy()
+    later = load_and_soc[0][5000:5300].copy()
     later["time_s"] += gap_s
     later["current_a"] = 0.0
     estimator.run(later[:1])
     assert estimator.record[0]["map"]["weight"] == pytest.approx(before)
     assert estimator.record[0]["unlearned_s"] - unlearned_s == pytest.approx(gap_s, abs=2.0)
+    # At the present SOC, learning continues, which the median of the bins disregards.
     estimator.run(later[1:])
-    left = np.exp(-gap_s / estimator.settings_record["map_memory_s"][0])
-    known = before > 0.0
-    kept = estimator.record[0]["map"]["weight"][known] / before[known]
-    assert np.median(kept) == pytest.approx(left, rel=2e-3)  # at the present SOC learning continues
+    remaining = np.exp(-gap_s / estimator.settings_record["map_memory_s"][0])
+    visited = before > 0.0
+    remaining_weight = estimator.record[0]["map"]["weight"][visited] / before[visited]
+    assert np.median(remaining_weight) == pytest.approx(remaining, rel=2e-3)
 
 
-def test_a_long_gap_preserves_the_capacity_and_the_constant_part_of_the_offset(load) -> None:
-    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
-    estimator.run(load[0][:-1])
+def test_a_long_gap_preserves_the_capacity_and_the_constant_part_of_the_offset(load_and_soc) -> None:
+    estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
+    estimator.run(load_and_soc[0][:-1])
     f = estimator.record[0]["filter"]
     (offset_a, ln_q), first = f["mean"][f["best"], [OFFSET, LN_Q]], f["covariance"][f["best"]].copy()
     p = estimator.settings_record[0]["filter"]
     estimator.resume(0.1 * p["offset_s"])
-    estimator.run(load[0][-1:])
+    estimator.run(load_and_soc[0][-1:])
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]]
     assert mean[LN_Q] == pytest.approx(ln_q, rel=0.2)
     assert covariance[LN_Q, LN_Q] == pytest.approx(first[LN_Q, LN_Q], rel=0.2)
     assert covariance[LN_Q, LN_Q] < p["capacity_std"] ** 2
     assert abs(mean[OFFSET] - np.exp(-0.1) * offset_a) < 0.1 * np.sqrt(first[OFFSET, OFFSET])
-    at_first = offset_variance(p)
-    left = at_first - np.exp(-0.2) * (at_first - first[OFFSET, OFFSET])
-    assert covariance[OFFSET, OFFSET] == pytest.approx(left, rel=0.05)
+    prior_variance = offset_variance(p)
+    remaining = prior_variance - np.exp(-0.2) * (prior_variance - first[OFFSET, OFFSET])
+    assert covariance[OFFSET, OFFSET] == pytest.approx(remaining, rel=0.05)
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2"])
-def test_laws_without_limits_receive_no_identified_limits(load, law: str) -> None:
-    estimator = Estimator(TRUTH, ObserverSettings(law=law), identifier=ON, initial_soc=1.0)
+def test_laws_without_limits_receive_no_identified_limits(load_and_soc, law: str) -> None:
+    estimator = Estimator(TRUTH, ObserverSettings(law=law), identifier=IDENTIFIER, initial_soc=1.0)
     targets = estimator.settings[0]["target"].copy()
-    estimator.run(load[0])
+    estimator.run(load_and_soc[0])
     assert np.array_equal(estimator.state[0]["target"], targets)
 
 
-def test_without_the_identifier_nothing_is_learned(load) -> None:
+def test_without_the_identifier_nothing_is_learned(load_and_soc) -> None:
     estimator = Estimator(TRUTH, initial_soc=0.8, identifier=None)
-    trace = estimator.run(load[0])
+    trace = estimator.run(load_and_soc[0])
     assert np.isnan(trace["soc_std"]).all()
     assert np.array_equal(trace["soc"], trace["soc_coulomb"])
     assert (estimator.record[0]["fit"]["bins"] == 0).all()
 
 
-def test_a_saved_record_resumes_identically(load) -> None:
-    block = load[0]
-    straight, first, second = (Estimator(TRUTH, identifier=ON, initial_soc=0.9) for _ in range(3))
-    straight.run(block)
+def test_a_saved_record_resumes_identically(load_and_soc) -> None:
+    block = load_and_soc[0]
+    uninterrupted, first, second = (Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=0.9) for _ in range(3))
+    uninterrupted.run(block)
     first.run(block[:5000])
     second.record[...] = first.record
     second.run(block[5000:])
-    assert straight.record.tobytes() == second.record.tobytes()
+    assert uninterrupted.record.tobytes() == second.record.tobytes()
 
 
-def test_the_soc_is_less_certain_after_a_gap_and_converges_again(load) -> None:
-    block, true_soc = load
-    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
+def test_the_soc_is_less_certain_after_a_gap_and_converges_again(load_and_soc) -> None:
+    block, true_soc = load_and_soc
+    estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
     before = estimator.run(block[:5000])["soc_std"][-1]
     estimator.resume(1800.0)
     after = estimator.run(block[6800:])
@@ -171,13 +174,13 @@ def test_the_soc_is_less_certain_after_a_gap_and_converges_again(load) -> None:
     assert np.abs(after["soc"][1800:] - true_soc[8600:]).max() < 0.015
 
 
-def test_gaps_do_not_accumulate_the_cell_imbalance_of_a_pack(load) -> None:
+def test_gaps_do_not_accumulate_the_cell_imbalance_of_a_pack(load_and_soc) -> None:
     """The imbalance adds to the std once, for any number of restarts."""
     stds = []
     for series in (1, 6):
-        block = load[0][:5000].copy()
+        block = load_and_soc[0][:5000].copy()
         block["voltage_v"] *= series
-        estimator = Estimator(TRUTH.pack(series, 1), identifier=ON, initial_soc=1.0)
+        estimator = Estimator(TRUTH.pack(series, 1), identifier=IDENTIFIER, initial_soc=1.0)
         estimator.run(block)
         for _ in range(10):
             estimator.resume(0.0)
@@ -186,9 +189,9 @@ def test_gaps_do_not_accumulate_the_cell_imbalance_of_a_pack(load) -> None:
     assert stds[1] < 1.1 * stds[0]
 
 
-def test_a_soc_set_by_the_user_is_used_unless_the_voltage_contradicts(load) -> None:
-    block, true_soc = load
-    estimator = Estimator(TRUTH, identifier=ON, initial_soc=0.8)
+def test_a_soc_set_by_the_user_is_used_unless_the_voltage_contradicts(load_and_soc) -> None:
+    block, true_soc = load_and_soc
+    estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=0.8)
     estimator.run(block[:10])
     estimator.set_soc(float(true_soc[9]))
     assert estimator.record[0]["observer"]["soc"] == true_soc[9]
@@ -196,11 +199,11 @@ def test_a_soc_set_by_the_user_is_used_unless_the_voltage_contradicts(load) -> N
     assert np.abs(trace["soc"] - true_soc[10:600]).max() < 0.01
 
 
-def test_a_clock_set_back_and_repeated_stamps_do_not_change_the_result(load) -> None:
-    block, true_soc = load[0].copy(), load[1]
+def test_a_clock_set_back_and_repeated_stamps_do_not_change_the_result(load_and_soc) -> None:
+    block, true_soc = load_and_soc[0].copy(), load_and_soc[1]
     block["time_s"][4000:] -= 2000.0
     block["time_s"][6000:6020] = block["time_s"][5999]
-    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
+    estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
     trace = estimator.run(block)
     assert estimator.state[0]["time_steps_back"] == 1
     assert estimator.state[0]["dropped_repeated"] == 20
@@ -208,21 +211,21 @@ def test_a_clock_set_back_and_repeated_stamps_do_not_change_the_result(load) -> 
 
 
 def test_the_map_is_empty_before_its_first_sample() -> None:
-    estimator = Estimator(TRUTH, identifier=ON)
+    estimator = Estimator(TRUTH, identifier=IDENTIFIER)
     assert [fitted_parameter(estimator.record[0], 3 * e + 1) for e in range(ELEMENTS)] == [None] * ELEMENTS
 
 
 @pytest.mark.parametrize("soc", [-0.1, 1.5, float("nan")])
 def test_a_soc_outside_0_to_1_is_rejected(soc: float) -> None:
     with pytest.raises(ValueError, match="is outside"):
-        Estimator(TRUTH, identifier=ON).set_soc(soc)
+        Estimator(TRUTH, identifier=IDENTIFIER).set_soc(soc)
 
 
-def test_a_reset_after_a_gap_restores_the_soc_of_the_gap(load) -> None:
-    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
-    estimator.run(load[0][:5000])
+def test_a_reset_after_a_gap_restores_the_soc_of_the_gap(load_and_soc) -> None:
+    estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
+    estimator.run(load_and_soc[0][:5000])
     estimator.set_soc(0.7)
     estimator.record["filter"]["mean"][0, :, SOC] = np.nan
-    estimator.run(load[0][5000:5002])
+    estimator.run(load_and_soc[0][5000:5002])
     assert estimator.record["counters"]["reset"][0] == 1
     assert estimator.state["soc"][0] == pytest.approx(0.7, abs=0.05)

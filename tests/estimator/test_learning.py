@@ -1,4 +1,4 @@
-"""Learning law: convergence under an informative load, boundedness under any load, and recovery."""
+"""Learning law: convergence under an informative load, bounds under any load, and recovery."""
 
 import itertools
 
@@ -19,18 +19,20 @@ from tests.estimator.random_steps import (
     RATED_A,
     RESOLUTION_V,
     TRUTH,
-    errors,
     file_off_by,
     held_currents,
     learner,
     measured,
     random_steps,
+    relative_errors,
 )
 
 NOISE_V = 1e-3
 STARTS = list(itertools.product((0.5, 2.0), repeat=5))[::5]
-OFF = (2.0, 0.5, 2.0, 0.5, 2.0)
-PRODUCTS = [2, 4]
+"""Wrong factors of the five parameters: every fifth combination of half and double."""
+WRONG_FACTORS = (2.0, 0.5, 2.0, 0.5, 2.0)
+TIME_CONSTANTS = [2, 4]
+"""Indices of tau_ts and tau_tl among the five parameters."""
 K_BOUND = 6.0
 """Maximum of k, at which gamma k is 0.1/s."""
 
@@ -44,9 +46,9 @@ def ten_hours() -> SampleBlock:
 def test_a_load_of_random_steps_determines_all_elements(ten_hours: SampleBlock, factors: tuple[float, ...]) -> None:
     estimator = learner(file_off_by(*factors))
     estimator.run(ten_hours)
-    error = errors(estimator, factors)
+    error = relative_errors(estimator, factors)
     assert error[0] < 0.005
-    assert error[PRODUCTS].max() < 0.02
+    assert error[TIME_CONSTANTS].max() < 0.02
 
 
 def test_a_constant_current_determines_only_the_sum_of_the_resistances() -> None:
@@ -56,7 +58,7 @@ def test_a_constant_current_determines_only_the_sum_of_the_resistances() -> None
     constant = measured(np.full(7200 * 2, 0.1 * RATED_A), NOISE_V, rng)
     estimator = learner(file_off_by(*factors))
     estimator.run(constant)
-    assert errors(estimator, factors).max() > 0.4
+    assert relative_errors(estimator, factors).max() > 0.4
 
 
 def test_the_estimated_voltage_is_near_the_true_one_with_200_mv_of_noise() -> None:
@@ -103,12 +105,12 @@ def test_k_is_bounded_under_persistent_noise() -> None:
 
 def test_a_k_beyond_its_bound_does_not_disturb_the_parameters() -> None:
     """A checkpoint after hours of noise may contain such a k."""
-    estimator, block = learner(file_off_by(*OFF)), random_steps(10.0, 5e-3)
+    estimator, block = learner(file_off_by(*WRONG_FACTORS)), random_steps(10.0, 5e-3)
     estimator.run(block[:1])
     estimator.state["k"] = 113.0
     estimator.run(block[1:])
     assert estimator.state["k"][0] == pytest.approx(K_BOUND)
-    assert errors(estimator, OFF)[[0, *PRODUCTS]].max() < 0.03
+    assert relative_errors(estimator, WRONG_FACTORS)[[0, *TIME_CONSTANTS]].max() < 0.03
 
 
 def test_a_jump_of_a_resistance_is_learned() -> None:
@@ -122,15 +124,15 @@ def test_a_jump_of_a_resistance_is_learned() -> None:
     block["voltage_v"][half // 2 :] = after["voltage_v"][half // 2 :]
     estimator = learner(TRUTH)
     estimator.run(block[: half // 2])
-    assert errors(estimator, (1.0,) * 5)[0] < 0.01
+    assert relative_errors(estimator, (1.0,) * 5)[0] < 0.01
     estimator.run(block[half // 2 : half // 2 + 1800])
-    assert errors(estimator, (1.0 / 1.5, 1, 1, 1, 1))[0] < 0.05
+    assert relative_errors(estimator, (1.0 / 1.5, 1, 1, 1, 1))[0] < 0.05
     estimator.run(block[half // 2 + 1800 :])
-    assert errors(estimator, (1.0 / 1.5, 1, 1, 1, 1))[0] < 0.01
+    assert relative_errors(estimator, (1.0 / 1.5, 1, 1, 1, 1))[0] < 0.01
 
 
 def test_step_and_run_leave_the_same_state_to_the_last_bit(ten_hours: SampleBlock) -> None:
-    at_once, one_by_one = learner(file_off_by(*OFF)), learner(file_off_by(*OFF))
+    at_once, one_by_one = learner(file_off_by(*WRONG_FACTORS)), learner(file_off_by(*WRONG_FACTORS))
     block = ten_hours[:2000]
     at_once.run(block)
     for x in block:
@@ -143,39 +145,39 @@ def test_the_result_does_not_depend_on_the_sample_rate() -> None:
     current_a = np.repeat(held_currents(2.0, np.random.default_rng(4)), 50)
     time_s = 0.01 * np.arange(len(current_a))
     voltage_v, _ = simulate_cell((FIRST_SOC, 0.0, 0.0), time_s, current_a, 0.275 * 3600.0, TRUTH.a)
-    found = []
+    thetas = []
     for every in (1, 10, 100):
         block = np.zeros(len(time_s[::every]), dtype=random_steps(0.01).dtype)
         block["time_s"], block["current_a"] = time_s[::every], current_a[::every]
         block["voltage_v"], block["temperature_c"] = voltage_v[::every], np.nan
-        estimator = learner(file_off_by(*OFF))
+        estimator = learner(file_off_by(*WRONG_FACTORS))
         estimator.run(block)
-        found.append(estimator.record[0]["learning"]["theta"][:5].copy())
-    assert found[1] == pytest.approx(found[0], abs=0.01)
-    assert found[2] == pytest.approx(found[0], abs=0.1)
+        thetas.append(estimator.record[0]["learning"]["theta"][:5].copy())
+    assert thetas[1] == pytest.approx(thetas[0], abs=0.01)
+    assert thetas[2] == pytest.approx(thetas[0], abs=0.1)
 
 
 def test_a_pack_learns_the_scaled_values_of_its_cell(ten_hours: SampleBlock) -> None:
-    cell, settings = learner(file_off_by(*OFF)), ObserverSettings(law="learning")
+    cell, settings = learner(file_off_by(*WRONG_FACTORS)), ObserverSettings(law="learning")
     pack = Estimator(
-        file_off_by(*OFF).pack(6, 1),
+        file_off_by(*WRONG_FACTORS).pack(6, 1),
         settings,
         identifier=None,
         initial_soc=FIRST_SOC,
         voltage_resolution_v=6 * RESOLUTION_V,
     )
-    of_pack = ten_hours[:7200].copy()
-    of_pack["voltage_v"] *= 6.0
+    pack_samples = ten_hours[:7200].copy()
+    pack_samples["voltage_v"] *= 6.0
     cell.run(ten_hours[:7200])
-    pack.run(of_pack)
-    theta, of_cell = (e.record[0]["learning"]["theta"] for e in (pack, cell))
-    assert theta == pytest.approx(of_cell, abs=1e-6)
+    pack.run(pack_samples)
+    theta, cell_theta = (e.record[0]["learning"]["theta"] for e in (pack, cell))
+    assert theta == pytest.approx(cell_theta, abs=1e-6)
     assert pack.state["k"][0] == pytest.approx(cell.state["k"][0])
 
 
 def test_learning_stops_below_the_margins() -> None:
     block = measured(np.full(4 * 7200, 0.1 * RATED_A), 0.0, np.random.default_rng(1))
-    estimator = learner(file_off_by(*OFF), soc=0.02)
+    estimator = learner(file_off_by(*WRONG_FACTORS), soc=0.02)
     estimator.run(block[:10])
     for part in np.array_split(block[10:], 20):
         theta = estimator.record[0]["learning"]["theta"].copy()
@@ -200,10 +202,10 @@ def test_capacitances_are_positive_with_the_smallest_margin_guard(law: str) -> N
 
 
 def test_a_gap_does_not_change_parameters_and_learning_continues() -> None:
-    """Two hours at rest without samples."""
+    """The gap is a rest of two hours without samples."""
     rng = np.random.default_rng(5)
-    parts = held_currents(2.0, rng), np.zeros(2 * 7200), held_currents(3.0, rng)
-    block = measured(np.concatenate(parts), NOISE_V, rng)
+    currents_a = held_currents(2.0, rng), np.zeros(2 * 7200), held_currents(3.0, rng)
+    block = measured(np.concatenate(currents_a), NOISE_V, rng)
     estimator = learner(TRUTH)
     estimator.run(block[:7200])
     theta = estimator.record[0]["learning"]["theta"].copy()
@@ -211,30 +213,30 @@ def test_a_gap_does_not_change_parameters_and_learning_continues() -> None:
     assert estimator.state["gaps"][0] == 1
     assert (estimator.record[0]["learning"]["theta"] == theta).all()
     estimator.run(block[14_401:])
-    assert errors(estimator, (1.0,) * 5)[[0, *PRODUCTS]].max() < 0.1
+    assert relative_errors(estimator, (1.0,) * 5)[[0, *TIME_CONSTANTS]].max() < 0.1
 
 
 def test_learned_parameters_are_preserved_after_a_restart_under_load(ten_hours: SampleBlock) -> None:
-    estimator = learner(file_off_by(*OFF))
+    estimator = learner(file_off_by(*WRONG_FACTORS))
     estimator.run(ten_hours[:28_800])
-    before = errors(estimator, OFF)
+    before = relative_errors(estimator, WRONG_FACTORS)
     estimator.resume(10.0)
-    again = ten_hours[28_800:].copy()
-    again["time_s"] -= again["time_s"][0]
-    estimator.run(again[:1])
-    assert (errors(estimator, OFF) == before).all()
-    estimator.run(again)
-    assert np.abs(errors(estimator, OFF) - before)[[0, *PRODUCTS]].max() < 0.1
+    after_restart = ten_hours[28_800:].copy()
+    after_restart["time_s"] -= after_restart["time_s"][0]
+    estimator.run(after_restart[:1])
+    assert (relative_errors(estimator, WRONG_FACTORS) == before).all()
+    estimator.run(after_restart)
+    assert np.abs(relative_errors(estimator, WRONG_FACTORS) - before)[[0, *TIME_CONSTANTS]].max() < 0.1
 
 
 @pytest.mark.parametrize("field", ["theta", "x", "information", "offset_v"])
 def test_a_non_finite_state_is_initialized_again(ten_hours: SampleBlock, field: str) -> None:
-    estimator = learner(file_off_by(*OFF))
+    estimator = learner(file_off_by(*WRONG_FACTORS))
     estimator.run(ten_hours[:600])
     estimator.record[0]["learning"][field] = np.nan
     trace = estimator.run(ten_hours[600:])
     assert np.isfinite(trace["voltage_estimate_v"][1:]).all()
-    assert errors(estimator, OFF)[0] < 0.01
+    assert relative_errors(estimator, WRONG_FACTORS)[0] < 0.01
     assert trace["lock"][-1] == 1
 
 
@@ -248,8 +250,10 @@ def test_invalid_samples_are_dropped(ten_hours: SampleBlock) -> None:
     assert dirty.record["learning"].tobytes() == clean.record["learning"].tobytes()
 
 
-def test_with_the_filter_the_law_uses_its_soc_and_has_its_own_parameters(ten_hours: SampleBlock) -> None:
-    cell = file_off_by(*OFF)
+def test_with_the_filter_the_law_uses_the_soc_of_the_filter_and_learns_its_own_parameters(
+    ten_hours: SampleBlock,
+) -> None:
+    cell = file_off_by(*WRONG_FACTORS)
     estimator = Estimator(
         cell,
         ObserverSettings(law="learning"),
@@ -265,7 +269,7 @@ def test_with_the_filter_the_law_uses_its_soc_and_has_its_own_parameters(ten_hou
 
 
 def test_learned_parameters_are_published_with_their_source(ten_hours: SampleBlock) -> None:
-    estimator = learner(file_off_by(*OFF))
+    estimator = learner(file_off_by(*WRONG_FACTORS))
     estimator.run(ten_hours)
     report = make_parameters_payload(estimator, 0.0)
     assert report.a["a15"].source == report.elements["r_s_ohm"].source == "identified"
@@ -278,7 +282,9 @@ def test_gamma_k_has_its_own_field_and_delta_is_reported_as_configured(ten_hours
     """A law of the thesis, in contrast, has N(k) and adapts the parameters of delta1 and delta2."""
     states = {}
     for law in ("learning", "improved"):
-        estimator = Estimator(file_off_by(*OFF), ObserverSettings(law=law), identifier=None, initial_soc=FIRST_SOC)
+        estimator = Estimator(
+            file_off_by(*WRONG_FACTORS), ObserverSettings(law=law), identifier=None, initial_soc=FIRST_SOC
+        )
         window = Window()
         window.add(estimator.run(ten_hours[:600]), 0.0)
         summary = window.take()

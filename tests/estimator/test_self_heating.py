@@ -13,35 +13,36 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.replay import load_capture
 
-HALF_C = Path(__file__).parents[1] / "data" / "lgm50" / "rate_0p5c_25c.csv.gz"
+HALF_C_CAPTURE = Path(__file__).parents[1] / "data" / "lgm50" / "rate_0p5c_25c.csv.gz"
 
 
-def rise_k(samples, cell=None):
-    """Return the estimator's temperature rise of an LG M50 with only chemistry and capacity known [K]."""
+def temperature_rise_k(samples, cell=None):
+    """Return the estimator's temperature rise, by default of an LG M50 of which only chemistry and capacity are known [K]."""
     estimator = Estimator(cell or load_cell("nmc", 5.0), initial_soc=1.0)
     rise_k = np.zeros(samples.size)
     for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
         estimator.step(time_s, current_a, voltage_v, status, temperature_c)
-        rise_k[n] = taken_c(estimator) - REFERENCE_C
+        rise_k[n] = used_temperature_c(estimator) - REFERENCE_C
     return rise_k
 
 
-def taken_c(estimator):
+def used_temperature_c(estimator):
+    """Return the temperature that the filter uses [C]."""
     return estimator.record["filter"]["temperature_c"][0]
 
 
-def loaded(estimator, seconds=600):
-    """Process a load of 1C for a cell of 5 Ah."""
+def run_at_1_c(estimator, seconds=600):
+    """Process a load of 1 C for a cell of 5 Ah; return the temperature that the filter uses [C]."""
     for second in range(seconds):
         estimator.step(float(second), 5.0, 3.9)
-    return taken_c(estimator)
+    return used_temperature_c(estimator)
 
 
 def test_the_modelled_temperature_matches_a_measured_one() -> None:
-    samples = load_capture(HALF_C).rows
+    samples = load_capture(HALF_C_CAPTURE).rows
     measured_k = samples["temperature_c"] - samples["temperature_c"][0]
     samples["temperature_c"] = np.nan
-    error_k = rise_k(samples) - measured_k
+    error_k = temperature_rise_k(samples) - measured_k
     assert np.sqrt(np.mean(measured_k**2)) > 1.5
     assert np.sqrt(np.mean(error_k**2)) < 0.6
 
@@ -51,32 +52,32 @@ def test_a_pack_has_the_temperature_of_its_cells() -> None:
     samples["time_s"], samples["temperature_c"] = np.arange(900.0), np.nan
     samples["current_a"], samples["voltage_v"] = 5.0, 3.9
     cell = load_cell("nmc", 5.0)
-    of_cell = rise_k(samples, cell)
+    cell_rise_k = temperature_rise_k(samples, cell)
     samples["current_a"], samples["voltage_v"] = 2 * 5.0, 4 * 3.9
-    assert of_cell[-1] > 2.0
-    assert rise_k(samples, cell.pack(4, 2)) == pytest.approx(of_cell, rel=0.02)
+    assert cell_rise_k[-1] > 2.0
+    assert temperature_rise_k(samples, cell.pack(4, 2)) == pytest.approx(cell_rise_k, rel=0.02)
 
 
 def test_a_measured_temperature_replaces_the_model() -> None:
-    samples = load_capture(HALF_C).rows
+    samples = load_capture(HALF_C_CAPTURE).rows
     samples["temperature_c"] = 10.0
-    assert np.all(rise_k(samples) == 10.0 - REFERENCE_C)
+    assert np.all(temperature_rise_k(samples) == 10.0 - REFERENCE_C)
 
 
-@pytest.mark.parametrize("unseen_s", [COOLING_S, 8 * 3600.0, math.inf], ids=["minutes", "a night", "nobody knows"])
-def test_a_cell_cools_in_a_gap(unseen_s: float) -> None:
+@pytest.mark.parametrize("gap_s", [COOLING_S, 8 * 3600.0, math.inf], ids=["minutes", "a night", "unknown duration"])
+def test_a_cell_cools_in_a_gap(gap_s: float) -> None:
     estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
-    warm_k = loaded(estimator) - REFERENCE_C
+    warm_k = run_at_1_c(estimator) - REFERENCE_C
     assert warm_k > 2.0
-    estimator.resume(unseen_s)
+    estimator.resume(gap_s)
     estimator.step(0.0, 0.0, 3.9)
     estimator.step(1.0, 0.0, 3.9)
-    assert 0.0 <= taken_c(estimator) - REFERENCE_C < warm_k * (0.1 if unseen_s > COOLING_S else 0.9)
+    assert 0.0 <= used_temperature_c(estimator) - REFERENCE_C < warm_k * (0.1 if gap_s > COOLING_S else 0.9)
 
 
 def test_the_modelled_temperature_is_limited() -> None:
     estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
     for second in range(300):
         estimator.step(float(second), 99.0, 3.9)
-    assert REFERENCE_C < taken_c(estimator) <= MAX_MODELLED_C
+    assert REFERENCE_C < used_temperature_c(estimator) <= MAX_MODELLED_C
     assert np.isfinite(estimator.record["filter"]["soc"][0])

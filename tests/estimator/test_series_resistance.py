@@ -1,4 +1,4 @@
-"""R_s by (4.2) while samples arrive: steps 1 to 3 of the thesis live."""
+"""R_s by (4.2) of the thesis while samples arrive, as in steps 1 to 3 of its procedure."""
 
 import numpy as np
 import pytest
@@ -21,14 +21,17 @@ from bms_estimator.telemetry.parameters import make_parameters_payload
 from tests.calibration.simulated_load import TRUTH, capture, steps
 
 FIRST_SOC = 0.98
-WHOLE_BIN = 100
-"""Minimum number of samples of a compared bin. In bins with fewer samples, one sample beyond the edge changes the mean."""
+MIN_BIN_SAMPLES = 100
+"""Minimum number of samples of a compared bin. With fewer samples, a single sample beyond the edge changes the mean."""
 R_S_ERROR = 0.002
-"""Relative tolerance; the measured difference is 0.0008. The live estimate uses the present a1..a12, `adapt` uses their
-mean (3.19), and the live SOC is counted by the mean of two samples."""
+"""Relative tolerance of R_s. The measured difference is 0.0008.
+
+The live estimate uses the present a1..a12, `adapt` their mean by (3.19) of the thesis. The live SOC is counted with the mean
+current of two samples.
+"""
 
 
-def thesis() -> Estimator:
+def make_thesis_estimator() -> Estimator:
     """Return an estimator with the improved law and without the identifier."""
     return Estimator(
         TRUTH,
@@ -47,27 +50,27 @@ def load() -> SampleBlock:
 
 
 def test_live_r_s_equals_that_of_steps_2_and_3_on_a_capture(load: SampleBlock) -> None:
-    estimator = thesis()
+    estimator = make_thesis_estimator()
     estimator.run(load)
     offline = steps_2_and_3(TRUTH, [Start(load, FIRST_SOC)], LOWEST_SOC)
     run = predict(TRUTH, load, FIRST_SOC, a=offline.run.average, lowest_soc=LOWEST_SOC)
-    expected, found = series_resistance(TRUTH, run), summed(estimator.record[0])
-    live = dict(zip(np.floor(found.soc * BINS), found.r_s_ohm, strict=True))
+    expected, live_fit = series_resistance(TRUTH, run), summed(estimator.record[0])
+    live = dict(zip(np.floor(live_fit.soc * BINS), live_fit.r_s_ohm, strict=True))
     count = np.bincount(np.floor(run.soc * BINS).astype(int), np.abs(run.current_a) > 0.06, BINS)
     pairs = [
         (r, live[b])
         for b, r in zip(np.floor(expected.soc * BINS), expected.r_s_ohm, strict=True)
-        if count[int(b)] >= WHOLE_BIN
+        if count[int(b)] >= MIN_BIN_SAMPLES
     ]
     assert len(pairs) > 10
-    of_4_2, of_live = np.array(pairs).T
-    assert of_live == pytest.approx(of_4_2, rel=R_S_ERROR)
+    offline_ohm, live_ohm = np.array(pairs).T
+    assert live_ohm == pytest.approx(offline_ohm, rel=R_S_ERROR)
     soc = np.linspace(0.4, 0.95, 50)  # the capture ends at 0.37
-    assert fit_series_resistance(found, LOWEST_SOC)(soc) == pytest.approx(offline.r_s(soc), rel=R_S_ERROR)
+    assert fit_series_resistance(live_fit, LOWEST_SOC)(soc) == pytest.approx(offline.r_s(soc), rel=R_S_ERROR)
 
 
 def test_step_and_run_give_bit_identical_r_s(load: SampleBlock) -> None:
-    whole, single = thesis(), thesis()
+    whole, single = make_thesis_estimator(), make_thesis_estimator()
     trace = whole.run(load[:3000])
     for time_s, current_a, voltage_v, *_ in load[:3000].tolist():
         single.step(time_s, current_a, voltage_v)
@@ -77,8 +80,8 @@ def test_step_and_run_give_bit_identical_r_s(load: SampleBlock) -> None:
     assert np.isfinite(trace["r_s_ohm"][-1])
 
 
-def test_r_s_is_published_as_of_4_2_and_null_until_a_current_flows(load: SampleBlock) -> None:
-    estimator = thesis()
+def test_r_s_by_4_2_is_published_and_is_null_until_a_current_flows(load: SampleBlock) -> None:
+    estimator = make_thesis_estimator()
     estimator.run(load[:10])
     before = make_parameters_payload(estimator, 0.0).elements["r_s_ohm"]
     assert (before.value, before.valid) == (None, False)
@@ -103,7 +106,7 @@ def test_r_s_is_published_as_of_4_2_and_null_until_a_current_flows(load: SampleB
 
 
 def test_a_checkpoint_restores_the_sums(load: SampleBlock) -> None:
-    estimator, next_run = thesis(), thesis()
+    estimator, next_run = make_thesis_estimator(), make_thesis_estimator()
     estimator.run(load[:5000])
     saved = {name: field.copy() for name, field in fields(estimator.record)}
     assert restore_state(next_run, saved, 5.0) == ""
@@ -111,28 +114,28 @@ def test_a_checkpoint_restores_the_sums(load: SampleBlock) -> None:
     for name in sums:
         assert next_run.record["series_resistance"][name].tobytes() == saved[f"series_resistance.{name}"].tobytes()
     settle_s = float(next_run.settings_record["learning"]["settle_s"][0])
-    next_run.run(load[5000 : 5000 + int(settle_s) - 10])  # the load meanwhile is not known
+    next_run.run(load[5000 : 5000 + int(settle_s) - 10])  # the load in the gap is not known
     assert next_run.record["series_resistance"]["samples"].tobytes() == saved["series_resistance.samples"].tobytes()
     next_run.run(load[5000 + int(settle_s) - 10 :])
     assert next_run.record["series_resistance"]["samples"].sum() > saved["series_resistance.samples"].sum()
 
 
 def test_a_damaged_or_foreign_sum_is_not_restored(load: SampleBlock) -> None:
-    estimator = thesis()
+    estimator = make_thesis_estimator()
     estimator.run(load[:5000])
     saved = {name: field.copy() for name, field in fields(estimator.record)}
     assert not any(name.startswith("series_resistance.") for name in without_observer(saved))
     saved["series_resistance.product_va"][0, 5] = np.nan
-    assert restore_state(thesis(), saved, 5.0) == "product_va of the series_resistance is not finite"
+    assert restore_state(make_thesis_estimator(), saved, 5.0) == "product_va of the series_resistance is not finite"
 
 
 def test_nothing_is_summed_while_the_rc_voltages_are_unknown(load: SampleBlock) -> None:
     """After a start under load and after a gap, x2 and x3 depend on an unmeasured load."""
     under_load = int(np.argmax(np.abs(load["current_a"]) > 0.5))
-    estimator = thesis()
+    estimator = make_thesis_estimator()
     estimator.run(load[under_load : under_load + 1000])
     assert not estimator.record["series_resistance"]["samples"].any()
-    after_gap = thesis()
+    after_gap = make_thesis_estimator()
     after_gap.run(load[:1000])
     before = after_gap.record["series_resistance"]["samples"].sum()
     after_gap.run(load[1100:2000])
@@ -140,14 +143,18 @@ def test_nothing_is_summed_while_the_rc_voltages_are_unknown(load: SampleBlock) 
 
 
 def test_a_bin_discounts_old_samples(load: SampleBlock) -> None:
-    flowing = 5000 + int(np.argmax(np.abs(load["current_a"][5000:]) > 0.06))
-    estimator = thesis()
-    estimator.run(load[:flowing])
+    first_current = 5000 + int(np.argmax(np.abs(load["current_a"][5000:]) > 0.06))
+    estimator = make_thesis_estimator()
+    estimator.run(load[:first_current])
     sums = estimator.record["series_resistance"]
-    full = int(estimator.state["soc"][0] * BINS)
-    sums["samples"][0, full], sums["square_a2"][0, full], sums["product_va"][0, full] = MAX_SAMPLES, 2e4, 2e3
-    estimator.run(load[flowing : flowing + 1])
-    assert sums["samples"][0, full] == MAX_SAMPLES / 2 + 1
+    current_bin = int(estimator.state["soc"][0] * BINS)
+    sums["samples"][0, current_bin], sums["square_a2"][0, current_bin], sums["product_va"][0, current_bin] = (
+        MAX_SAMPLES,
+        2e4,
+        2e3,
+    )
+    estimator.run(load[first_current : first_current + 1])
+    assert sums["samples"][0, current_bin] == MAX_SAMPLES / 2 + 1
 
 
 def test_the_identifier_or_another_law_has_no_r_s_by_4_2(load: SampleBlock) -> None:

@@ -1,4 +1,4 @@
-"""Sources with little information: a sample each minute, coarse current, dead band, voltage and current at different times."""
+"""Sources with little information: a sample each minute, a coarse current, a dead band, and a delayed current."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from tests.estimator.simulated_cell import TRUTH, pulses
 MINUTE = Sampling(60.0)
 
 
-def steady(current_a: float, samples: int, step_s: float = 1.0) -> SampleBlock:
+def constant_load(current_a: float, samples: int, step_s: float = 1.0) -> SampleBlock:
     block = np.zeros(samples, dtype=SAMPLE)
     block["time_s"] = step_s * np.arange(samples)
     block["current_a"], block["voltage_v"], block["temperature_c"] = current_a, 3.7, 25.0
@@ -23,7 +23,7 @@ def steady(current_a: float, samples: int, step_s: float = 1.0) -> SampleBlock:
 
 
 @pytest.mark.parametrize(
-    ("source", "rmse", "std"),
+    ("source", "max_rmse", "max_std"),
     [
         (Source(1.0 / 60.0, 0.1, volt_step=0.01), 3.2, 5.0),
         (Source(1.0, 0.1, 2.5, capacity_ah=100.0, house=True, standby_a=2.0), 2.4, 2.5),
@@ -31,11 +31,11 @@ def steady(current_a: float, samples: int, step_s: float = 1.0) -> SampleBlock:
     ],
     ids=lambda value: value.name if isinstance(value, Source) else "",
 )
-def test_the_interval_coverage_holds_with_little_information(source: Source, rmse: float, std: float) -> None:
-    found = list(scores(source, seeds=range(1, 5)))
-    assert np.mean([s.cover for s in found]) >= 95.0
-    assert np.sqrt(np.mean([s.rmse**2 for s in found])) <= rmse
-    assert np.mean([s.std for s in found]) <= std
+def test_the_interval_coverage_holds_with_little_information(source: Source, max_rmse: float, max_std: float) -> None:
+    results = list(scores(source, seeds=range(1, 5)))
+    assert np.mean([s.cover for s in results]) >= 95.0
+    assert np.sqrt(np.mean([s.rmse**2 for s in results])) <= max_rmse
+    assert np.mean([s.std for s in results]) <= max_std
 
 
 def test_a_sample_each_minute_causes_no_gaps_with_late_or_lost_samples() -> None:
@@ -52,13 +52,13 @@ def test_a_sample_each_minute_causes_no_gaps_with_late_or_lost_samples() -> None
     assert estimator.state["gaps"][0] == 1
 
 
-def test_the_charge_between_samples_a_minute_apart_is_counted_as_straight_between_them() -> None:
-    samples = steady(0.0, 3, 70.0)
+def test_the_current_is_interpolated_linearly_between_samples_a_minute_apart() -> None:
+    samples = constant_load(0.0, 3, 70.0)
     samples["current_a"] = [0.0, 1.0, 1.0]
     estimator = Estimator(TRUTH, initial_soc=0.5, sampling=MINUTE)
     estimator.run(samples)
-    drawn = (0.5 * 70.0 + 70.0) / (3600.0 * TRUTH.cell.capacity_ah)
-    assert estimator.state["soc_coulomb"][0] == pytest.approx(0.5 - drawn)
+    discharged = (0.5 * 70.0 + 70.0) / (3600.0 * TRUTH.cell.capacity_ah)
+    assert estimator.state["soc_coulomb"][0] == pytest.approx(0.5 - discharged)
 
 
 @pytest.mark.parametrize(
@@ -75,15 +75,14 @@ def test_a_constant_reported_current_has_a_constant_error(sampling: Sampling, cu
     f["current_a"] = current_a
     variance_as2 = sum(rounding_charge_variance(f, p, sampling.period_s, current_a) for _ in range(3600))
     assert variance_as2 == pytest.approx((error_a * 3600.0) ** 2)
-    assert rounding_charge_variance(f, p, 1.0, current_a + 1.0) == pytest.approx(
-        0.1**2 / 12.0
-    )  # the error of another current is independent
+    # The error of a different current is independent.
+    assert rounding_charge_variance(f, p, 1.0, current_a + 1.0) == pytest.approx(0.1**2 / 12.0)
 
 
 def test_settings_of_a_board_have_the_default_resolution() -> None:
     block, _ = pulses(hours=0.5)
-    told, untold = Estimator(TRUTH, sampling=Settings().sampling), Estimator(TRUTH)
-    assert told.run(block).tobytes() == untold.run(block).tobytes()
+    configured, by_default = Estimator(TRUTH, sampling=Settings().sampling), Estimator(TRUTH)
+    assert configured.run(block).tobytes() == by_default.run(block).tobytes()
 
 
 def test_the_resolution_of_a_source_is_that_of_its_protocol_unless_configured() -> None:

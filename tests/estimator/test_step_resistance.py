@@ -1,4 +1,4 @@
-"""R_s follows from a current step between two samples, at any rate, for any cell file."""
+"""R_s from current steps between two samples, at any sample rate and for any cell file."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def pulses() -> tuple[SampleBlock, Floats]:
     return samples, soc
 
 
-def seen_by_all(samples: SampleBlock) -> Floats:
+def step_resistances(samples: SampleBlock) -> Floats:
     """Return the resistance of each step of the capture from one sample to the next [ohm]."""
     change_a, change_v = np.diff(samples["current_a"]), np.diff(samples["voltage_v"])
     steps = np.abs(change_a) >= MIN_A
@@ -51,22 +51,24 @@ def seen_by_all(samples: SampleBlock) -> Floats:
 @pytest.mark.parametrize("rate_hz", [1, 10, 100])
 def test_r_s_matches_the_resistance_of_current_steps(pulses, file: str, rate_hz: int) -> None:
     samples = pulses[0][:: FULL_HZ // rate_hz].copy()
-    shown_ohm = np.median(seen_by_all(samples))
+    step_ohm = np.median(step_resistances(samples))
     noise_v = np.random.default_rng(10).normal(0.0, 1e-3, samples.size)
     samples["voltage_v"] += noise_v
     estimator = Estimator(cell_file(FILES[file]), initial_soc=0.5)
     trace = estimator.run(samples)
     late = trace["time_s"] > 0.5 * trace["time_s"][-1]
     r_s, std = trace["r_s_ohm"][late], trace["r_s_std_ohm"][late]
-    # at 1 Hz a step includes a part of the fastest RC pairs, which a generic file does not describe in the cold
-    assert np.abs(r_s / shown_ohm - 1.0).max() < (0.12 if (file, rate_hz) == ("generic", 1) else 0.1)
-    assert (np.abs(r_s - shown_ohm) < 2.0 * std).mean() > 0.95
+    # At 1 Hz a step includes a part of the fastest RC pairs, which a generic file does not describe at 15 C.
+    assert np.abs(r_s / step_ohm - 1.0).max() < (0.12 if (file, rate_hz) == ("generic", 1) else 0.1)
+    assert (np.abs(r_s - step_ohm) < 2.0 * std).mean() > 0.95
     assert (std < 0.2 * r_s).all()
 
 
-def learned_of(rows: list[tuple[float, float, float]]) -> float:
-    """Return ln(R_s / R_0 of the file) after a minute without current and these rows: time [s], current [A], voltage
-    [V]."""
+def learned_ln_ratio(rows: list[tuple[float, float, float]]) -> float:
+    """Return ln(R_s / R_0 of the file) after a minute without current and these rows.
+
+    A row is time [s], current [A] and voltage [V].
+    """
     estimator = Estimator(cell_file(FILES["generic"]), initial_soc=0.5)
     for n in range(60):
         estimator.step(float(n), 0.0, 3.7)
@@ -75,19 +77,19 @@ def learned_of(rows: list[tuple[float, float, float]]) -> float:
     return float(estimator.record[0]["filter"]["step"]["ln_ratio"])
 
 
-@pytest.mark.parametrize("back_a", [0.0, 0.004])
-def test_an_interrupted_step_does_not_change_r_s(back_a: float) -> None:
+@pytest.mark.parametrize("return_a", [0.0, 0.004])
+def test_an_interrupted_step_does_not_change_r_s(return_a: float) -> None:
     """A rejected sample or a clock set back lies between the current step and its return."""
-    not_believed = [(60.0, 3.0, 3.55), (60.5, 0.0, 2.6), (61.0, back_a, 3.69)]
-    set_back = [(60.0, 3.0, 3.55), (59.0, 0.0, 3.7), (60.0, back_a, 3.7)]
-    assert learned_of(not_believed) == learned_of(set_back) == 0.0
+    rejected_sample = [(60.0, 3.0, 3.55), (60.5, 0.0, 2.6), (61.0, return_a, 3.69)]
+    clock_set_back = [(60.0, 3.0, 3.55), (59.0, 0.0, 3.7), (60.0, return_a, 3.7)]
+    assert learned_ln_ratio(rejected_sample) == learned_ln_ratio(clock_set_back) == 0.0
 
 
 def test_without_current_steps_r_s_is_that_of_the_filter(pulses) -> None:
-    smooth = pulses[0][::FULL_HZ].copy()
-    smooth["current_a"] = OXIDE.capacity_ah * (0.5 + 0.4 * np.sin(smooth["time_s"] / 200.0))
+    without_steps = pulses[0][::FULL_HZ].copy()
+    without_steps["current_a"] = OXIDE.capacity_ah * (0.5 + 0.4 * np.sin(without_steps["time_s"] / 200.0))
     estimator = Estimator(cell_file(FILES["generic"]), initial_soc=0.7)
-    estimator.run(smooth)
+    estimator.run(without_steps)
     f, e = estimator.record[0]["filter"], estimator.record[0]["elements"]
     assert f["step"]["ln_ratio"] == 0.0
     assert e["ln_variance"][R_S] > f["covariance"][f["best"], LN_R0, LN_R0]

@@ -1,4 +1,4 @@
-"""Kills, restarts and gaps: unmeasured changes are inside the interval, and known values are kept."""
+"""Kills, restarts and gaps: the interval includes unmeasured changes, and certain values are preserved."""
 
 import numpy as np
 import pytest
@@ -10,26 +10,29 @@ from bms_estimator.settings.observer import IdentifierSettings
 from tests.estimator.simulated_cell import TRUTH, measured, pulses
 
 FULL_LOAD_A = 1.5 * TRUTH.cell.capacity_ah
-SEEN_S = 900
+SCORED_AFTER_S = 900
 
 
-def killed(block: SampleBlock, every_s: int, age_s: int, down_s: int, initial_soc: float) -> np.ndarray:
-    """Return the trace of an estimator that continues, each time, ``down_s`` later from its state ``age_s`` before."""
-    estimator, traces, begin = Estimator(TRUTH, initial_soc=initial_soc), [], 0
-    while begin < block.size:
-        traces.append(estimator.run(block[begin : begin + every_s - age_s]).copy())
-        kept = estimator.record.copy()
-        traces.append(estimator.run(block[begin + every_s - age_s : begin + every_s]).copy())
-        estimator.record[...] = kept
+def run_with_kills(block: SampleBlock, every_s: int, age_s: int, down_s: int, initial_soc: float) -> np.ndarray:
+    """Return the trace of an estimator that is killed every ``every_s``.
+
+    After each kill it resumes ``down_s`` later from a checkpoint that is ``age_s`` older than the kill.
+    """
+    estimator, traces, first = Estimator(TRUTH, initial_soc=initial_soc), [], 0
+    while first < block.size:
+        traces.append(estimator.run(block[first : first + every_s - age_s]).copy())
+        checkpoint = estimator.record.copy()
+        traces.append(estimator.run(block[first + every_s - age_s : first + every_s]).copy())
+        estimator.record[...] = checkpoint
         estimator.resume(float(age_s + down_s))
-        begin += every_s + down_s
+        first += every_s + down_s
     return np.concatenate(traces)
 
 
-def outside(trace: np.ndarray, true_soc: np.ndarray) -> float:
-    """Return the share of samples, after a quarter of an hour, whose true SOC is outside two standard deviations."""
+def fraction_outside(trace: np.ndarray, true_soc: np.ndarray) -> float:
+    """Return the fraction of samples after ``SCORED_AFTER_S`` whose true SOC is outside two standard deviations."""
     error = trace["soc"] - true_soc[trace["time_s"].astype(int)]
-    return float(np.mean((np.abs(error) > 2.0 * trace["soc_std"])[trace["time_s"] >= SEEN_S]))
+    return float(np.mean((np.abs(error) > 2.0 * trace["soc_std"])[trace["time_s"] >= SCORED_AFTER_S]))
 
 
 @pytest.mark.parametrize("initial_soc", [0.7, 1.0])
@@ -39,13 +42,13 @@ def test_the_true_soc_stays_in_the_interval_after_kills_under_load(load: str, ag
     """The process is killed every 100 s, with checkpoints up to a minute old and a downtime of 12 s."""
     constant = np.full(2000, FULL_LOAD_A)
     block, true_soc = pulses() if load == "pulses" else measured(constant, 0.9, np.random.default_rng(1))
-    assert outside(killed(block, 100, age_s, 12, initial_soc), true_soc) < 0.02
+    assert fraction_outside(run_with_kills(block, 100, age_s, 12, initial_soc), true_soc) < 0.02
 
 
 def test_a_crash_loop_before_convergence_does_not_reduce_the_std() -> None:
-    """Each start measures the same polarization, which is no independent information."""
+    """Each start measures the voltage under the same polarization, so that the information is not independent."""
     block, true_soc = measured(np.full(1500, FULL_LOAD_A), 0.9, np.random.default_rng(2))
-    assert outside(killed(block, 40, 2, 12, 0.7), true_soc) < 0.02
+    assert fraction_outside(run_with_kills(block, 40, 2, 12, 0.7), true_soc) < 0.02
 
 
 @pytest.mark.parametrize("every_s", [60, 600, 3600])
@@ -53,24 +56,24 @@ def test_restarts_at_rest_do_not_change_the_soc(every_s: int) -> None:
     """An error of the OCV is not independent between restarts, for any number of restarts."""
     block = measured(np.zeros(4 * 3600), 0.6, np.random.default_rng(3))[0]
     block["voltage_v"] += 0.02
-    straight = Estimator(TRUTH, initial_soc=0.5).run(block)[-1]
-    again = killed(block, every_s, 1, 3, 0.5)[-1]
-    assert again["soc"] == pytest.approx(straight["soc"], abs=1e-3)
-    assert again["soc_std"] == pytest.approx(straight["soc_std"], rel=0.05)
+    uninterrupted = Estimator(TRUTH, initial_soc=0.5).run(block)[-1]
+    restarted = run_with_kills(block, every_s, 1, 3, 0.5)[-1]
+    assert restarted["soc"] == pytest.approx(uninterrupted["soc"], abs=1e-3)
+    assert restarted["soc_std"] == pytest.approx(uninterrupted["soc_std"], rel=0.05)
 
 
-@pytest.mark.parametrize("unseen_s", [40, 400, 1500])
+@pytest.mark.parametrize("gap_s", [40, 400, 1500])
 @pytest.mark.parametrize("restart", [False, True], ids=["gap", "restart"])
-def test_the_true_soc_after_a_load_in_a_gap_is_inside_the_interval(unseen_s: int, restart: bool) -> None:
+def test_the_true_soc_after_a_load_in_a_gap_is_inside_the_interval(gap_s: int, restart: bool) -> None:
     """The cell rests before and after the gap, and the earlier load flows in the gap."""
-    load_a = np.repeat([0.0, 3.0, 0.0, 3.0, 0.0], [1200, 1200, 1200, unseen_s, 600])
+    load_a = np.repeat([0.0, 3.0, 0.0, 3.0, 0.0], [1200, 1200, 1200, gap_s, 600])
     block, true_soc = measured(load_a, 0.9, np.random.default_rng(4))
     estimator = Estimator(TRUTH, initial_soc=0.9)
     estimator.run(block[:3600])
     if restart:
-        estimator.resume(unseen_s + 1.0)
-    after = estimator.run(block[3600 + unseen_s :])
-    error = np.abs(after["soc"] - true_soc[3600 + unseen_s :])
+        estimator.resume(gap_s + 1.0)
+    after = estimator.run(block[3600 + gap_s :])
+    error = np.abs(after["soc"] - true_soc[3600 + gap_s :])
     assert (error < 2.0 * after["soc_std"]).all()
     assert error[-1] < 0.02
 
@@ -79,28 +82,28 @@ def test_samples_before_a_gap_give_no_information_on_its_charge() -> None:
     """At 10 Hz an update uses the samples of a second. The gap may begin after any number of them."""
     load_a = np.repeat([0.3, 1.0, 0.3], [3000, 1000, 100]) * TRUTH.cell.capacity_ah
     block, true_soc = measured(load_a, 0.5, np.random.default_rng(8), step_s=0.1)
-    found = []
-    for begin in range(3000, 3010):
+    results = []
+    for first in range(3000, 3010):
         estimator = Estimator(TRUTH, initial_soc=0.5, identifier=IdentifierSettings(soc_std=0.02))
-        estimator.run(block[:begin])
+        estimator.run(block[:first])
         after = estimator.run(block[4000:])[0]
-        found.append((after["soc"], after["soc_std"]))
+        results.append((after["soc"], after["soc_std"]))
         assert abs(after["soc"] - true_soc[4000]) < 2.0 * after["soc_std"]
-    soc, std = np.transpose(found)
+    soc, std = np.transpose(results)
     assert np.ptp(soc) < 0.1 * std.mean()
     assert np.ptp(std) < 0.1 * std.mean()
 
 
 @pytest.mark.parametrize("period_s", [60, 120, 600, 1800])
 def test_slow_sampling_is_no_gap(period_s: int) -> None:
-    """Both ends of a step are measured, so the load between them is not the long-term one."""
+    """The current at both ends of a step is measured. Therefore the std of the long-term load is not added."""
     block, true_soc = measured(np.repeat([0.0, 0.3], [3600, 7 * 3600]), 0.95, np.random.default_rng(6))
     estimator = Estimator(TRUTH, initial_soc=0.95)
     trace = estimator.run(block[::period_s])
     error = np.abs(trace["soc"] - true_soc[::period_s])[trace["time_s"] >= 7200.0]
     assert error.max() < 0.01
     assert (error < 2.0 * trace["soc_std"][trace["time_s"] >= 7200.0]).all()
-    assert estimator.state["gaps"][0] == 1  # the first step: nothing is known of the pace
+    assert estimator.state["gaps"][0] == 1  # the first step, because the sample period is not known yet
 
 
 def test_missing_samples_after_a_restart_are_a_gap() -> None:

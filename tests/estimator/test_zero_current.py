@@ -1,4 +1,4 @@
-"""Information of a rest without current on the current sensor, and its limits."""
+"""Update of the current sensor's offset by samples that report no current, and cases without an update."""
 
 import numpy as np
 import pytest
@@ -14,27 +14,30 @@ from tests.estimator.anywhere.cases import LFP, Case, capture, load_a
 from tests.estimator.anywhere.score import score
 
 CAPACITY_AH = 3.0
-FIRST_STD_A, ZERO_STD_A = 0.007 * CAPACITY_AH, 0.001 * CAPACITY_AH
-FINE_A = 0.002
+INITIAL_STD_A, ZERO_STD_A = 0.007 * CAPACITY_AH, 0.001 * CAPACITY_AH
+SMALLEST_A = 0.002
 
 
-def offset_after(shown_a, sampling=None, smallest_a=FINE_A):
-    """Return the offset and its std [A] after ten minutes of load, with one report of ``smallest_a``, and two minutes
-    of ``shown_a``."""
+def offset_after(reported_a, sampling=None, smallest_a=SMALLEST_A):
+    """Return the offset and its std [A] after ten minutes of load and two minutes with the current ``reported_a``.
+
+    During the load the sensor reports ``smallest_a`` for 20 s, which limits its resolution.
+    """
     rng = np.random.default_rng(1)
     samples = np.zeros(720, dtype=SAMPLE)
     samples["time_s"] = np.arange(720.0)
     samples["current_a"][:600] = np.repeat(rng.uniform(1.0, 3.0, 30), 20)
     samples["current_a"][300:320] = smallest_a
-    samples["current_a"][600:] = shown_a
+    samples["current_a"][600:] = reported_a
     samples["voltage_v"], samples["temperature_c"] = 3.7 - 0.03 * samples["current_a"], 25.0
     estimator = Estimator(
         load_cell("nmc", CAPACITY_AH), initial_soc=0.6, **({"sampling": sampling} if sampling else {})
     )
-    return offset_found(estimator, samples)
+    return run_and_get_offset(estimator, samples)
 
 
-def offset_found(estimator, samples):
+def run_and_get_offset(estimator, samples):
+    """Return the offset and its std after the samples [A]."""
     estimator.run(samples)
     f = estimator.record[0]["filter"]
     return f["mean"][f["best"], OFFSET], np.sqrt(f["covariance"][f["best"], OFFSET, OFFSET])
@@ -54,22 +57,22 @@ def test_a_zero_current_is_detected_with_noise() -> None:
 
 
 @pytest.mark.parametrize(
-    "unknown",
+    "arguments",
     [
-        {"shown_a": 0.05},
-        {"shown_a": -0.05},
-        {"shown_a": 0.02},
-        {"shown_a": 0.0, "smallest_a": 0.3},
-        {"shown_a": 0.0, "sampling": Sampling(1.0, 0.0, 0.5)},
-        {"shown_a": 0.0, "sampling": Sampling(1.0, 0.1)},
+        {"reported_a": 0.05},
+        {"reported_a": -0.05},
+        {"reported_a": 0.02},
+        {"reported_a": 0.0, "smallest_a": 0.3},
+        {"reported_a": 0.0, "sampling": Sampling(1.0, 0.0, 0.5)},
+        {"reported_a": 0.0, "sampling": Sampling(1.0, 0.1)},
     ],
-    ids=["50 mA", "-50 mA", "20 mA", "nothing small was ever shown", "dead band", "coarse steps"],
+    ids=["50 mA", "-50 mA", "20 mA", "unknown resolution", "dead band", "coarse steps"],
 )
-def test_a_possible_load_or_hidden_current_gives_no_information(unknown) -> None:
-    assert offset_after(**unknown)[1] > 0.7 * FIRST_STD_A
+def test_a_possible_load_or_hidden_current_gives_no_information(arguments) -> None:
+    assert offset_after(**arguments)[1] > 0.7 * INITIAL_STD_A
 
 
-LOAD = (100, 1.0, 1), (20, FINE_A, 1), (100, 1.0, 1)
+LOAD = (100, 1.0, 1), (20, SMALLEST_A, 1), (100, 1.0, 1)
 
 
 def offset_of(steps, estimator=None):
@@ -85,33 +88,33 @@ def offset_of(steps, estimator=None):
     samples = np.zeros(len(times), dtype=SAMPLE)
     samples["time_s"], samples["current_a"] = times, currents
     samples["voltage_v"], samples["temperature_c"] = 3.7 - 0.03 * samples["current_a"], 25.0
-    return offset_found(estimator, samples)
+    return run_and_get_offset(estimator, samples)
 
 
 def test_samples_of_both_signs_are_no_rest() -> None:
     """Samples a minute apart have a mean of zero, as with changing clouds, but none reports zero."""
-    crossing = [(60, current_a, 60) for current_a in (2.0, -2.0) * 10]
-    assert offset_of(crossing)[1] > 0.7 * FIRST_STD_A
+    alternating = [(60, current_a, 60) for current_a in (2.0, -2.0) * 10]
+    assert offset_of(alternating)[1] > 0.7 * INITIAL_STD_A
 
 
 def test_a_single_small_sample_does_not_determine_the_resolution() -> None:
     """A single sample may be a mean over a step. Two successive ones are a current."""
-    edge = [(100, 1.0, 1), (1, FINE_A, 1), (100, 1.0, 1), (120, 0.0, 1)]
+    edge = [(100, 1.0, 1), (1, SMALLEST_A, 1), (100, 1.0, 1), (120, 0.0, 1)]
     estimators = [Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6) for _ in range(2)]
-    assert offset_of(edge, estimators[0])[1] > 0.7 * FIRST_STD_A
+    assert offset_of(edge, estimators[0])[1] > 0.7 * INITIAL_STD_A
     assert offset_of([*LOAD, *edge], estimators[1])[1] < 1.2 * ZERO_STD_A
 
 
-@pytest.mark.parametrize("behind", [(), LOAD], ids=["nothing shown", "shown again"])
-def test_the_resolution_is_determined_again_after_a_restart(behind) -> None:
+@pytest.mark.parametrize("later_steps", [(), LOAD], ids=["no small current", "small current again"])
+def test_the_resolution_is_determined_again_after_a_restart(later_steps) -> None:
     estimator = Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6)
     offset_of([*LOAD, (50, 0.0, 1)], estimator)
     estimator.resume(3600.0)
-    std_a = offset_of([*behind, (130, 0.0, 1)], estimator)[1]
-    if behind:
+    std_a = offset_of([*later_steps, (130, 0.0, 1)], estimator)[1]
+    if later_steps:
         assert std_a < 1.2 * ZERO_STD_A
     else:
-        assert std_a > 0.7 * FIRST_STD_A
+        assert std_a > 0.7 * INITIAL_STD_A
 
 
 def test_a_small_load_after_a_long_rest_is_not_averaged_with_the_rest() -> None:
@@ -120,8 +123,7 @@ def test_a_small_load_after_a_long_rest_is_not_averaged_with_the_rest() -> None:
 
 
 def test_a_constant_small_load_stays_in_the_interval() -> None:
-    """C/600 of an LFP cell on its plateau for a day, reported correctly: it may be an offset, and the interval
-    includes that."""
+    """An LFP cell on its plateau is discharged with C/600 for a day. The interval includes that the current is an offset."""
     hours, capacity_ah = 24.0, 100.0
     samples = np.zeros(round(3600.0 * hours) // 10, dtype=SAMPLE)
     samples["time_s"] = 10.0 * np.arange(samples.size)
@@ -130,8 +132,8 @@ def test_a_constant_small_load_stays_in_the_interval() -> None:
     samples["voltage_v"], samples["temperature_c"] = 3.29, 25.0
     estimator = Estimator(load_cell("lfp", capacity_ah), identifier=IdentifierSettings(soc_std=0.01), initial_soc=0.6)
     trace = estimator.run(samples)
-    drawn = np.cumsum(samples["current_a"]) * 10.0 / 3600.0 / capacity_ah
-    assert (np.abs(trace["soc"] - (0.6 - drawn)) < 2.0 * trace["soc_std"])[60:].all()
+    discharged = np.cumsum(samples["current_a"]) * 10.0 / 3600.0 / capacity_ah
+    assert (np.abs(trace["soc"] - (0.6 - discharged)) < 2.0 * trace["soc_std"])[60:].all()
 
 
 def test_a_direct_update_of_a_state_equals_the_kalman_update() -> None:
@@ -148,22 +150,24 @@ def test_a_direct_update_of_a_state_equals_the_kalman_update() -> None:
     assert (s["covariance"][0] == s["covariance"][0].T).all()
 
 
-def test_zero_current_rests_keep_the_soc_on_a_plateau() -> None:
-    """Nine hours of an LFP cell from full with five minutes of rest in each half hour. Without rests, the offset would
-    cause an error of up to 9 %."""
+def test_rests_without_current_limit_the_error_of_the_soc_on_a_plateau() -> None:
+    """An LFP cell is discharged from full for nine hours, with five minutes of rest in each half hour.
+
+    Without rests, the offset would cause an error of up to 9 %.
+    """
     case = Case("LFP, rests", **LFP, load_c=0.1, hours=9.0, soc=1.0, unseen_h=0.0, capacity=1.0, seed=32)
     seconds = round(3600.0 * case.hours)
     current_a = load_a(case, seconds)
     current_a[np.arange(seconds) % 1800 < 300] = 0.0
-    seen = capture(case, current_a)
+    recording = capture(case, current_a)
     stds = []
     for zero_std_c in (None, 1.0):
-        estimator = Estimator(seen.cell, identifier=IdentifierSettings(capacity_std=0.015), initial_soc=0.8)
+        estimator = Estimator(recording.cell, identifier=IdentifierSettings(capacity_std=0.015), initial_soc=0.8)
         if zero_std_c is not None:
             estimator.settings_record["filter"]["zero_std_c"] = zero_std_c
-        trace = estimator.run(seen.samples)
-        found = score(trace["time_s"], trace["soc"], trace["soc_std"], seen.soc)
-        stds.append(found.std)
-        assert found.rmse < 1.0
-        assert found.cover > 95.0
+        trace = estimator.run(recording.samples)
+        result = score(trace["time_s"], trace["soc"], trace["soc_std"], recording.soc)
+        stds.append(result.std)
+        assert result.rmse < 1.0
+        assert result.cover > 95.0
     assert stds[0] < 0.7 * stds[1]

@@ -1,4 +1,4 @@
-"""Fuel cell files: the shipped one, scaling, invalid files, writing and reading."""
+"""Fuel cell files: the shipped file, scaling, invalid files, writing and reading."""
 
 from pathlib import Path
 
@@ -17,6 +17,7 @@ PEM = load_fuel_cell("pem_30w")
 
 
 def voltage_v(model: FuelCellModel, current_a: float) -> float:
+    """Return the voltage of the polarisation curve at ``current_a`` [V]."""
     return float(polarisation(model.a, np.zeros(8), np.array([current_a]), np.array([np.nan]))[0][0])
 
 
@@ -54,12 +55,12 @@ def test_a_written_file_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     a = PEM.a
     a[1 : 1 + len(NAMES)] *= 1.25
-    found = PEM.identified(a, {"r_ohm": 0.0123456})
-    write_cell(path, found, ["a remark"])
-    again = load_any(path)
-    assert again == found
-    assert again.a == pytest.approx(a, rel=1e-4)
-    assert again.std == {"r_ohm": 0.012}
+    identified = PEM.identified(a, {"r_ohm": 0.0123456})
+    write_cell(path, identified, ["a remark"])
+    read_back = load_any(path)
+    assert read_back == identified
+    assert read_back.a == pytest.approx(a, rel=1e-4)
+    assert read_back.std == {"r_ohm": 0.012}
     assert is_fuel_cell(path)
 
 

@@ -19,9 +19,11 @@ from bms_estimator.sources.captures.replay import load_capture
 OHM_AH_10_S = {"lfp": 0.045, "nmc": 0.13, "nca": 0.13, "lco": 0.13, "lmo": 0.08, "lto": 0.016}
 """Typical resistance after 10 s at SOC 0.5 [ohm Ah], with a tolerance of 20 %. A cell of 100 Ah LFP has 0.45 mohm."""
 TAU_S = np.array([1.0, 6.0, 30.0, 120.0, 500.0, 2000.0])
+"""Time constants of the ladder [s]."""
 
 
-def curve(name):
+def ocv_table(name):
+    """Return the OCV table of a generic cell."""
     ocv = load_cell(name, 1.0).ocv
     assert isinstance(ocv, TableOcv)
     return ocv
@@ -46,11 +48,11 @@ def test_a_generic_cell_is_plausible_and_runs(name):
 
 @pytest.mark.parametrize("name", generic_cells())
 def test_the_curve_of_a_generic_cell_increases_and_has_an_error(name):
-    ocv = curve(name)
+    ocv = ocv_table(name)
     soc = np.array(ocv.soc)
     assert (soc[0], soc[-1]) == (0.0, 1.0)
-    fine = PchipInterpolator(soc, ocv.ocv_v)(np.linspace(0.0, 1.0, 1001))
-    assert (np.diff(fine) > 0).all()
+    ocv_v = PchipInterpolator(soc, ocv.ocv_v)(np.linspace(0.0, 1.0, 1001))
+    assert (np.diff(ocv_v) > 0).all()
     middle = (soc >= 0.2) & (soc <= 0.9)
     error_v = np.array(ocv.error_v)[middle]
     # curves of one chemistry differ by more than a few millivolts, but by less than 100 mV
@@ -78,8 +80,10 @@ def test_the_elements_of_a_generic_cell_are_equivalent_to_its_ladder(name):
 @pytest.mark.parametrize("name", generic_cells())
 def test_the_resistance_of_a_generic_cell_is_typical(name):
     ladder = load_cell(name, 1.0).ladder
-    half = ladder.soc.index(0.5)
-    ohm = np.array([weak[half] + strong[half] for weak, strong in zip(ladder.weak_ohm, ladder.strong_ohm, strict=True)])
+    index = ladder.soc.index(0.5)
+    ohm = np.array(
+        [weak[index] + strong[index] for weak, strong in zip(ladder.weak_ohm, ladder.strong_ohm, strict=True)]
+    )
     assert ohm[0] + ohm[1:] @ -np.expm1(-10.0 / TAU_S) == pytest.approx(OHM_AH_10_S[name], rel=0.2)
 
 
@@ -95,27 +99,30 @@ def test_capacity_scales_a_generic_cell_like_cells_in_parallel(name):
     assert (large.ladder.std, large.ladder.error_v) == (small.ladder.std, small.ladder.error_v)
 
 
-def within(name, soc, ocv_v):
+def deviation_in_std(name, soc, ocv_v):
     """Return the distances of a real cell's curve from the generic one, in standard deviations."""
-    ocv = curve(name)
+    ocv = ocv_table(name)
     return np.abs(ocv_v - PchipInterpolator(ocv.soc, ocv.ocv_v)(soc)) / np.interp(soc, ocv.soc, ocv.error_v)
 
 
-def branch(path, sign):
+def charge_and_voltage(path, sign):
     """Return the charge since the first sample of a load of this sign [Ah], and the voltage [V]."""
     capture = load_capture(path)
     charge_ah = np.cumsum(capture["current_a"] * np.diff(capture["time_s"], prepend=capture["time_s"][0])) / 3600
-    under = np.sign(np.round(capture["current_a"], 3)) == sign
-    return np.abs(charge_ah[under] - charge_ah[under][0]), capture["voltage_v"][under]
+    is_load = np.sign(np.round(capture["current_a"], 3)) == sign
+    return np.abs(charge_ah[is_load] - charge_ah[is_load][0]), capture["voltage_v"][is_load]
 
 
-def test_error_covers_the_leaf_and_the_lg_m50(data):
+def test_the_declared_error_of_the_ocv_covers_the_leaf_and_the_lg_m50(data):
     with (data / "lgm50" / "ocv_25c.csv").open() as file:
         soc, ocv_v = np.array([(float(row["soc"]), float(row["ocv_v"])) for row in csv.DictReader(file)]).T
     leaf = load_cell("leaf").ocv
-    for apart, least in ((within("nmc", soc, ocv_v), 0.95), (within("lmo", np.array(leaf.soc), leaf.ocv_v), 0.9)):
-        assert (apart <= 2.0).mean() >= least
-        assert apart.mean() > 0.3  # the error is not much too large
+    for deviation, min_fraction in (
+        (deviation_in_std("nmc", soc, ocv_v), 0.95),
+        (deviation_in_std("lmo", np.array(leaf.soc), leaf.ocv_v), 0.9),
+    ):
+        assert (deviation <= 2.0).mean() >= min_fraction
+        assert deviation.mean() > 0.3  # the error is not much too large
 
 
 @pytest.mark.parametrize(
@@ -126,15 +133,18 @@ def test_error_covers_the_leaf_and_the_lg_m50(data):
         ("lfp", "a123/c30_dis_p25", "a123/c30_chg_p25"),
     ],
 )
-def test_error_covers_cells_that_were_not_used_for_the_curve(name, discharge, charge, shared_data):
-    """The true curve is the mean of a slow discharge and charge, with SOC by the charge of each."""
+def test_the_declared_error_of_the_ocv_covers_cells_that_were_not_used_for_it(name, discharge, charge, shared_data):
+    """The true OCV is the mean of a slow discharge and a slow charge, each with SOC by its own charge."""
     soc = np.linspace(0.0, 1.0, 101)
-    down_ah, down_v = branch(shared_data / f"{discharge}.csv.gz", 1)
-    up_ah, up_v = branch(shared_data / f"{charge}.csv.gz", -1)
-    ocv_v = (np.interp(1 - soc, down_ah / down_ah[-1], down_v) + np.interp(soc, up_ah / up_ah[-1], up_v)) / 2
-    apart = within(name, soc, ocv_v)
-    assert (apart <= 2.0).mean() >= 0.95
-    assert apart.mean() > 0.3
+    discharged_ah, discharge_v = charge_and_voltage(shared_data / f"{discharge}.csv.gz", 1)
+    charged_ah, charge_v = charge_and_voltage(shared_data / f"{charge}.csv.gz", -1)
+    ocv_v = (
+        np.interp(1 - soc, discharged_ah / discharged_ah[-1], discharge_v)
+        + np.interp(soc, charged_ah / charged_ah[-1], charge_v)
+    ) / 2
+    deviation = deviation_in_std(name, soc, ocv_v)
+    assert (deviation <= 2.0).mean() >= 0.95
+    assert deviation.mean() > 0.3
 
 
 def test_a_generic_cell_without_capacity_causes_an_error_with_remedy():
@@ -150,7 +160,7 @@ def test_an_invalid_capacity_is_rejected(capacity_ah):
 
 def test_a_given_capacity_replaces_only_the_capacity_of_a_cell_file():
     """An aged cell has a smaller capacity and the measured resistances."""
-    aged, new = load_cell("leaf", 24.0), load_cell("leaf")
-    assert aged.cell.capacity_ah == 24.0
-    assert aged.model_copy(update={"cell": new.cell}) == new
-    assert aged.cell.model_copy(update={"capacity_ah": new.cell.capacity_ah}) == new.cell
+    aged_cell, new_cell = load_cell("leaf", 24.0), load_cell("leaf")
+    assert aged_cell.cell.capacity_ah == 24.0
+    assert aged_cell.model_copy(update={"cell": new_cell.cell}) == new_cell
+    assert aged_cell.cell.model_copy(update={"capacity_ah": new_cell.cell.capacity_ah}) == new_cell.cell

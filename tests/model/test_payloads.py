@@ -1,3 +1,5 @@
+"""JSON of payloads, which is built once for each object."""
+
 from bms_estimator.model.payloads import Alarm
 
 RAISED = Alarm(

@@ -1,4 +1,7 @@
-"""Lemma 4.1.3, (2.11) and (2.12) against results by hand from the printed bounds and weights."""
+"""Limits by Lemma 4.1.3 and deltas by (2.11) and (2.12) of the thesis, compared with results by hand.
+
+The results by hand use the printed bounds and weights. Errata are those of ``bms_estimator.reports.errata``.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values
 
 TABLE_4 = {1: 0.2995, 3: 0.04485, 6: 0.04990, 13: 0.1495, 15: 0.06970}
-"""(100 upper + lower) / 101."""
+"""Limits by hand: (100 upper + lower) / 101."""
 TABLES_5_AND_10 = {
     1: 0.5500,
     2: 30.00,
@@ -23,18 +26,20 @@ TABLES_5_AND_10 = {
     11: 27.50,
     12: 3667.0,
 }
-"""(x upper + y lower) / (x + y); a8 with the weights of E4, a5 of Table 10 as E5."""
+"""Limits by hand: (x upper + y lower) / (x + y). The weights of a8 are those of erratum 4, and a5 of Table 10 that of
+erratum 5."""
 INFERRED = {("5", 7): 759.3, ("10", 7): 759.3, ("10", 4): 6.250}
-"""With the weights of E24 and E32."""
+"""Limits by hand, by table and index, with the weights of errata 24 and 32."""
 TABLE_5 = "0.5555 29.9996 0.0557 5.6095 149.9983 0.0630 759.2573 10.6712 684.61 5999.6 27.5014 3666.6"
-"""Digits of the printed estimates."""
+"""Printed estimates of a1..a12 in Table 5, with all digits."""
 TABLE_10 = (0.5505, 30.0475, 0.0551, 6.2585, 150.0, 0.0551, 760.2266, 10.7686, 685.7457, 6036.4, 27.5422, 3696.0)
-"""a5 is printed as 30 (E5)."""
+"""Printed estimates of a1..a12 in Table 10, but a5 as in erratum 5 instead of 30."""
 WORST_PERCENT = 0.28
-"""a8 of Table 10."""
+"""Largest difference between a computed mean and Table 10, that of a8 [%]."""
 
 
-def digits(value):
+def round_to_four_digits(value):
+    """Round a number to four significant digits."""
     return float(f"{value:.4g}")
 
 
@@ -42,26 +47,26 @@ def digits(value):
 def test_limits_of_table_4_to_four_digits(index, expected):
     upper, lower, *_ = printed_values.TABLE_4[index]
     x, y = printed_values.TABLE_4_WEIGHTS
-    assert digits((x * upper + y * lower) / (x + y)) == expected
+    assert round_to_four_digits((x * upper + y * lower) / (x + y)) == expected
 
 
 @pytest.mark.parametrize("cell", ["chen_mora", "thunder_power_6s"])
 @pytest.mark.parametrize(("index", "expected"), TABLES_5_AND_10.items())
 def test_limits_of_tables_5_and_10_to_four_digits(cell, index, expected):
     for table in ("5", "10"):
-        assert digits(printed_values.bounds(table, index).limit) == INFERRED.get((table, index), expected)
-    assert digits(load_cell(cell).bounds(index).limit) == expected
+        assert round_to_four_digits(printed_values.bounds(table, index).limit) == INFERRED.get((table, index), expected)
+    assert round_to_four_digits(load_cell(cell).bounds(index).limit) == expected
 
 
 def test_printed_weights_of_a8_have_another_limit():
     upper, lower, x, y = printed_values.BOUNDS[8]
     assert (upper, lower, x, y) == (30, 1, 50, 10)
-    assert digits((x * upper + y * lower) / (x + y)) == 25.17  # E4
+    assert round_to_four_digits((x * upper + y * lower) / (x + y)) == 25.17  # erratum 4
 
 
 @pytest.mark.parametrize(("index", "digits"), list(enumerate(TABLE_5.split(), 1)))
 def test_means_from_the_first_sample_reproduce_table_5(index, digits):
-    """Only bounds, initial values and the weights of E32 are used, and no data (E3)."""
+    """Only bounds, initial values and the weights of erratum 32 are used, and no data (erratum 3)."""
     assert printed_values.TABLE_5[index][1] == float(digits)
     decimals = len(digits.partition(".")[2])
     assert f"{printed_values.mean_from_start('5', index):.{decimals}f}" == digits
@@ -71,7 +76,7 @@ def test_means_from_the_first_sample_reproduce_table_5(index, digits):
 @pytest.mark.parametrize("index", [7, 8, 10, 11, 12])
 def test_printed_weights_do_not_give_the_digits_of_table_5(index):
     upper, lower, x, y = printed_values.BOUNDS[index]
-    x, y = {7: (70.0, 65.0), 8: (10.0, 20.0)}.get(index, (x, y))  # the right limit, by E24 and E4
+    x, y = {7: (70.0, 65.0), 8: (10.0, 20.0)}.get(index, (x, y))  # weights with the correct limit, by errata 24 and 4
     limit = (x * upper + y * lower) / (x + y)
     mean = limit + (printed_values.initial("5", index) - limit) / ((x + y) * printed_values.START_MEAN_S["5"])
     decimals = printed_values.DECIMALS_5[index]
@@ -81,7 +86,7 @@ def test_printed_weights_do_not_give_the_digits_of_table_5(index):
 
 
 def test_no_other_weights_up_to_800_give_the_digits_of_a7():
-    """E32: 196, 182 is the only pair of integers for the time that a4 allows."""
+    """By erratum 32, 196 and 182 are the only pair of integers for the time that follows from a4."""
     seconds, start, digits = (328.12, 328.4), 510.0, 759.2573
     x, y = (grid.ravel() for grid in np.mgrid[1:801, 1:801])
     limit = (1000.0 * x + 500.0 * y) / (x + y)
@@ -100,13 +105,13 @@ def test_worst_mean_of_table_10():
 
 
 def test_free_parameters_are_counted_from_the_inferred_weights():
-    """Free are the time, the rate of each inferred pair, and its ratio unless that is printed."""
+    """Free parameters are the time, the rate of each inferred pair, and its ratio unless the ratio is printed."""
     for table, pairs in printed_values.INFERRED_WEIGHTS.items():
         ratios = [x / y != printed_values.BOUNDS[i][2] / printed_values.BOUNDS[i][3] for i, (x, y) in pairs.items()]
         assert printed_values.FREE_PARAMETERS[table] == 1 + len(pairs) + sum(ratios)
 
 
-def test_weights_of_e24_give_the_printed_estimates_and_the_printed_weights_do_not():
+def test_weights_of_erratum_24_give_the_printed_estimates_and_the_printed_weights_do_not():
     for table, index, mean, estimate in (
         ("5", 7, 759.2573, 759.2573),
         ("10", 7, 760.1875, 760.2266),
@@ -122,7 +127,7 @@ def test_weights_of_e24_give_the_printed_estimates_and_the_printed_weights_do_no
         assert abs(as_printed / estimate - 1.0) > 1e-3
 
 
-def test_deltas_of_e13():
+def test_deltas_of_erratum_13():
     true, estimated, pack = load_cell("chen_mora").a, printed_values.tables_5_and_6(), printed_values.tables_8_to_10()
     for a, delta_1, delta_2 in (
         (true, 0.005013, 0.011156),

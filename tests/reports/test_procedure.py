@@ -1,4 +1,4 @@
-"""Procedure of chapter 5 on captures: use of each capture, requirements, results."""
+"""Procedure of chapter 5 of the thesis on captures: use of each capture, requirements, and results."""
 
 import re
 from pathlib import Path
@@ -19,7 +19,7 @@ from tests.calibration.simulated_load import TRUTH, capture, constant, steps
 from tests.calibration.simulated_relaxation import relaxation
 
 CAPACITY_AH = TRUTH.cell.capacity_ah
-SERVES = {"relaxation": Kind.RELAXATION, "slow": Kind.CONSTANT, "constant": Kind.CONSTANT, "steps": Kind.STEPS}
+KIND_BY_NAME = {"relaxation": Kind.RELAXATION, "slow": Kind.CONSTANT, "constant": Kind.CONSTANT, "steps": Kind.STEPS}
 DOCUMENT = Path(__file__).parents[1] / "benchmarks" / "chapter5_results.md"
 
 
@@ -33,56 +33,60 @@ def samples():
     }
 
 
-def on(samples):
+def make_procedure(samples):
+    """Return the procedure on captures of ``TRUTH``."""
     captures = [Capture(name, kind_of(name, block, CAPACITY_AH), block) for name, block in samples.items()]
     return Procedure(TRUTH, captures, 1e-3)
 
 
 @pytest.fixture(scope="module")
-def protocol(samples):
-    return on(samples)
+def procedure(samples):
+    return make_procedure(samples)
 
 
 @pytest.fixture(scope="module")
-def leaf(data):
-    """Return the procedure on a capture with rests and on the 1C discharge of a longer capture."""
+def leaf_procedure(data):
+    """Return the procedure on two captures of a Leaf cell: one with rests, and the 1 C discharge of a longer one."""
     hppc, cc = (load_capture(data / "leaf" / f"{name}.csv.gz").rows for name in ("hppc_25c_from_full", "cc_1c"))
     captures = [Capture("hppc", Kind.RELAXATION, hppc), Capture("cc", Kind.CONSTANT, chapter5.discharge(cc, 0.3))]
     return Procedure(load_cell("leaf"), captures, 1e-3)
 
 
 @pytest.mark.parametrize("noise_a", [0.0, 0.01, 0.05])
-@pytest.mark.parametrize("name", SERVES)
-def test_kind_of_a_capture(samples, name, noise_a):
+@pytest.mark.parametrize("name", KIND_BY_NAME)
+def test_the_kind_of_a_capture_is_recognized(samples, name, noise_a):
     block = samples[name].copy()
     block["current_a"] += noise_a * np.random.default_rng(0).standard_normal(block.size)
-    assert kind_of(name, block, CAPACITY_AH) is SERVES[name]
+    assert kind_of(name, block, CAPACITY_AH) is KIND_BY_NAME[name]
 
 
-def test_start_of_each_capture(protocol):
-    start = {c.name: protocol.initial_soc(c) for c in protocol.captures}
+def test_the_initial_soc_of_each_capture_is_determined(procedure):
+    start = {c.name: procedure.initial_soc(c) for c in procedure.captures}
     assert (start["relaxation"], start["constant"]) == (1.0, 1.0)
     assert start["steps"] == pytest.approx(0.98, abs=0.01)
 
 
-def test_frozen_model_is_validated_on_other_loads(protocol):
-    """(5.3) as in Table 11. The OCV of ``TRUTH`` is not of the form (2.10), which causes most of the error."""
-    assert protocol.smallest.name == "slow"
-    assert [c.name for c in protocol.validating] == ["constant", "steps"]
-    found = {name: (run.mean_percent, run.max_percent) for name, run in protocol.dynamic.items()}
-    assert found["constant"] == pytest.approx((0.221, 0.687), abs=0.01)
-    assert found["steps"] == pytest.approx((0.224, 1.106), abs=0.01)
+def test_frozen_model_is_validated_on_other_loads(procedure):
+    """The errors are those of (5.3) of the thesis, as in its Table 11.
+
+    Most of the error is due to the OCV of ``TRUTH``, which is not of the form (2.10).
+    """
+    assert procedure.smallest.name == "slow"
+    assert [c.name for c in procedure.validating] == ["constant", "steps"]
+    results = {name: (run.mean_percent, run.max_percent) for name, run in procedure.dynamic.items()}
+    assert results["constant"] == pytest.approx((0.221, 0.687), abs=0.01)
+    assert results["steps"] == pytest.approx((0.224, 1.106), abs=0.01)
 
 
-def test_static_model_is_worse_on_every_load(protocol):
-    found = {name: run.mean_percent for name, run in protocol.static.items()}
-    assert found == pytest.approx({"slow": 0.331, "constant": 0.477, "steps": 0.262}, abs=0.01)
-    assert all(found[name] > run.mean_percent for name, run in protocol.dynamic.items())
+def test_static_model_is_worse_on_every_load(procedure):
+    results = {name: run.mean_percent for name, run in procedure.static.items()}
+    assert results == pytest.approx({"slow": 0.331, "constant": 0.477, "steps": 0.262}, abs=0.01)
+    assert all(results[name] > run.mean_percent for name, run in procedure.dynamic.items())
 
 
-def test_soc_by_interpolation_is_near_the_counted_one(protocol):
-    soc, e_o = protocol.interpolated("constant")
-    counted = protocol.dynamic["constant"].soc
+def test_soc_by_interpolation_is_near_the_counted_one(procedure):
+    soc, e_o = procedure.interpolated("constant")
+    counted = procedure.dynamic["constant"].soc
     assert 100.0 * np.sqrt(np.mean((soc - counted) ** 2)) == pytest.approx(1.15, abs=0.05)
     assert e_o.shape == soc.shape
 
@@ -90,36 +94,39 @@ def test_soc_by_interpolation_is_near_the_counted_one(protocol):
 @pytest.mark.parametrize("name", ["constant", "steps"])
 def test_validating_capture_changes_no_parameter(samples, name):
     """A voltage error of 50 mV does not change any of a1..a21."""
-    moved = samples[name].copy()
-    moved["voltage_v"][100:] += 0.05  # the first rest still gives the initial SOC
-    before, after = on(samples), on(samples | {name: moved})
+    with_voltage_error = samples[name].copy()
+    with_voltage_error["voltage_v"][100:] += 0.05  # the first rest still gives the initial SOC
+    before, after = make_procedure(samples), make_procedure(samples | {name: with_voltage_error})
     assert after.a_for(name).tolist() == before.a_for(name).tolist()
     assert after.joint_fit.a.tolist() == before.joint_fit.a.tolist()
     assert after.dynamic[name].mean_percent > before.dynamic[name].mean_percent + 0.5
 
 
 def test_captures_of_step_3_change_the_parameters(samples):
-    moved = samples["constant"].copy()
-    moved["voltage_v"] += 0.05
-    before, after = on(samples), on(samples | {"constant": moved})
+    with_voltage_error = samples["constant"].copy()
+    with_voltage_error["voltage_v"] += 0.05
+    before, after = make_procedure(samples), make_procedure(samples | {"constant": with_voltage_error})
     assert after.a_for("steps")[15] < before.a_for("steps")[15] - 0.005
 
 
 def test_load_above_the_c_rates_of_the_thesis_only_validates(samples):
-    fast = on(samples | {"constant": capture(constant(2.0, 6_000), soc=1.0)})
-    assert list(fast.r_s_curves) == ["slow", "relaxation"]
-    assert [c.name for c in fast.validating] == ["constant", "steps"]
+    with_fast_load = make_procedure(samples | {"constant": capture(constant(2.0, 6_000), soc=1.0)})
+    assert list(with_fast_load.r_s_curves) == ["slow", "relaxation"]
+    assert [c.name for c in with_fast_load.validating] == ["constant", "steps"]
 
 
-def test_validation_ends_at_the_lowest_point_of_all_relaxation_tests(samples, protocol):
+def test_validation_ends_at_the_lowest_point_of_all_relaxation_tests(samples, procedure):
     """A second test that ends half full does not raise the end of validation."""
-    half = samples["relaxation"][: samples["relaxation"].size // 2]
-    both, alone = on(samples | {"half": half}), on(samples | {"relaxation": half})
-    assert [test.name for test in both.tests] == ["relaxation", "half"]
-    assert both.lowest_soc == protocol.lowest_soc < 0.1
-    assert alone.lowest_soc == both.tests[1].soc.min() > 0.4
-    assert both.dynamic["constant"].soc[-1] == pytest.approx(protocol.lowest_soc, abs=1e-3)
-    assert both.r_s_mean.soc.min() == pytest.approx(protocol.lowest_soc, abs=0.02)
+    half_test = samples["relaxation"][: samples["relaxation"].size // 2]
+    with_both_tests, with_half_test = (
+        make_procedure(samples | {"half": half_test}),
+        make_procedure(samples | {"relaxation": half_test}),
+    )
+    assert [test.name for test in with_both_tests.tests] == ["relaxation", "half"]
+    assert with_both_tests.lowest_soc == procedure.lowest_soc < 0.1
+    assert with_half_test.lowest_soc == with_both_tests.tests[1].soc.min() > 0.4
+    assert with_both_tests.dynamic["constant"].soc[-1] == pytest.approx(procedure.lowest_soc, abs=1e-3)
+    assert with_both_tests.r_s_mean.soc.min() == pytest.approx(procedure.lowest_soc, abs=0.02)
 
 
 def test_printed_bounds_are_scaled_by_cells_and_capacity():
@@ -129,65 +136,64 @@ def test_printed_bounds_are_scaled_by_cells_and_capacity():
     assert scaled["a3"].limit == pytest.approx(ohm * pack.bounds(3).limit)
     assert scaled["a9"].limit == pytest.approx(pack.bounds(9).limit / ohm)
     assert scaled["a5"] == pack.adaptation["a5"]
-    own = TRUTH.model_copy(update={"adaptation": {"a3": pack.adaptation["a3"]}})
-    captures = [Capture(name, kind, np.empty(0)) for name, kind in SERVES.items()]
-    assert (
-        Procedure(own, captures, 1e-3).cell.bounds(3) == pack.adaptation["a3"]
-    )  # bounds of the cell file take precedence
+    with_own_bound = TRUTH.model_copy(update={"adaptation": {"a3": pack.adaptation["a3"]}})
+    captures = [Capture(name, kind, np.empty(0)) for name, kind in KIND_BY_NAME.items()]
+    # Bounds of the cell file take precedence.
+    assert Procedure(with_own_bound, captures, 1e-3).cell.bounds(3) == pack.adaptation["a3"]
 
 
 @pytest.mark.parametrize(
-    ("missing", "words"),
+    ("missing", "expected_text"),
     [(("relaxation",), "voltage relaxation test"), (("slow", "constant", "steps"), "constant load or steps")],
 )
-def test_missing_captures_are_reported(samples, missing, words):
-    captures = [Capture(name, SERVES[name], block) for name, block in samples.items() if name not in missing]
-    with pytest.raises(UserError, match=rf"needs a {words}; given: .*\)"):
+def test_missing_captures_are_reported(samples, missing, expected_text):
+    captures = [Capture(name, KIND_BY_NAME[name], block) for name, block in samples.items() if name not in missing]
+    with pytest.raises(UserError, match=rf"needs a {expected_text}; given: .*\)"):
         Procedure(TRUTH, captures, 1e-3)
 
 
-def test_single_constant_load_validates_and_step_2_uses_the_relaxation_test(leaf):
-    assert leaf.smallest.name == "hppc"
-    assert [c.name for c in leaf.validating] == ["cc"]
+def test_single_constant_load_validates_and_step_2_uses_the_relaxation_test(leaf_procedure):
+    assert leaf_procedure.smallest.name == "hppc"
+    assert [c.name for c in leaf_procedure.validating] == ["cc"]
 
 
-@pytest.mark.parametrize(("kept", "missing"), [("steps", ("33", "34")), ("constant", ("36", "37", "38"))])
-def test_figure_of_a_missing_load_is_empty_with_a_reason(samples, kept, missing):
-    recorded = Recorded(TRUTH, tuple((name, samples[name]) for name in ("relaxation", kept)), 1e-3)
+@pytest.mark.parametrize(("remaining", "missing"), [("steps", ("33", "34")), ("constant", ("36", "37", "38"))])
+def test_figure_of_a_missing_load_is_empty_with_a_reason(samples, remaining, missing):
+    recorded = Recorded(TRUTH, tuple((name, samples[name]) for name in ("relaxation", remaining)), 1e-3)
     experiment = Experiment(recorded)
-    drawn = {key: FIGURES[key](experiment) for key in ("33", "34", "36", "37", "38")}
-    assert {key for key, figure in drawn.items() if not figure.svg} == set(missing)
+    figures = {key: FIGURES[key](experiment) for key in ("33", "34", "36", "37", "38")}
+    assert {key for key, figure in figures.items() if not figure.svg} == set(missing)
     assert all(
-        "None of the captures is such a load." in drawn[key].reason for key in missing if key not in ("34", "36")
+        "None of the captures is such a load." in figures[key].reason for key in missing if key not in ("34", "36")
     )
-    assert not any("None of the captures" in figure.reason for key, figure in drawn.items() if key not in missing)
+    assert not any("None of the captures" in figure.reason for key, figure in figures.items() if key not in missing)
 
 
-def test_leaf_figures(leaf):
-    """The values are those of docs/theory/chapter5.md."""
-    run, (soc, _) = leaf.dynamic["cc"], leaf.interpolated("cc")
+def test_errors_of_the_leaf_cell_are_those_of_the_document(leaf_procedure):
+    """The document is docs/theory/chapter5.md."""
+    run, (soc, _) = leaf_procedure.dynamic["cc"], leaf_procedure.interpolated("cc")
     assert (run.mean_percent, run.max_percent) == pytest.approx((0.543, 2.37), abs=0.005)
-    assert leaf.static["cc"].mean_percent == pytest.approx(0.517, abs=0.005)
+    assert leaf_procedure.static["cc"].mean_percent == pytest.approx(0.517, abs=0.005)
     assert 100.0 * np.sqrt(np.mean((soc - run.soc) ** 2)) == pytest.approx(2.7, abs=0.05)
-    assert 1e3 * np.sqrt(np.mean(leaf.joint_fit.residual_v**2)) == pytest.approx(5.8, abs=0.05)
+    assert 1e3 * np.sqrt(np.mean(leaf_procedure.joint_fit.residual_v**2)) == pytest.approx(5.8, abs=0.05)
 
 
-def test_leaf_verdicts(leaf):
-    found = {key: claim(key, [leaf]).verdict for key in CLAIMS}
+def test_verdicts_on_the_leaf_cell(leaf_procedure):
+    results = {key: claim(key, [leaf_procedure]).verdict for key in CLAIMS}
     fails, none = Reproduction.CLAIM_FAILS, Reproduction.NO_DATA
-    assert list(found.values()) == [fails, fails, none, none, fails, fails, Reproduction.CLAIM_HOLDS, fails]
+    assert list(results.values()) == [fails, fails, none, none, fails, fails, Reproduction.CLAIM_HOLDS, fails]
 
 
-def test_relaxation_test_shared_by_two_cells_counts_twice(leaf):
-    """Results by name of the capture would overwrite each other."""
-    one, two = claim("RC products", [leaf]), claim("RC products", [leaf, leaf])
-    assert two.results == 2 * one.results
-    assert len(one.results) == 2
+def test_relaxation_test_shared_by_two_cells_counts_twice(leaf_procedure):
+    """The results are a list, because results by the name of the capture would overwrite each other."""
+    once, twice = claim("RC products", [leaf_procedure]), claim("RC products", [leaf_procedure, leaf_procedure])
+    assert twice.results == 2 * once.results
+    assert len(once.results) == 2
 
 
-def test_dynamic_against_static_is_their_ratio(leaf):
+def test_dynamic_against_static_is_their_ratio(leaf_procedure):
     for key, limit in (("order", 1.0), ("ratio", 0.003 / 0.358)):
-        (result,) = claim(f"dynamic against static, {key}", [leaf]).results
+        (result,) = claim(f"dynamic against static, {key}", [leaf_procedure]).results
         assert (result.value, result.limit) == (pytest.approx(0.543 / 0.517, abs=0.01), limit)
         assert not result.met
 
@@ -197,36 +203,36 @@ def test_dynamic_against_static_is_their_ratio(leaf):
 )
 def test_claim_holds_if_met_on_more_than_half(met, verdict):
     results = tuple(Result(f"load {i}", 1.0 if i < met else 2.0, 1.5) for i in range(4))
-    claimed = Claim("mean", "Table 11", "mean error at most 1.5 %", results)
-    assert (claimed.met, claimed.verdict) == (met, verdict)
-    assert claimed.span == {0: "2", 2: "1 to 2", 3: "1 to 2"}[met]
-    assert f"met on {met} of 4 captures (values {claimed.span})" in claimed.sentence
+    claim_result = Claim("mean", "Table 11", "mean error at most 1.5 %", results)
+    assert (claim_result.met, claim_result.verdict) == (met, verdict)
+    assert claim_result.span == {0: "2", 2: "1 to 2", 3: "1 to 2"}[met]
+    assert f"met on {met} of 4 captures (values {claim_result.span})" in claim_result.sentence
 
 
 @pytest.fixture(scope="module")
-def real_cells(shared_data):
-    return {experiment.name: chapter5.protocol(experiment) for experiment in chapter5.EXPERIMENTS}
+def real_cell_procedures(shared_data):
+    return {experiment.name: chapter5.make_procedure(experiment) for experiment in chapter5.EXPERIMENTS}
 
 
 @pytest.mark.thorough
-def test_document_lists_every_measured_error(real_cells):
-    """Values agree in all printed digits."""
-    measured = [" | ".join(row) for name, p in real_cells.items() for row in chapter5.lines(name, p)]
+def test_document_lists_every_measured_error(real_cell_procedures):
+    """The values of the document agree in all printed digits."""
+    measured = [" | ".join(row) for name, p in real_cell_procedures.items() for row in chapter5.load_rows(name, p)]
     table = DOCUMENT.read_text(encoding="utf-8").split("## Errors")[1].split("\n## ")[0]
     assert re.findall(r"^\| (.*) \|$", table, re.MULTILINE)[1:] == measured
 
 
 @pytest.mark.thorough
-def test_document_lists_every_verdict(real_cells):
-    room = [real_cells[experiment.name] for experiment in chapter5.EXPERIMENTS if experiment.room]
+def test_document_lists_every_verdict(real_cell_procedures):
+    room = [real_cell_procedures[experiment.name] for experiment in chapter5.EXPERIMENTS if experiment.room]
     measured = [
         " | ".join((key, *everywhere, *at_room_temperature))
         for (key, *everywhere), (_, *at_room_temperature) in zip(
-            chapter5.outcomes(list(real_cells.values())), chapter5.outcomes(room), strict=True
+            chapter5.outcomes(list(real_cell_procedures.values())), chapter5.outcomes(room), strict=True
         )
     ]
     table = DOCUMENT.read_text(encoding="utf-8").split("## Verdicts")[1].split("\n## ")[0]
     rows = re.findall(r"^\| (.*) \|$", table, re.MULTILINE)
     first = rows.index(measured[0])
     assert rows[first : first + len(CLAIMS)] == measured
-    assert rows[-len(chapter5.STEP_3) :] == [" | ".join(row) for row in chapter5.steps_met(real_cells)]
+    assert rows[-len(chapter5.STEP_3) :] == [" | ".join(row) for row in chapter5.steps_met(real_cell_procedures)]

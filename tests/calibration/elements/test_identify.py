@@ -1,3 +1,5 @@
+"""Identification of the elements of a cell file from captures: accuracy, scores of replays, and rejected captures."""
+
 import numpy as np
 import pytest
 from scipy.stats import gmean
@@ -48,7 +50,8 @@ def from_warm_with_given_ocv(warm):
     return identify([warm], wrong_start(), refine_ocv=False)
 
 
-def errors_mv(cell, samples):
+def voltage_rms_mv(cell, samples):
+    """Return the RMS error of the predicted voltage above SOC 0.1 [mV]."""
     return 1e3 * validate(Columns(samples, "other"), cell).above.voltage_rms_v
 
 
@@ -62,47 +65,49 @@ def test_identified_resistances_at_25_c_are_within_their_errors(identified):
 def test_captures_at_two_temperatures_predict_a_temperature_between(identified, from_warm):
     between = ladder_capture(steps(7), 10.0)
     assert identified.cell.ladder.temperature_c == (COLD_C, WARM_C)
-    assert errors_mv(identified.cell, between) < 6.0
+    assert voltage_rms_mv(identified.cell, between) < 6.0
     assert from_warm.cell.ladder.temperature_c == (WARM_C, WARM_C)
-    assert errors_mv(from_warm.cell, between) > 1.5 * errors_mv(identified.cell, between)
+    assert voltage_rms_mv(from_warm.cell, between) > 1.5 * voltage_rms_mv(identified.cell, between)
 
 
 def test_at_one_temperature_the_weak_share_is_that_of_the_given_file(identified, warm):
-    found = identify([warm], identified.cell).cell.ladder
-    ladders = found, identified.cell.ladder
+    result = identify([warm], identified.cell).cell.ladder
+    ladders = result, identified.cell.ladder
     weak, strong = (np.array([getattr(x, part) for x in ladders]) for part in ("weak_ohm", "strong_ohm"))
-    there = (weak + strong > 1e-9).all(axis=0)
-    assert there.mean() > 0.8
-    share, known = (weak / (weak + strong + 1e-15))[:, there]
-    assert share == pytest.approx(known, abs=1e-6)
-    assert np.ptp(known) > 0.2
+    is_positive = (weak + strong > 1e-9).all(axis=0)
+    assert is_positive.mean() > 0.8
+    fitted_share, given_share = (weak / (weak + strong + 1e-15))[:, is_positive]
+    assert fitted_share == pytest.approx(given_share, abs=1e-6)
+    assert np.ptp(given_share) > 0.2
     assert (weak + strong).sum(axis=1)[0, 2:] == pytest.approx((weak + strong).sum(axis=1)[1, 2:], rel=0.1)
-    assert found.temperature_c == (COLD_C, WARM_C)
+    assert result.temperature_c == (COLD_C, WARM_C)
 
 
-def growth(ladder):
-    """Return the growth of the sum of all resistances, from SOC 0.65 to 0."""
+def growth_near_empty(ladder):
+    """Return the sum of all resistances at SOC 0 divided by that at SOC 0.65."""
     ohm = (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).sum(axis=0)
     return ohm[0] / np.interp(0.65, ladder.soc, ohm)
 
 
-def test_growth_near_empty_without_data_is_between_constant_and_that_of_the_file(warm):
-    above = Columns(warm.rows[: int(np.argmax(np.cumsum(warm.rows["current_a"]) > 0.6 * 3600.0 * 3.0))], "above")
-    found = {}
+def test_without_data_near_empty_the_resistances_grow_partly_as_in_the_given_file(warm):
+    without_low_soc = Columns(
+        warm.rows[: int(np.argmax(np.cumsum(warm.rows["current_a"]) > 0.6 * 3600.0 * 3.0))], "above"
+    )
+    result = {}
     for name, times in (("level", 1.0), ("growing", 4.0)):
         rows = ((0.004 * times, 0.004, 0.004),) * 7
         parts = {"soc": (0.0, 0.3, 1.0), "weak_ohm": rows, "strong_ohm": rows, "std": 0.6}
         given = TRUTH.model_copy(update={"ladder": LADDER.model_copy(update=parts)})
-        once = identify([above], given, refine_ocv=False).cell
-        found[name] = growth(once.ladder)
-        again = growth(identify([above], once, refine_ocv=False).cell.ladder)
-        assert again == pytest.approx(found[name], rel=0.1)  # repeated identification preserves the growth
-    assert 1.5 * found["level"] < found["growing"] < 3.0
+        cell = identify([without_low_soc], given, refine_ocv=False).cell
+        result[name] = growth_near_empty(cell.ladder)
+        growth_again = growth_near_empty(identify([without_low_soc], cell, refine_ocv=False).cell.ladder)
+        assert growth_again == pytest.approx(result[name], rel=0.1)
+    assert 1.5 * result["level"] < result["growing"] < 3.0
 
 
 def test_a_capture_with_little_information_gives_a_larger_std(warm, from_warm_with_given_ocv):
     from_short = identify([Columns(warm.rows[:700], "short")], wrong_start(), refine_ocv=False)
-    stds = [found.cell.ladder.std for found in (from_warm_with_given_ocv, from_short)]
+    stds = [result.cell.ladder.std for result in (from_warm_with_given_ocv, from_short)]
     assert module.LADDER_STD < stds[0] < 1.3 * module.LADDER_STD < 1.5 * stds[0] < stds[1]
 
 
@@ -120,32 +125,32 @@ def test_elements_of_the_file_are_equivalent_to_the_ladder(identified):
 
 def test_capacitances_of_a_flat_ladder_are_positive_down_to_empty():
     flat = LADDER.model_copy(update={"weak_ohm": ((0.02,) * 3,) * 7, "strong_ohm": ((0.0,) * 3,) * 7})
-    made = two_branch_fit.cell_file_sections(flat)
-    assert made["r_s"].offset_ohm == pytest.approx(0.02, rel=1e-3)
+    sections = two_branch_fit.cell_file_sections(flat)
+    assert sections["r_s"].offset_ohm == pytest.approx(0.02, rel=1e-3)
     for name in ("c_ts", "c_tl"):
-        assert 0.0 < made[name].amplitude_farad < made[name].offset_farad
+        assert 0.0 < sections[name].amplitude_farad < sections[name].offset_farad
 
 
 def test_rc_pairs_that_a_slow_capture_does_not_determine_have_small_positive_resistances():
-    """A sample period of a minute gives a resistance of 0 for RC pairs of seconds."""
-    untold = LADDER.model_copy(
+    """With a sample period of a minute, the resistance of RC pairs with time constants of seconds is 0."""
+    ladder_without_fast_pairs = LADDER.model_copy(
         update={"weak_ohm": tuple((0.0 if 0 < k < 4 else 0.02,) * 3 for k in range(7)), "strong_ohm": ((0.0,) * 3,) * 7}
     )
-    made = two_branch_fit.cell_file_sections(untold)
-    assert 0.0 < made["r_ts"].offset_ohm < 1e-3 * made["r_tl"].offset_ohm
-    assert 1.0 < made["r_ts"].offset_ohm * made["c_ts"].offset_farad < 30.0
+    sections = two_branch_fit.cell_file_sections(ladder_without_fast_pairs)
+    assert 0.0 < sections["r_ts"].offset_ohm < 1e-3 * sections["r_tl"].offset_ohm
+    assert 1.0 < sections["r_ts"].offset_ohm * sections["c_ts"].offset_farad < 30.0
 
 
 def test_captures_at_similar_temperatures_are_held_back_from_the_fit_that_they_score(warm, cold):
     other = Columns(ladder_capture(steps(5), WARM_C + 3.0), "other")
-    found = identify([warm, cold, other], wrong_start())
-    assert [c.held_back for c in found.captures] == [True, False, True]
-    assert found.score_after < found.score_before
-    for mean, of_each in (
-        (found.score_before, [c.score_before for c in found.captures]),
-        (found.score_after, [c.score_after for c in found.captures]),
+    result = identify([warm, cold, other], wrong_start())
+    assert [c.held_back for c in result.captures] == [True, False, True]
+    assert result.score_after < result.score_before
+    for mean, of_captures in (
+        (result.score_before, [c.score_before for c in result.captures]),
+        (result.score_after, [c.score_after for c in result.captures]),
     ):
-        assert mean == pytest.approx(gmean(of_each))
+        assert mean == pytest.approx(gmean(of_captures))
 
 
 def test_identification_that_makes_replays_worse_is_rejected_with_the_scores(warm, monkeypatch):
@@ -159,15 +164,15 @@ def test_identification_that_makes_replays_worse_is_rejected_with_the_scores(war
 def test_the_given_ocv_is_used_if_replays_are_better_with_it(warm, monkeypatch):
     given = wrong_start()
     monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell.ocv is given.ocv else 5.25)
-    found = identify([warm], given)
-    assert found.cell.ocv == given.ocv
-    assert found.ocv_correction_v == 0.0
+    result = identify([warm], given)
+    assert result.cell.ocv == given.ocv
+    assert result.ocv_correction_v == 0.0
 
 
 def test_captures_too_short_for_a_replay_are_identified_without_score():
-    found = identify([Columns(ladder_capture(steps()[:1200], WARM_C), "short")], wrong_start())
-    assert np.isnan(found.score_before)
-    assert np.isnan(found.captures[0].score_after)
+    result = identify([Columns(ladder_capture(steps()[:1200], WARM_C), "short")], wrong_start())
+    assert np.isnan(result.score_before)
+    assert np.isnan(result.captures[0].score_after)
 
 
 def test_the_score_is_larger_for_a_wrong_interval():
@@ -183,91 +188,95 @@ def test_a_wrong_ocv_is_corrected(warm):
     true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
     wrong_v = true_v + 6e-3 * np.sin(2.0 * np.pi * soc)
     wrong = TableOcv(form="table", soc=tuple(soc), ocv_v=tuple(wrong_v), error_v=(6e-3,) * soc.size)
-    found = identify([warm], TRUTH.model_copy(update={"ocv": wrong}), initial_soc=0.98).cell.ocv
+    result = identify([warm], TRUTH.model_copy(update={"ocv": wrong}), initial_soc=0.98).cell.ocv
     middle = (soc > 0.15) & (soc < 0.95)
-    left_v = np.interp(soc, found.soc, found.ocv_v) - true_v
-    assert np.sqrt(np.mean(left_v[middle] ** 2)) < 0.8 * np.sqrt(np.mean((wrong_v - true_v)[middle] ** 2))
-    assert (np.diff(found.ocv_v) > 0.0).all()
+    remaining_error_v = np.interp(soc, result.soc, result.ocv_v) - true_v
+    assert np.sqrt(np.mean(remaining_error_v[middle] ** 2)) < 0.8 * np.sqrt(np.mean((wrong_v - true_v)[middle] ** 2))
+    assert (np.diff(result.ocv_v) > 0.0).all()
 
 
 def test_a_possible_error_of_hysteresis_does_not_change_the_curve(warm):
-    """With a hysteresis of +-25 mV, an error of 8 mV in a discharge gives no information on the curve after charge."""
+    """With a hysteresis of +-25 mV, an error of 8 mV in a discharge gives no information on the OCV after charge."""
     soc = np.linspace(0.0, 1.0, 101)
     true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
-    moved_v = {}
+    curve_shift_v = {}
     for name, hysteresis_v in (("branches", 0.025), ("one", None)):
         middle_v = true_v + 8e-3 + (hysteresis_v or 0.0)
-        told = TableOcv(
+        with_given_temperature = TableOcv(
             form="table",
             soc=tuple(soc),
             ocv_v=tuple(middle_v),
             error_v=(8e-3,) * soc.size,
             hysteresis_v=None if hysteresis_v is None else (hysteresis_v,) * soc.size,
         )
-        found = identify([warm], TRUTH.model_copy(update={"ocv": told}), initial_soc=0.98).cell.ocv
-        moved_v[name] = np.mean((np.interp(soc, found.soc, found.ocv_v) - middle_v)[20:90])
-        assert found.hysteresis_v is None or found.hysteresis_v[0] == hysteresis_v
-    assert abs(moved_v["branches"]) < 0.5 * abs(moved_v["one"])
+        result = identify([warm], TRUTH.model_copy(update={"ocv": with_given_temperature}), initial_soc=0.98).cell.ocv
+        curve_shift_v[name] = np.mean((np.interp(soc, result.soc, result.ocv_v) - middle_v)[20:90])
+        assert result.hysteresis_v is None or result.hysteresis_v[0] == hysteresis_v
+    assert abs(curve_shift_v["branches"]) < 0.5 * abs(curve_shift_v["one"])
 
 
 def test_the_miscount_of_a_capture_is_identified(warm, from_warm_with_given_ocv):
     rows = warm.rows.copy()
     rows["current_a"] *= 0.98
-    lacking = identify([Columns(rows, "lacking")], wrong_start(), refine_ocv=False)
+    with_small_current = identify([Columns(rows, "lacking")], wrong_start(), refine_ocv=False)
     assert abs(from_warm_with_given_ocv.captures[0].miscount) < 0.001
-    assert 0.005 < lacking.captures[0].miscount < 0.02  # true value 0.02, reduced by the prior, whose std is 0.004
+    # The true value is 0.02. The prior with a std of 0.004 reduces the result.
+    assert 0.005 < with_small_current.captures[0].miscount < 0.02
 
 
-def test_refine_ocv_false_keeps_the_ocv_and_its_temperature_coefficient(warm, cold):
-    found = identify([warm, cold], wrong_start(), refine_ocv=False)
-    assert found.cell.ocv == wrong_start().ocv
-    assert found.ocv_correction_v == 0.0
+def test_without_refinement_the_ocv_and_its_temperature_coefficient_are_those_of_the_file(warm, cold):
+    result = identify([warm, cold], wrong_start(), refine_ocv=False)
+    assert result.cell.ocv == wrong_start().ocv
+    assert result.ocv_correction_v == 0.0
 
 
 def test_a_pack_is_identified_with_the_accuracy_of_a_cell():
     pack = TRUTH.pack(6, 2)
     samples = capture(2.0 * steps(), cell=pack, noise_v=3e-3)
-    found = identify([Columns(samples, "pack")], wrong_start().pack(6, 2))
-    assert found.elements[0.5]["r_s"][0] == pytest.approx(3.0 * r_s(0.5, TRUTH.a), rel=0.03)
-    assert errors_mv(found.cell, samples) < 36.0
+    result = identify([Columns(samples, "pack")], wrong_start().pack(6, 2))
+    assert result.elements[0.5]["r_s"][0] == pytest.approx(3.0 * r_s(0.5, TRUTH.a), rel=0.03)
+    assert voltage_rms_mv(result.cell, samples) < 36.0
 
 
 def test_glitches_do_not_change_the_result(warm, from_warm):
     samples = warm.rows.copy()
     rng = np.random.default_rng(5)
-    places = rng.choice(np.arange(100, samples.size - 100), 60, replace=False)
-    samples["voltage_v"][places[:20]] = 0.0
-    samples["voltage_v"][places[20:35]] = 3.0
-    samples["voltage_v"][places[35:45]] = np.nan
-    resting = places[45:][samples["current_a"][places[45:]] == 0.0]
+    samples_with_faults = rng.choice(np.arange(100, samples.size - 100), 60, replace=False)
+    samples["voltage_v"][samples_with_faults[:20]] = 0.0
+    samples["voltage_v"][samples_with_faults[20:35]] = 3.0
+    samples["voltage_v"][samples_with_faults[35:45]] = np.nan
+    resting = samples_with_faults[45:][samples["current_a"][samples_with_faults[45:]] == 0.0]
     samples["current_a"][resting] = 4.6
     samples["time_s"][50:52] = samples["time_s"][49]
-    found = identify([Columns(samples, "glitches")], wrong_start())
-    assert found.captures[0].glitches >= 45
+    result = identify([Columns(samples, "glitches")], wrong_start())
+    assert result.captures[0].glitches >= 45
     for name in OHM:
-        assert found.elements[0.5][name][0] == pytest.approx(from_warm.elements[0.5][name][0], rel=0.05)
+        assert result.elements[0.5][name][0] == pytest.approx(from_warm.elements[0.5][name][0], rel=0.05)
 
 
 def test_a_gap_at_rest_is_accepted():
     samples = ladder_capture(np.r_[steps()[:6000], np.zeros(3600), steps()[6000:]], WARM_C)
-    found = identify([Columns(np.delete(samples, np.s_[6060:9540]), "gap")], wrong_start())
-    assert found.elements[0.5]["r_s"][0] == pytest.approx(OHM["r_s"], rel=0.05)
+    result = identify([Columns(np.delete(samples, np.s_[6060:9540]), "gap")], wrong_start())
+    assert result.elements[0.5]["r_s"][0] == pytest.approx(OHM["r_s"], rel=0.05)
 
 
 def test_captures_without_excitation_are_left_out(warm):
     slow = Columns(capture(constant(0.15, 20_000)), "slow")
-    found = identify([slow, warm], wrong_start())
-    assert found.left_out == ("slow",)
-    assert [c.name for c in found.captures] == ["warm"]
+    result = identify([slow, warm], wrong_start())
+    assert result.left_out == ("slow",)
+    assert [c.name for c in result.captures] == ["warm"]
 
 
 def test_without_a_sensor_the_given_temperature_is_used(cold):
     samples = cold.rows.copy()
     samples["temperature_c"] = np.nan
-    told = identify([Columns(samples, "cold")], wrong_start(), temperature_c=COLD_C)
-    assert told.cell.ladder.temperature_c == (COLD_C, COLD_C)
-    assert told.captures[0].temperature_c == (COLD_C, COLD_C)
-    assert told.elements[0.5]["r_s"][0] < identify([Columns(samples, "cold")], wrong_start()).elements[0.5]["r_s"][0]
+    with_given_temperature = identify([Columns(samples, "cold")], wrong_start(), temperature_c=COLD_C)
+    assert with_given_temperature.cell.ladder.temperature_c == (COLD_C, COLD_C)
+    assert with_given_temperature.captures[0].temperature_c == (COLD_C, COLD_C)
+    assert (
+        with_given_temperature.elements[0.5]["r_s"][0]
+        < identify([Columns(samples, "cold")], wrong_start()).elements[0.5]["r_s"][0]
+    )
     with pytest.raises(
         UserError, match=r"^cold: temperature_c runs from 298.0 to 298.0, but cells are between -45 and 85"
     ):
@@ -286,39 +295,47 @@ def with_capacity(capacity_ah):
     return TRUTH.model_copy(update={"cell": cell})
 
 
-def flipped(samples):
+def reverse_current(samples):
+    """Reverse the sign of the current."""
     samples["current_a"] *= -1.0
     return samples
 
 
-def with_gap(samples):
+def insert_gap(samples):
+    """Insert an hour without samples during a load."""
     loaded = int(np.flatnonzero(samples["current_a"] > 0.4)[4000])
     samples["time_s"][loaded:] += 3600.0
     return samples
 
 
-def stuck(samples, first):
+def hold_voltage(samples, first):
+    """Hold the voltage from sample ``first`` on."""
     samples["voltage_v"][first:] = samples["voltage_v"][first]
     return samples
 
 
-def in_hours(samples):
+def convert_time_to_hours(samples):
+    """Convert the time stamps to hours, as in a column with another unit."""
     samples["time_s"] /= 3600.0
     return samples
 
 
 @pytest.mark.parametrize(
-    ("samples", "cell", "words"),
+    ("samples", "cell", "expected_texts"),
     [
         (capture(np.zeros(4000)), TRUTH, ["no excitation", "0.0000 A", "1.11 h"]),
-        (flipped(capture(steps())), TRUTH, ["sign is wrong", "mV per ampere"]),
-        (flipped(capture(constant())), TRUTH, ["sign is wrong", "Ah drawn while the voltage went from"]),
+        (reverse_current(capture(steps())), TRUTH, ["sign is wrong", "mV per ampere"]),
+        (reverse_current(capture(constant())), TRUTH, ["sign is wrong", "Ah drawn while the voltage went from"]),
         (capture(steps()), with_capacity(2.0), ["outside 0..1", "capacity of 2 Ah"]),
         (capture(steps()), with_capacity(5.0), ["charge and voltage disagree", "capacity of 5 Ah"]),
-        (stuck(capture(steps()), 0), TRUTH, ["the voltage is constant", "check the column for repeated old values"]),
-        (stuck(capture(steps()), 2000), TRUTH, ["the voltage changes by 0.000 mV per ampere"]),
-        (in_hours(capture(steps())[:9000]), TRUTH, ["it lasts 2.5 s", "check that time_s is in seconds"]),
-        (with_gap(capture(steps())), TRUTH, ["a gap of 3601 s", "A: the charge drawn in it is unknown"]),
+        (
+            hold_voltage(capture(steps()), 0),
+            TRUTH,
+            ["the voltage is constant", "check the column for repeated old values"],
+        ),
+        (hold_voltage(capture(steps()), 2000), TRUTH, ["the voltage changes by 0.000 mV per ampere"]),
+        (convert_time_to_hours(capture(steps())[:9000]), TRUTH, ["it lasts 2.5 s", "check that time_s is in seconds"]),
+        (insert_gap(capture(steps())), TRUTH, ["a gap of 3601 s", "A: the charge drawn in it is unknown"]),
         (capture(steps()), load_cell("thunder_power_6s"), ["lie within the cell's limits", "check the cell file"]),
     ],
     ids=[
@@ -334,11 +351,11 @@ def in_hours(samples):
         "another cell",
     ],
 )
-def test_errors_contain_the_fault_and_its_numbers(samples, cell, words):
+def test_errors_contain_the_fault_and_its_numbers(samples, cell, expected_texts):
     with pytest.raises(UserError) as caught:
         identify([Columns(samples, "bad.csv")], cell)
     assert str(caught.value).startswith("bad.csv: ")
-    assert all(word in str(caught.value) for word in words)
+    assert all(word in str(caught.value) for word in expected_texts)
 
 
 def test_a_good_capture_contradicts_only_a_wrong_initial_soc():
@@ -357,20 +374,20 @@ def test_a_capture_that_stays_empty_is_rejected():
 
 def test_a_cell_identified_from_a_real_relaxation_test_predicts_random_steps(shared_data):
     folder = shared_data / "ncr18650"
-    found = identify([load_capture(folder / "cell5_relaxation_c2.csv.gz")], TRUTH)
-    errors = validate(load_capture(folder / "cell5_random_steps.csv.gz"), found.cell).above
+    result = identify([load_capture(folder / "cell5_relaxation_c2.csv.gz")], TRUTH)
+    errors = validate(load_capture(folder / "cell5_random_steps.csv.gz"), result.cell).above
     assert errors.voltage_rms_v <= 12e-3
-    assert found.elements[0.5]["r_s"][0] == pytest.approx(84.4e-3, rel=0.1)  # median of dV/dI at its steps
+    assert result.elements[0.5]["r_s"][0] == pytest.approx(84.4e-3, rel=0.1)  # median of dV/dI at its steps
 
 
 def test_a_real_cell_is_identified_from_a_wrong_start_and_predicts_another_load(data):
-    """Nissan Leaf: the fit uses pulses and rests; the prediction is tested on cycles at 1C."""
+    """The cell is that of a Nissan Leaf. The fit uses pulses and rests, and the prediction is tested on cycles at 1 C."""
     leaf = load_cell("leaf")
     table = leaf.model_dump() | {"ladder": None}
     for name in ("r_s", "r_ts", "r_tl"):
         table[name] |= {key: 2.0 * table[name][key] for key in ("amplitude_ohm", "offset_ohm")}
-    found = identify([load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")], type(leaf).model_validate(table))
-    assert found.elements[0.5]["r_s"][0] == pytest.approx(1.57e-3, rel=0.1)  # median of dV/dI at its steps
-    assert found.captures[0].voltage_rms_v < 5e-3
-    assert found.score_after < found.score_before
-    assert validate(load_capture(data / "leaf" / "cc_1c.csv.gz"), found.cell).above.voltage_rms_v < 25e-3
+    result = identify([load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")], type(leaf).model_validate(table))
+    assert result.elements[0.5]["r_s"][0] == pytest.approx(1.57e-3, rel=0.1)  # median of dV/dI at its steps
+    assert result.captures[0].voltage_rms_v < 5e-3
+    assert result.score_after < result.score_before
+    assert validate(load_capture(data / "leaf" / "cc_1c.csv.gz"), result.cell).above.voltage_rms_v < 25e-3

@@ -1,4 +1,4 @@
-"""Fit of (2.10) to points of a known curve."""
+"""Fit of the open-circuit voltage of Chen and Mora, (2.10) of the thesis, to points of a known curve."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from tests.calibration.simulated_relaxation import relaxation
 GRID = np.linspace(0.0, 1.0, 501)
 
 
-def points(soc, ocv_v, std_v=1e-3, **ends):
+def make_points(soc, ocv_v, std_v=1e-3, **ends):
     soc = np.asarray(soc, dtype=float)
     return Points(soc, np.asarray(ocv_v, dtype=float), np.full(soc.size, std_v), **ends)
 
@@ -24,7 +24,7 @@ def points(soc, ocv_v, std_v=1e-3, **ends):
 @pytest.mark.parametrize("a", [TABLE_1, TABLE_8], ids=["Table 1", "Table 8"])
 def test_exact_points_give_the_true_parameters(a):
     soc = np.linspace(0.005, 1.0, 60)
-    fit = fit_chen_mora(points(soc, chen_mora(np.array(a), soc)))
+    fit = fit_chen_mora(make_points(soc, chen_mora(np.array(a), soc)))
     assert fit.a == pytest.approx(a, rel=1e-4)
     assert max_v(fit.residual_v) < 1e-7
 
@@ -33,18 +33,18 @@ def test_shipped_cell_has_the_curve_of_table_1():
     ocv = load_cell("chen_mora").ocv
     assert ocv.a == pytest.approx(TABLE_1)
     x = 0.37
-    by_hand = -1.031 * np.exp(-35.0 * x) + 3.685 + 0.2156 * x - 0.1178 * x**2 + 0.3201 * x**3
-    assert chen_mora(np.array(TABLE_1), np.array([x]))[0] == pytest.approx(by_hand, rel=1e-15)
+    expected_v = -1.031 * np.exp(-35.0 * x) + 3.685 + 0.2156 * x - 0.1178 * x**2 + 0.3201 * x**3
+    assert chen_mora(np.array(TABLE_1), np.array([x]))[0] == pytest.approx(expected_v, rel=1e-15)
 
 
 def test_standard_errors_equal_the_scatter_of_the_fits():
-    """The scatter of fits to 40 noisy sets of points equals their standard errors."""
+    """The scatter of the fits to 40 noisy sets of points is compared with their standard errors."""
     rng, soc = np.random.default_rng(0), np.linspace(0.01, 1.0, 80)
-    exact = chen_mora(np.array(TABLE_1), soc)
-    fits = [fit_chen_mora(points(soc, exact + 1e-3 * rng.standard_normal(soc.size))) for _ in range(40)]
+    exact_v = chen_mora(np.array(TABLE_1), soc)
+    fits = [fit_chen_mora(make_points(soc, exact_v + 1e-3 * rng.standard_normal(soc.size))) for _ in range(40)]
     scatter = np.std([fit.a for fit in fits], axis=0, ddof=1)
-    claimed = np.mean([fit.std for fit in fits], axis=0)
-    assert scatter == pytest.approx(claimed, rel=0.4)
+    declared = np.mean([fit.std for fit in fits], axis=0)
+    assert scatter == pytest.approx(declared, rel=0.4)
     assert np.mean([rms_v(fit.residual_v) for fit in fits]) == pytest.approx(1e-3, rel=0.1)
 
 
@@ -53,51 +53,55 @@ def test_points_that_end_above_the_knee_give_a_positive_voltage_at_soc_0():
     soc = np.linspace(0.07, 1.0, 19)
     ocv_v = 3.2 + 0.1 * soc
     ocv_v[0] -= 0.15
-    fit = fit_chen_mora(points(soc, ocv_v))
+    fit = fit_chen_mora(make_points(soc, ocv_v))
     assert fit.a[0] <= ocv_v.max()
     assert fit(np.array([0.0]))[0] > -0.1
 
 
 def test_a_parameter_at_its_bound_has_no_standard_error():
     soc = np.linspace(0.0, 1.0, 40)
-    fit = fit_chen_mora(points(soc, 3.5 + 0.6 * soc))  # no exponential in it
+    fit = fit_chen_mora(make_points(soc, 3.5 + 0.6 * soc))  # a curve without exponential part
     assert np.isnan(fit.std[0])
     assert np.isfinite(fit.std[2:]).all()
     assert max_v(fit.residual_v) < 1e-5
 
 
 def test_joint_fit_of_several_runs_is_better_than_the_mean_of_their_parameters():
-    """(5.1)-(5.2) average strongly correlated parameters."""
-    rng, exact = np.random.default_rng(4), np.array(TABLE_1)
+    """(5.1)-(5.2) of the thesis average the parameters of the runs, which are strongly correlated."""
+    rng, true_a = np.random.default_rng(4), np.array(TABLE_1)
     runs = []
     for count in (9, 10, 12):
         soc = np.linspace(0.2 / count, 1.0, count)
-        runs.append(points(soc, chen_mora(exact, soc) + 2e-3 * rng.standard_normal(count)))
+        runs.append(make_points(soc, chen_mora(true_a, soc) + 2e-3 * rng.standard_normal(count)))
     fits = [fit_chen_mora(run) for run in runs]
     mean = average(fits)
     assert mean == pytest.approx(sum(fit.a for fit in fits) / 3)  # (5.1), (5.2)
     order = np.argsort(np.concatenate([run.soc for run in runs]))
     joint = fit_chen_mora(
-        points(np.concatenate([run.soc for run in runs])[order], np.concatenate([run.ocv_v for run in runs])[order])
+        make_points(
+            np.concatenate([run.soc for run in runs])[order], np.concatenate([run.ocv_v for run in runs])[order]
+        )
     )
-    inside = GRID[GRID > 0.05]
-    true_v = chen_mora(exact, inside)
-    assert rms_v(joint(inside) - true_v) < rms_v(chen_mora(mean, inside) - true_v)
-    assert rms_v(joint(inside) - true_v) < 2e-3
+    above_knee = GRID[GRID > 0.05]
+    true_v = chen_mora(true_a, above_knee)
+    assert rms_v(joint(above_knee) - true_v) < rms_v(chen_mora(mean, above_knee) - true_v)
+    assert rms_v(joint(above_knee) - true_v) < 2e-3
 
 
 def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
-    tests = [relaxation_test(relaxation(rounds=10, seed=seed), TRUTH.cell.capacity_ah, name="mine") for seed in (0, 1)]
-    both = pooled(tests)
-    assert both.soc.size == len(tests[0].rests) + len(tests[1].rests)
-    assert (np.diff(both.soc) >= 0.0).all()
-    assert both.full_v == pytest.approx(0.5 * (tests[0].full_v + tests[1].full_v))
-    assert np.isnan(both.empty_v)  # neither runs empty
+    relaxation_tests = [
+        relaxation_test(relaxation(rounds=10, seed=seed), TRUTH.cell.capacity_ah, name="mine") for seed in (0, 1)
+    ]
+    pooled_points = pooled(relaxation_tests)
+    assert pooled_points.soc.size == len(relaxation_tests[0].rests) + len(relaxation_tests[1].rests)
+    assert (np.diff(pooled_points.soc) >= 0.0).all()
+    assert pooled_points.full_v == pytest.approx(0.5 * (relaxation_tests[0].full_v + relaxation_tests[1].full_v))
+    assert np.isnan(pooled_points.empty_v)  # neither capture ends empty
 
 
 @pytest.mark.parametrize("fit", [fit_chen_mora, fit_table])
 def test_too_few_points_or_too_small_a_span_are_rejected_with_their_numbers(fit):
     with pytest.raises(UserError, match=r"5 points of the open-circuit voltage; \(2.10\) has 6 parameters"):
-        fit(points(np.linspace(0.0, 1.0, 5), np.linspace(3.4, 4.1, 5)))
+        fit(make_points(np.linspace(0.0, 1.0, 5), np.linspace(3.4, 4.1, 5)))
     with pytest.raises(UserError, match=r"points span SOC 0.50 to 0.70 only"):
-        fit(points(np.linspace(0.5, 0.7, 12), np.linspace(3.4, 4.1, 12)))
+        fit(make_points(np.linspace(0.5, 0.7, 12), np.linspace(3.4, 4.1, 12)))

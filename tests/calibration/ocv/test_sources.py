@@ -1,4 +1,4 @@
-"""Recognition of kinds of captures, and OCV from several of them."""
+"""Kinds of captures, and the OCV from several captures."""
 
 import numpy as np
 import pytest
@@ -26,26 +26,27 @@ from tests.calibration.simulated_slow import CAPACITY_AH, CURRENT_A, hysteresis_
 INSIDE = (NODES > 0.1) & (NODES < 0.95)
 
 
-def of(*samples, curves=(), capacity_ah=None, **options):
+def sources_of(*samples, curves=(), capacity_ah=None, **options):
+    """Return the sources of the OCV in captures and external curves."""
     recordings = [Recording(f"run{i}", one) for i, one in enumerate(samples)]
     return find_sources(recordings, curves, capacity_ah=capacity_ah, **options)
 
 
-def off_v(found):
-    return (fit_table(found.points).ocv_v - true_v(NODES))[INSIDE]
+def ocv_error_v(result):
+    """Return the error of the fitted OCV between SOC 0.1 and 0.95 [V]."""
+    return (fit_table(result.points).ocv_v - true_v(NODES))[INSIDE]
 
 
 @pytest.mark.parametrize("files", [1, 2])
 def test_a_pair_gives_mean_hysteresis_and_capacity(files):
     """Discharge and charge are in one file or in two."""
-    found = of(slow((1.0, -1.0))) if files == 1 else of(slow((1.0,)), slow((-1.0,)))
-    (source,) = found.sources
+    result = sources_of(slow((1.0, -1.0))) if files == 1 else sources_of(slow((1.0,)), slow((-1.0,)))
+    (source,) = result.sources
     assert source.kind.startswith("C/20 discharge and charge, 2.99")
-    assert found.capacity_ah == found.measured_ah == pytest.approx(CAPACITY_AH, rel=2e-3)
-    assert np.abs(off_v(found)).max() < 2e-3
-    assert found.hysteresis_v[INSIDE] == pytest.approx(
-        0.7 * hysteresis_v(NODES[INSIDE]), abs=2e-3
-    )  # the remainder is polarization
+    assert result.capacity_ah == result.measured_ah == pytest.approx(CAPACITY_AH, rel=2e-3)
+    assert np.abs(ocv_error_v(result)).max() < 2e-3
+    # The rest of the difference between discharge and charge is polarization.
+    assert result.hysteresis_v[INSIDE] == pytest.approx(0.7 * hysteresis_v(NODES[INSIDE]), abs=2e-3)
 
 
 @pytest.mark.parametrize("noise_a", [0.01, 0.04])
@@ -53,135 +54,137 @@ def test_a_noisy_current_sensor_and_a_charge_before_the_discharge_are_accepted(n
     samples = slow((-1.0, 1.0))
     samples["current_a"] += noise_a * np.random.default_rng(1).standard_normal(samples.size)
     samples["current_a"][[700, 4000]] = 0.5
-    found = of(samples)
-    assert found.sources[0].kind.startswith("C/20 discharge and charge")
-    assert found.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-2)
-    assert np.abs(off_v(found)).max() < 3e-3
+    result = sources_of(samples)
+    assert result.sources[0].kind.startswith("C/20 discharge and charge")
+    assert result.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-2)
+    assert np.abs(ocv_error_v(result)).max() < 3e-3
 
 
 def test_an_unpaired_discharge_has_the_hysteresis_in_its_error():
-    found = of(slow((1.0,)))
-    fit = fit_table(found.points)
-    assert found.sources[0].kind.startswith("C/20 discharge, 2.99")
-    assert found.hysteresis_v is None
-    assert np.median(off_v(found)) < -5e-3
-    assert (np.abs(off_v(found)) < 2.5 * fit.error_v[INSIDE]).all()
+    result = sources_of(slow((1.0,)))
+    fit = fit_table(result.points)
+    assert result.sources[0].kind.startswith("C/20 discharge, 2.99")
+    assert result.hysteresis_v is None
+    assert np.median(ocv_error_v(result)) < -5e-3
+    assert (np.abs(ocv_error_v(result)) < 2.5 * fit.error_v[INSIDE]).all()
 
 
-@pytest.mark.parametrize(("direction", "lifted"), [(1.0, 1.0), (-1.0, -1.0)])
-def test_an_unpaired_curve_is_moved_by_half_of_a_typical_hysteresis(direction, lifted):
-    found, usual_v = of(slow((direction,)), capacity_ah=CAPACITY_AH), hysteresis_v(NODES)
-    moved = center_on_typical_hysteresis(found, usual_v)
-    plain, points = found.points, moved.points
-    assert points.ocv_v - plain.ocv_v == pytest.approx(lifted * hysteresis_v(plain.soc), abs=1e-4)
-    assert (points.common_v > plain.common_v).all()
-    assert moved.hysteresis_v == pytest.approx(usual_v)
-    assert moved.hysteresis_std_v == pytest.approx(TYPICAL_HYSTERESIS_STD * usual_v)
+@pytest.mark.parametrize(("direction", "sign"), [(1.0, 1.0), (-1.0, -1.0)])
+def test_an_unpaired_curve_is_moved_by_half_of_a_typical_hysteresis(direction, sign):
+    result, typical_v = sources_of(slow((direction,)), capacity_ah=CAPACITY_AH), hysteresis_v(NODES)
+    centered = center_on_typical_hysteresis(result, typical_v)
+    uncorrected, points = result.points, centered.points
+    assert points.ocv_v - uncorrected.ocv_v == pytest.approx(sign * hysteresis_v(uncorrected.soc), abs=1e-4)
+    assert (points.common_v > uncorrected.common_v).all()
+    assert centered.hysteresis_v == pytest.approx(typical_v)
+    assert centered.hysteresis_std_v == pytest.approx(TYPICAL_HYSTERESIS_STD * typical_v)
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize("rested", [True, False])
 def test_the_overpotential_of_an_unpaired_curve_is_subtracted(direction, rested):
-    """The ohmic drop is subtracted too if no step to or from a rest determines it."""
+    """The ohmic drop is also subtracted if no step from or to a rest determines it."""
     samples, ladder = slow((direction,)), load_cell("nca", CAPACITY_AH).ladder
-    found = of(samples if rested else samples[samples["current_a"] != 0.0], capacity_ah=CAPACITY_AH)
-    plain, (source,) = found.points, without_branches(found, ladder).sources
+    result = sources_of(samples if rested else samples[samples["current_a"] != 0.0], capacity_ah=CAPACITY_AH)
+    uncorrected, (source,) = result.points, without_branches(result, ladder).sources
     rows = [row for part in (ladder.weak_ohm, ladder.strong_ohm) for row in part[int(rested) :]]
-    drop_v = CURRENT_A * sum(np.interp(plain.soc, ladder.soc, row) for row in rows)
-    assert source.points.ocv_v - plain.ocv_v == pytest.approx(direction * drop_v, rel=1e-3)
-    assert source.points.common_v == pytest.approx(np.hypot(plain.common_v, ladder.std * drop_v), rel=1e-3)
+    drop_v = CURRENT_A * sum(np.interp(uncorrected.soc, ladder.soc, row) for row in rows)
+    assert source.points.ocv_v - uncorrected.ocv_v == pytest.approx(direction * drop_v, rel=1e-3)
+    assert source.points.common_v == pytest.approx(np.hypot(uncorrected.common_v, ladder.std * drop_v), rel=1e-3)
     assert source.notes[-1].startswith(f"{1e3 * drop_v.mean():.0f} mV")
 
 
 def test_a_cold_unpaired_curve_has_a_larger_overpotential():
     samples, ladder = slow((1.0,)), load_cell("nca", CAPACITY_AH).ladder
-    lifted_v = []
+    overpotential_v = []
     for temperature_c in (25.0, 0.0):
         samples["temperature_c"] = temperature_c
-        found = of(samples)
-        lifted_v.append((without_branches(found, ladder).points.ocv_v - found.points.ocv_v).mean())
-    assert 1.5 < lifted_v[1] / lifted_v[0] < 5.0
+        result = sources_of(samples)
+        overpotential_v.append((without_branches(result, ladder).points.ocv_v - result.points.ocv_v).mean())
+    assert 1.5 < overpotential_v[1] / overpotential_v[0] < 5.0
 
 
 def test_nothing_is_subtracted_from_pairs_rests_and_given_curves():
     soc, ladder = np.linspace(0.0, 1.0, 101), load_cell("nca", CAPACITY_AH).ladder
-    found = of(slow((1.0, -1.0)), relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)])
-    assert without_branches(found, ladder) == found
+    result = sources_of(slow((1.0, -1.0)), relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)])
+    assert without_branches(result, ladder) == result
 
 
 def test_rests_and_given_curves_without_hysteresis_are_moved_to_the_mean():
     soc = np.linspace(0.0, 1.0, 101)
-    found = of(relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)], capacity_ah=TRUTH.cell.capacity_ah)
-    moved = center_on_typical_hysteresis(found, np.full(NODES.size, 0.01))
-    for before, after in zip(found.sources, moved.sources, strict=True):
+    result = sources_of(
+        relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)], capacity_ah=TRUTH.cell.capacity_ah
+    )
+    centered = center_on_typical_hysteresis(result, np.full(NODES.size, 0.01))
+    for before, after in zip(result.sources, centered.sources, strict=True):
         assert after.points.ocv_v - before.points.ocv_v == pytest.approx(0.01)
         assert after.points.std_v == pytest.approx(before.points.std_v)
 
 
 def test_an_incomplete_charge_is_left_out_with_a_note():
-    found = of(slow((1.0,)), slow((-1.0,), part=0.85))
-    assert found.hysteresis_v is None
-    assert len(found.sources) == 1
-    assert "charge run1 left out: 2.5" in found.sources[0].notes[0]
+    result = sources_of(slow((1.0,)), slow((-1.0,), part=0.85))
+    assert result.hysteresis_v is None
+    assert len(result.sources) == 1
+    assert "charge run1 left out: 2.5" in result.sources[0].notes[0]
 
 
 def test_a_slow_curve_of_an_aged_cell_uses_its_measured_capacity():
-    found = of(slow((1.0, -1.0), capacity_ah=2.7), capacity_ah=CAPACITY_AH)
-    assert found.capacity_ah == CAPACITY_AH
-    assert found.measured_ah == pytest.approx(2.7, rel=2e-3)
-    assert "counted against its own 2.69" in found.sources[0].notes[0]
-    assert np.abs(off_v(found)).max() < 2e-3
+    result = sources_of(slow((1.0, -1.0), capacity_ah=2.7), capacity_ah=CAPACITY_AH)
+    assert result.capacity_ah == CAPACITY_AH
+    assert result.measured_ah == pytest.approx(2.7, rel=2e-3)
+    assert "counted against its own 2.69" in result.sources[0].notes[0]
+    assert np.abs(ocv_error_v(result)).max() < 2e-3
 
 
 def test_a_given_curve_and_its_hysteresis_are_used_unchanged():
     soc = np.linspace(0.0, 1.0, 101)
-    found = of(curves=[ExternalCurve("book", soc, true_v(soc), hysteresis_v(soc))], capacity_ah=5.0)
-    assert [source.kind for source in found.sources] == ["given curve, 101 points"]
-    assert np.abs(off_v(found)).max() < 2e-3
-    assert found.hysteresis_v == pytest.approx(hysteresis_v(NODES), abs=1e-3)
+    result = sources_of(curves=[ExternalCurve("book", soc, true_v(soc), hysteresis_v(soc))], capacity_ah=5.0)
+    assert [source.kind for source in result.sources] == ["given curve, 101 points"]
+    assert np.abs(ocv_error_v(result)).max() < 2e-3
+    assert result.hysteresis_v == pytest.approx(hysteresis_v(NODES), abs=1e-3)
 
 
-@pytest.mark.parametrize("share", [0.4, 1.0])
-def test_rests_determine_the_remaining_fraction_of_the_hysteresis(share):
+@pytest.mark.parametrize("fraction", [0.4, 1.0])
+def test_rests_determine_the_remaining_fraction_of_the_hysteresis(fraction):
     soc, rests = np.linspace(0.0, 1.0, 101), relaxation()
-    plain = of(rests, capacity_ah=TRUTH.cell.capacity_ah).points
-    book = ExternalCurve("book", soc, fit_table(plain)(soc) + share * 0.02, np.full(soc.size, 0.02))
-    found = of(rests, curves=[book], capacity_ah=TRUTH.cell.capacity_ah)
-    moved = found.points.ocv_v[found.points.source == 1]
-    assert moved == pytest.approx(plain.ocv_v + share * 0.02, abs=1e-3)
-    assert found.hysteresis_v == pytest.approx(np.full(NODES.size, share * 0.02), abs=1e-3)
-    assert f"rests keep {found.hysteresis_v[0] / 0.02:.2f} of its hysteresis" in found.sources[0].notes
+    uncorrected = sources_of(rests, capacity_ah=TRUTH.cell.capacity_ah).points
+    given_curve = ExternalCurve("book", soc, fit_table(uncorrected)(soc) + fraction * 0.02, np.full(soc.size, 0.02))
+    result = sources_of(rests, curves=[given_curve], capacity_ah=TRUTH.cell.capacity_ah)
+    centered = result.points.ocv_v[result.points.source == 1]
+    assert centered == pytest.approx(uncorrected.ocv_v + fraction * 0.02, abs=1e-3)
+    assert result.hysteresis_v == pytest.approx(np.full(NODES.size, fraction * 0.02), abs=1e-3)
+    assert f"rests keep {result.hysteresis_v[0] / 0.02:.2f} of its hysteresis" in result.sources[0].notes
 
 
 def test_a_capture_that_starts_lower_is_aligned_by_its_first_rest():
     full, lower = relaxation(), capture(schedule(rounds=12), soc=0.93)
-    found = of(full, lower, capacity_ah=TRUTH.cell.capacity_ah)
-    assert [test.start_soc for test in found.tests] == [1.0, pytest.approx(0.93, abs=5e-3)]
-    assert found.sources[1].notes == (f"starts at SOC {found.tests[1].start_soc:.3f}",)
-    alone = of(lower, capacity_ah=TRUTH.cell.capacity_ah, initial_soc=0.93)
-    assert alone.tests[0].start_soc == 0.93
+    result = sources_of(full, lower, capacity_ah=TRUTH.cell.capacity_ah)
+    assert [test.start_soc for test in result.tests] == [1.0, pytest.approx(0.93, abs=5e-3)]
+    assert result.sources[1].notes == (f"starts at SOC {result.tests[1].start_soc:.3f}",)
+    only_lower = sources_of(lower, capacity_ah=TRUTH.cell.capacity_ah, initial_soc=0.93)
+    assert only_lower.tests[0].start_soc == 0.93
 
 
 def test_rests_after_charge_within_a_test_are_less_certain():
-    """Some rounds of the test contain regeneration."""
+    """In some rounds of the test, the load is a charge."""
     current_a = schedule(rounds=17)
     is_load = current_a > 0.0
     current_a[is_load & (np.cumsum(np.diff(is_load, prepend=False) & is_load) % 5 == 4)] *= -0.5
-    test = of(capture(current_a, soc=1.0), capacity_ah=TRUTH.cell.capacity_ah)
+    test = sources_of(capture(current_a, soc=1.0), capacity_ah=TRUTH.cell.capacity_ah)
     points, rests = test.points, test.tests[0].rests
-    charged = np.array([rest.after_charge for rest in rests])
-    assert 2 <= charged.sum() < 5
+    after_charge = np.array([rest.after_charge for rest in rests])
+    assert 2 <= after_charge.sum() < 5
     grid = np.linspace(points.soc[0], 0.95, 50)
-    plain = fit_table(of(relaxation(), capacity_ah=TRUTH.cell.capacity_ah).points)
-    assert fit_table(points)(grid) == pytest.approx(plain(grid), abs=4e-3)
-    by_soc = charged[np.argsort(test.tests[0].soc, kind="stable")]
+    uncorrected = fit_table(sources_of(relaxation(), capacity_ah=TRUTH.cell.capacity_ah).points)
+    assert fit_table(points)(grid) == pytest.approx(uncorrected(grid), abs=4e-3)
+    by_soc = after_charge[np.argsort(test.tests[0].soc, kind="stable")]
     assert points.std_v[by_soc].min() > np.median(points.std_v[~by_soc])
 
 
 def test_pairs_at_several_temperatures_determine_de_dt():
     per_kelvin_v = 3e-4
-    runs = [slow((1.0, -1.0), temperature_c=t, off_v=per_kelvin_v * (t - 25.0)) for t in (10.0, 25.0, 45.0)]
-    fit = fit_table(of(*runs).points)
+    runs = [slow((1.0, -1.0), temperature_c=t, offset_v=per_kelvin_v * (t - 25.0)) for t in (10.0, 25.0, 45.0)]
+    fit = fit_table(sources_of(*runs).points)
     assert fit.per_kelvin_v is not None
     assert np.median(fit.per_kelvin_v) == pytest.approx(per_kelvin_v, rel=0.3)
     assert np.abs((fit.ocv_v - true_v(NODES))[INSIDE]).max() < 3e-3
@@ -198,28 +201,28 @@ def test_pairs_at_several_temperatures_determine_de_dt():
 )
 def test_unusable_captures_are_rejected_with_their_numbers(samples, capacity_ah, message):
     with pytest.raises(UserError, match=message):
-        of(samples(), capacity_ah=capacity_ah)
+        sources_of(samples(), capacity_ah=capacity_ah)
 
 
 def test_a_slow_discharge_with_the_wrong_sign_is_rejected():
     samples = slow((1.0,))
     samples["current_a"] *= -1.0
     with pytest.raises(UserError, match=r"wrong sign: charge from 3600 s on .*--current-sign"):
-        of(samples)
+        sources_of(samples)
 
 
 def test_lfp_pairs_at_three_temperatures_give_one_curve(shared_data):
     folder = shared_data / "a123"
-    names = [f"c30_{way}_{at}.csv.gz" for at in ("p25", "p05", "n15") for way in ("dis", "chg")]
-    found = find_sources([Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=None)
-    assert found.capacity_ah == pytest.approx(2.06, abs=0.005)
-    assert [round(source.temperature_c) for source in found.sources] == [25, 5, -15]
-    half_v = np.interp(NODES, GRID, found.sources[0].hysteresis_v)
+    names = [f"c30_{direction}_{at}.csv.gz" for at in ("p25", "p05", "n15") for direction in ("dis", "chg")]
+    result = find_sources([Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=None)
+    assert result.capacity_ah == pytest.approx(2.06, abs=0.005)
+    assert [round(source.temperature_c) for source in result.sources] == [25, 5, -15]
+    half_v = np.interp(NODES, GRID, result.sources[0].hysteresis_v)
     assert 0.005 < half_v[INSIDE].min() < half_v[INSIDE].max() < 0.03
-    assert found.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v)
-    assert found.hysteresis_std_v == pytest.approx(REST_SHARE_STD * half_v)
-    fit = fit_table(found.points)
-    warm = found.sources[0].points
+    assert result.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v)
+    assert result.hysteresis_std_v == pytest.approx(REST_SHARE_STD * half_v)
+    fit = fit_table(result.points)
+    warm = result.sources[0].points
     plateau = (warm.soc > 0.15) & (warm.soc < 0.95)
     assert np.abs(fit(warm.soc) - warm.ocv_v)[plateau].max() < 3e-3
 
@@ -227,12 +230,12 @@ def test_lfp_pairs_at_three_temperatures_give_one_curve(shared_data):
 def test_the_hysteresis_of_a_cold_pair_is_converted_to_25_c(shared_data):
     folder, mean_v = shared_data / "a123", {}
     for at in ("p25", "n15"):
-        names = [f"c30_{way}_{at}.csv.gz" for way in ("dis", "chg")]
-        found = find_sources(
+        names = [f"c30_{direction}_{at}.csv.gz" for direction in ("dis", "chg")]
+        result = find_sources(
             [Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=2.06
         )
-        size = arrhenius(HYSTERESIS_J, found.sources[0].temperature_c)
-        half_v = np.interp(NODES, GRID, found.sources[0].hysteresis_v)
-        assert found.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v / size)
-        mean_v[at] = found.hysteresis_v[INSIDE].mean()
+        temperature_factor = arrhenius(HYSTERESIS_J, result.sources[0].temperature_c)
+        half_v = np.interp(NODES, GRID, result.sources[0].hysteresis_v)
+        assert result.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v / temperature_factor)
+        mean_v[at] = result.hysteresis_v[INSIDE].mean()
     assert 0.7 < mean_v["n15"] / mean_v["p25"] < 1.8

@@ -1,4 +1,7 @@
-"""Schemes 1 to 3 and the improved method through the estimator, and Algorithm 1 over a whole discharge."""
+"""Schemes 1 to 3 and the improved law of the thesis in the estimator, and its Algorithm 1 over a whole discharge.
+
+Numbers in parentheses are equations of the thesis.
+"""
 
 import numpy as np
 import pytest
@@ -14,53 +17,55 @@ from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 
 CELL = load_cell("chen_mora")
 SMALL = [1, 3, 6, 13, 15]
+"""Indices of the parameters below the default epsilon of scheme 2."""
 LARGE = [i for i in range(1, 16) if i not in SMALL]
-DISTURBED_V, DISTURBED = 0.3, 500
-"""Voltage error and number of samples: e, and with it the drive of (3.16), is far from zero."""
+DISTURBANCE_V = 0.3
+"""Error of the measured voltage, so that e, which drives (3.16), is far from zero [V]."""
+DISTURBED_SAMPLES = 500
 
 
-def settings(law, **others):
+def make_settings(law, **others):
     """Return settings of the printed law: no dead zone, no rearming of k, no loss of lock."""
     printed = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "lock_error_v": 100.0}
     return ObserverSettings.model_validate(printed | others)
 
 
 @pytest.fixture(scope="module")
-def disturbed():
+def disturbed_samples():
     """Return samples of half a minute at 1C and 100 Hz, the first seconds with a voltage error."""
     samples = discharge(CELL, 0.275, 0.01)[:3000]
-    samples["voltage_v"][:DISTURBED] -= DISTURBED_V
+    samples["voltage_v"][:DISTURBED_SAMPLES] -= DISTURBANCE_V
     return samples
 
 
-def moved(law, samples, cell=CELL):
+def parameter_change(law, samples, cell=CELL):
     """Return the change of a1..a15 at index 1..15, and that of k, the integral of e^2 over the run (3.13)."""
-    estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
+    estimator = Estimator(cell, make_settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     estimator.run(samples)
     change = estimator.state["a"][0] - estimator.settings["a_initial"][0]
     return change, float(estimator.state["k"][0] - estimator.settings["k0"][0])
 
 
 @pytest.mark.parametrize("every", [1, 10, 100])
-def test_scheme_1_changes_every_parameter_by_the_increase_of_k(disturbed, every):
-    """(3.16) and (3.13) integrate the same e^2, at 100, 10 and 1 Hz."""
-    change, integral = moved("scheme-1", disturbed[::every])
+def test_scheme_1_changes_every_parameter_by_the_increase_of_k(disturbed_samples, every):
+    """(3.16) and (3.13) both integrate e^2, at 100, 10 and 1 Hz."""
+    change, integral = parameter_change("scheme-1", disturbed_samples[::every])
     assert integral > 1e-3
     assert change[1:] == pytest.approx(np.full(15, integral), rel=1e-6)
 
 
-def test_scheme_2_returns_small_parameters_to_their_initial_values(disturbed):
-    change, integral = moved("scheme-2", disturbed)
+def test_scheme_2_returns_small_parameters_to_their_initial_values(disturbed_samples):
+    change, integral = parameter_change("scheme-2", disturbed_samples)
     assert change[LARGE] == pytest.approx(np.full(10, integral), rel=1e-6)
     assert np.abs(change[SMALL]).max() < 1e-3 * integral
-    while_disturbed, _ = moved("scheme-2", disturbed[:3])
+    while_disturbed, _ = parameter_change("scheme-2", disturbed_samples[:3])
     assert (while_disturbed[SMALL] > 1e-4).all()  # the parameters return afterwards and were not constant
     assert while_disturbed[1] == pytest.approx(while_disturbed[3], rel=1e-9)
 
 
-def test_scheme_2_holds_what_lies_below_its_epsilon(disturbed):
+def test_scheme_2_holds_what_lies_below_its_epsilon(disturbed_samples):
     estimator = Estimator(
-        CELL, settings("scheme-2", scheme_2_epsilon=7.0, scheme_2_lambda=50.0), initial_soc=1.0, identifier=None
+        CELL, make_settings("scheme-2", scheme_2_epsilon=7.0, scheme_2_lambda=50.0), initial_soc=1.0, identifier=None
     )
     assert estimator.settings["rate"][0, [1, 3, 4, 6, 13, 15]].tolist() == [50.0] * 6
     assert estimator.settings["rate"][0, [2, 5, 7, 14]].tolist() == [0.0] * 4
@@ -68,26 +73,30 @@ def test_scheme_2_holds_what_lies_below_its_epsilon(disturbed):
 
 @pytest.mark.parametrize(("law", "last"), [("scheme-3", 15), ("improved", 12)])
 @pytest.mark.parametrize("factor", [0.05, 1.0, 40.0])
-def test_bounded_laws_converge_to_their_limits_from_any_initial_value(disturbed, law, last, factor):
+def test_bounded_laws_converge_to_their_limits_from_any_initial_value(disturbed_samples, law, last, factor):
     """(3.18): the limit of Lemma 4.1.3 once the error is gone."""
     bounds = {
         i: CELL.bounds(i).model_copy(update={"initial": factor * CELL.bounds(i).limit}) for i in range(1, last + 1)
     }
     cell = with_bounds(CELL, bounds)
-    estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
-    estimator.run(disturbed)
+    estimator = Estimator(cell, make_settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
+    estimator.run(disturbed_samples)
     found = estimator.state["a"][0]
     assert found[1 : last + 1] == pytest.approx([bounds[i].limit for i in range(1, last + 1)], rel=1e-4)
     assert found[last + 1 : 16] == pytest.approx(CELL.a[last + 1 : 16], rel=1e-15)  # a13..a15 come from (4.2)
 
 
-def test_scheme_3_converges_to_the_limits_of_table_4(disturbed):
+def test_scheme_3_converges_to_the_limits_of_table_4(disturbed_samples):
     table_4 = {1: (0.30, 0.25), 3: (0.045, 0.03), 6: (0.05, 0.04), 13: (0.15, 0.1), 15: (0.07, 0.04)}
     bounds = {i: Bounds(upper=u, lower=low, weight_upper=100.0, weight_lower=1.0) for i, (u, low) in table_4.items()}
     estimator = Estimator(
-        with_bounds(CELL, bounds), settings("scheme-3"), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+        with_bounds(CELL, bounds),
+        make_settings("scheme-3"),
+        voltage_resolution_v=1e-6,
+        initial_soc=1.0,
+        identifier=None,
     )
-    estimator.run(disturbed)
+    estimator.run(disturbed_samples)
     limits = [0.2995050, 0.0448515, 0.0499010, 0.1495050, 0.0697030]
     assert estimator.state["a"][0, SMALL] == pytest.approx(limits, rel=1e-4)
 
@@ -97,7 +106,7 @@ def test_output_equation_of_each_law(law):
     """(3.14) with its loop through u = -N e closed for the schemes, (4.1) for the improved method."""
     samples = discharge(CELL, 0.275, 0.01)[:40]
     samples["voltage_v"] -= 0.1
-    estimator = Estimator(CELL, settings(law, k0=0.3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
+    estimator = Estimator(CELL, make_settings(law, k0=0.3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     for time_s, current_a, voltage_v, *_ in samples.tolist():
         state = estimator.state[0].copy()
         estimator.step(time_s, current_a, voltage_v)
@@ -115,7 +124,7 @@ def converged():
     """Algorithm 1 at C/10, 1 Hz."""
     samples = discharge(CELL, 0.0275, 1.0)
     estimator = Estimator(
-        CELL, settings("improved", epsilon_v=1e-3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+        CELL, make_settings("improved", epsilon_v=1e-3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
     )
     return adaptive_run(estimator, samples)
 
@@ -155,7 +164,7 @@ def test_algorithm_1_reports_why_it_did_not_converge():
 
     def outcome(block, **others):
         estimator = Estimator(
-            CELL, settings("improved", **others), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+            CELL, make_settings("improved", **others), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
         )
         return adaptive_run(estimator, block).outcome
 
@@ -167,7 +176,7 @@ def test_algorithm_1_reports_why_it_did_not_converge():
 def test_error_of_a_run_is_that_of_the_observer_with_the_identifier_enabled():
     samples = discharge(CELL, 0.055, 1.0)[:150]  # every sample is a snapshot
     once, again = (
-        Estimator(CELL, settings("improved"), identifier=IdentifierSettings(), initial_soc=0.9) for _ in range(2)
+        Estimator(CELL, make_settings("improved"), identifier=IdentifierSettings(), initial_soc=0.9) for _ in range(2)
     )
     trace = again.run(samples)
     assert np.abs(trace["tracking_error_v"] - trace["innovation_v"]).max() > 1e-3

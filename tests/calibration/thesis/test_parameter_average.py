@@ -1,4 +1,4 @@
-"""Means over the settled part of a run (3.19), with t_int and t_unst found or given."""
+"""Means of the parameters over a time window, (3.19) of the thesis. The ends t_int and t_unst are detected or given."""
 
 import numpy as np
 import pytest
@@ -16,12 +16,12 @@ SETTINGS = ObserverSettings.model_validate({"dead_zone_v": 0.0, "rearm_gain": No
 TIME_S = np.arange(0.0, 1000.0)
 
 
-def run(samples, **given):
+def run_algorithm(samples, **ends):
     estimator = Estimator(CELL, SETTINGS, voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
-    return adaptive_run(estimator, samples, **given)
+    return adaptive_run(estimator, samples, **ends)
 
 
-def find(error_v=None, voltage_v=None, margin=None, a=None, **given):
+def find_window(error_v=None, voltage_v=None, margin=None, a=None, **ends):
     """Return the averaging window of a run of 1000 s that contains only the given events."""
     return averaging_window(
         TIME_S,
@@ -30,7 +30,7 @@ def find(error_v=None, voltage_v=None, margin=None, a=None, **given):
         np.ones(TIME_S.size) if margin is None else margin,
         np.ones((TIME_S.size, 16)) if a is None else a,
         1e-3,
-        **given,
+        **ends,
     )
 
 
@@ -41,39 +41,40 @@ def samples():
 
 
 def test_a_simulated_discharge_is_averaged_from_settling_to_instability(samples):
-    found = run(samples)
-    window = found.window
+    result = run_algorithm(samples)
+    window = result.window
     assert 0.0 < window.t_int_s < 60.0  # a1 to a12 start far from their limits
     assert window.start_reason == "99 % of the later errors are within 1.00 mV"
     assert window.end_reason == "knee of the voltage"
-    assert 0.9 * samples["time_s"][-1] < window.t_unst_s < found.crossings[1].time_s
+    assert 0.9 * samples["time_s"][-1] < window.t_unst_s < result.crossings[1].time_s
     limits = [CELL.bounds(i).limit for i in range(1, 13)]
-    assert found.average[1:13] == pytest.approx(limits, rel=1e-4)
+    assert result.average[1:13] == pytest.approx(limits, rel=1e-4)
 
 
-def test_override_of_both_ends():
-    """From the first sample on the mean includes the path from a_i(t0): limit + (a_i(t0) - limit) / (rate t), by
-    (4.5)."""
-    found = run(discharge(CELL, 0.055, 0.01)[:50_000], t_int_s=0.0, t_unst_s=400.0)
-    assert found.window == AveragingWindow(0.0, 400.0, "given", "given")
+def test_both_ends_can_be_given():
+    """By (4.5), the mean from the first sample on is limit + (a_i(t0) - limit) / (rate t)."""
+    result = run_algorithm(discharge(CELL, 0.055, 0.01)[:50_000], t_int_s=0.0, t_unst_s=400.0)
+    assert result.window == AveragingWindow(0.0, 400.0, "given", "given")
     for i in (1, 3, 4, 6, 8, 12):
         bounds = CELL.bounds(i)
-        way = (bounds.initial - bounds.limit) / (bounds.rate * 400.0)
-        assert found.average[i] - bounds.limit == pytest.approx(way, rel=0.15)  # trapezoids at 100 Hz
+        expected_deviation = (bounds.initial - bounds.limit) / (bounds.rate * 400.0)
+        assert result.average[i] - bounds.limit == pytest.approx(
+            expected_deviation, rel=0.15
+        )  # error of trapezoids at 100 Hz
 
 
-def test_override_of_one_end_does_not_change_the_other(samples):
-    automatic = run(samples).window
-    later = run(samples, t_int_s=1000.0).window
+def test_a_given_end_does_not_change_the_other_end(samples):
+    automatic = run_algorithm(samples).window
+    later = run_algorithm(samples, t_int_s=1000.0).window
     assert (later.t_int_s, later.start_reason) == (1000.0, "given")
     assert (later.t_unst_s, later.end_reason) == (automatic.t_unst_s, automatic.end_reason)
-    earlier = run(samples, t_unst_s=5000.0).window
+    earlier = run_algorithm(samples, t_unst_s=5000.0).window
     assert (earlier.t_unst_s, earlier.end_reason) == (5000.0, "given")
     assert earlier.t_int_s == pytest.approx(automatic.t_int_s, abs=1.0)
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("ends", "message"),
     [
         ({"t_unst_s": -1.0}, "t_unst = -1 s: must lie within 0 to 999 s of the run"),
         ({"t_unst_s": 2000.0}, "t_unst = 2000 s: must lie within 0 to 999 s of the run"),
@@ -82,51 +83,54 @@ def test_override_of_one_end_does_not_change_the_other(samples):
         ({"t_int_s": 500.0, "t_unst_s": 400.0}, "t_int = 500 s: must lie within 0 to 400 s of the run"),
     ],
 )
-def test_override_outside_the_run_is_rejected(given, message):
+def test_an_end_outside_the_run_is_rejected(ends, message):
     with pytest.raises(UserError, match=message):
-        find(**given)
+        find_window(**ends)
 
 
 def test_t_int_is_the_time_at_which_the_error_has_settled():
-    window = find(error_v=np.where(TIME_S < 120.0, 5e-3, 2e-4))
+    window = find_window(error_v=np.where(TIME_S < 120.0, 5e-3, 2e-4))
     assert window.t_int_s == pytest.approx(112.0, abs=9.0)  # one sample in a hundred may be beyond the limit
     assert "99 % of the later errors are within 1.00 mV" in window.start_reason
     spikes = np.where((TIME_S < 50.0) | (TIME_S % 300.0 == 299.0), 5e-3, 0.0)
-    assert 40.0 <= find(error_v=spikes).t_int_s <= 50.0
+    assert 40.0 <= find_window(error_v=spikes).t_int_s <= 50.0
 
 
 def test_t_int_is_after_the_settling_of_the_parameters():
     a = np.ones((TIME_S.size, 16))
     a[:, 4] += 10.0 * np.exp(-TIME_S / 20.0)
-    window = find(a=a)
+    window = find_window(a=a)
     assert window.t_int_s == pytest.approx(20.0 * np.log(1e4), abs=1.5)  # within 0.1 % of the median
     assert "every later a_i is within 0.1 % of its median" in window.start_reason
 
 
 def test_an_error_that_never_settles_leaves_no_window():
-    window = find(error_v=np.full(TIME_S.size, 0.0123))
+    window = find_window(error_v=np.full(TIME_S.size, 0.0123))
     assert window.start_reason == "the error never settles within 1.00 mV"
     assert window.t_int_s == TIME_S[-1]
 
 
 def test_t_unst_is_the_first_of_margin_knee_and_end():
-    assert (find().t_unst_s, find().end_reason) == (TIME_S[-1], "end of the run")
+    assert (find_window().t_unst_s, find_window().end_reason) == (TIME_S[-1], "end of the run")
     margin = np.where(TIME_S >= 900.0, -1e-3, 0.1)
-    assert (find(margin=margin).t_unst_s, find(margin=margin).end_reason) == (900.0, "SOC reached max(delta1, delta2)")
+    assert (find_window(margin=margin).t_unst_s, find_window(margin=margin).end_reason) == (
+        900.0,
+        "SOC reached max(delta1, delta2)",
+    )
     knee = np.linspace(4.2, 3.6, TIME_S.size) - np.maximum(TIME_S - 800.0, 0.0) * 0.01
-    window = find(voltage_v=knee, margin=margin)
+    window = find_window(voltage_v=knee, margin=margin)
     assert window.end_reason == "knee of the voltage"
     assert window.t_unst_s == pytest.approx(800.0, abs=12.0)
-    dip = np.linspace(4.2, 3.6, TIME_S.size) - np.where((TIME_S > 500.0) & (TIME_S < 520.0), 0.3, 0.0)
-    assert find(voltage_v=dip).end_reason == "end of the run"  # a temporary load is no knee
+    temporary_load = np.linspace(4.2, 3.6, TIME_S.size) - np.where((TIME_S > 500.0) & (TIME_S < 520.0), 0.3, 0.0)
+    assert find_window(voltage_v=temporary_load).end_reason == "end of the run"  # a temporary load is no knee
 
 
 def test_mean_over_uneven_steps_is_the_integral():
     time_s = np.cumsum(np.random.default_rng(1).uniform(0.01, 2.0, 5000))
     a = np.tile(time_s[:, None], (1, 16))  # a_i(t) = t, whose mean is the middle
-    inside = time_s[(time_s >= 500.0) & (time_s <= 2000.0)]
-    found = averaged(time_s, a, AveragingWindow(500.0, 2000.0, "given", "given"))
-    assert found == pytest.approx(np.full(16, 0.5 * (inside[0] + inside[-1])), rel=1e-9)
+    times_in_window = time_s[(time_s >= 500.0) & (time_s <= 2000.0)]
+    result = averaged(time_s, a, AveragingWindow(500.0, 2000.0, "given", "given"))
+    assert result == pytest.approx(np.full(16, 0.5 * (times_in_window[0] + times_in_window[-1])), rel=1e-9)
 
 
 def test_mean_over_an_empty_window_is_the_last_value():

@@ -1,4 +1,4 @@
-"""Validation with frozen parameters (5.3), the static model of chapter 6, and SOC by interpolation (7.1)."""
+"""Prediction of the voltage by models of the thesis: frozen parameters (5.3), the static model of chapter 6, SOC by (7.1)."""
 
 import dataclasses
 
@@ -16,8 +16,8 @@ from tests.calibration.simulated_load import TRUTH, capture, constant, steps, wr
 CELL = load_cell("chen_mora")
 
 
-def pulses(current_a=1.5, half_s=600, rounds=12):
-    return np.tile(np.r_[np.full(half_s, current_a), np.zeros(half_s)], rounds)
+def pulses(current_a=1.5, pulse_s=600, rounds=12):
+    return np.tile(np.r_[np.full(pulse_s, current_a), np.zeros(pulse_s)], rounds)
 
 
 LOADS = {"constant": constant(1.5, 7000), "pulse": pulses(), "variable steps": steps(4)}
@@ -48,13 +48,13 @@ def test_a_voltage_error_of_one_percent_is_reported_as_one_percent():
     assert run.max_percent == pytest.approx(1.0, abs=2e-3)
 
 
-@pytest.mark.parametrize("frozen_at", [0.1, 0.5, 0.9])
-def test_static_elements_are_those_of_one_soc_everywhere(frozen_at):
-    frozen = static_elements(CELL.a, frozen_at)
+@pytest.mark.parametrize("soc_of_elements", [0.1, 0.5, 0.9])
+def test_static_elements_are_those_of_one_soc_everywhere(soc_of_elements):
+    static_a = static_elements(CELL.a, soc_of_elements)
     for element in (r_ts, r_tl, c_ts, c_tl, r_s):
-        expected = element(frozen_at, CELL.a)
-        assert [element(x, frozen) for x in (0.02, 0.5, 1.0)] == pytest.approx([expected] * 3, rel=1e-9)
-    assert frozen[16:22] == pytest.approx(CELL.a[16:22])
+        expected = element(soc_of_elements, CELL.a)
+        assert [element(x, static_a) for x in (0.02, 0.5, 1.0)] == pytest.approx([expected] * 3, rel=1e-9)
+    assert static_a[16:22] == pytest.approx(CELL.a[16:22])
 
 
 @pytest.mark.parametrize("load", ["pulse", "variable steps"])
@@ -63,31 +63,33 @@ def test_the_dynamic_model_is_better_than_the_static_one_where_elements_rise(loa
     dynamic = predict(TRUTH, samples, 0.98)
     static = predict(TRUTH, samples, 0.98, a=static_elements(TRUTH.a, 0.5))
     assert static.mean_percent > 2.0 * dynamic.mean_percent
-    low = static.soc < 0.15
-    assert static.error_percent[low].mean() > 3.0 * static.error_percent[~low].mean()
-    near = np.abs(static.soc - 0.5) < 0.02
-    assert np.abs(static.error_v[near]).max() < 4e-3  # near the SOC of the static model both agree
+    near_empty = static.soc < 0.15
+    assert static.error_percent[near_empty].mean() > 3.0 * static.error_percent[~near_empty].mean()
+    at_soc_of_static_model = np.abs(static.soc - 0.5) < 0.02
+    assert (
+        np.abs(static.error_v[at_soc_of_static_model]).max() < 4e-3
+    )  # both models agree at the SOC of the static model
 
 
 def test_given_parameters_replace_those_of_the_cell():
     samples = capture(LOADS["pulse"])
-    given = predict(TRUTH, samples, 0.98, a=wrong_start().a, lowest_soc=0.1)
-    own = predict(wrong_start(), samples, 0.98, lowest_soc=0.1)
-    assert np.array_equal(given.predicted_v, own.predicted_v)
+    with_given_parameters = predict(TRUTH, samples, 0.98, a=wrong_start().a, lowest_soc=0.1)
+    with_own_parameters = predict(wrong_start(), samples, 0.98, lowest_soc=0.1)
+    assert np.array_equal(with_given_parameters.predicted_v, with_own_parameters.predicted_v)
 
 
 def test_prediction_ends_before_a_capacitance_is_negative():
     samples = discharge(CELL, 0.275, 1.0)
-    worst = max(delta(CELL.a[8], CELL.a[9], CELL.a[7]), delta(CELL.a[11], CELL.a[12], CELL.a[10]))
-    assert worst == pytest.approx(0.011156, abs=1e-6)  # E13
+    max_delta = max(delta(CELL.a[8], CELL.a[9], CELL.a[7]), delta(CELL.a[11], CELL.a[12], CELL.a[10]))
+    assert max_delta == pytest.approx(0.011156, abs=1e-6)  # erratum 13 of the thesis
     run = predict(CELL, samples, 1.0)
-    assert worst < run.soc[-1] < 1.1 * worst
+    assert max_delta < run.soc[-1] < 1.1 * max_delta
     assert samples["time_s"].size > run.time_s.size
     assert np.isfinite(run.predicted_v).all()
     assert predict(CELL, samples, 1.0, lowest_soc=0.2).soc[-1] == pytest.approx(0.2, abs=1e-3)
 
 
-@pytest.mark.parametrize(("lowest_soc", "floor"), [(0.02, "0.020"), (0.0, "0.012")])  # delta2 is 0.011, E13
+@pytest.mark.parametrize(("lowest_soc", "floor"), [(0.02, "0.020"), (0.0, "0.012")])  # delta2 is 0.011
 def test_a_start_below_the_lowest_soc_is_rejected(lowest_soc, floor):
     samples = discharge(CELL, 0.275, 1.0)
     message = rf"{CELL.cell.name}: SOC is 0\.010 at the first sample, and the prediction ends below {floor}"

@@ -1,4 +1,4 @@
-"""Step 3: R_s by (4.2) and its fit (2.9) for a known cell."""
+"""R_s by (4.2) of the thesis and its fit (2.9), step 3 of the procedure of the thesis, for a known cell."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def true_ohm(soc, cell=CELL):
     return np.array([r_s(x, cell.a) for x in soc])
 
 
-def curve(current_a, noise_v=0.0):
+def r_s_of_load(current_a, noise_v=0.0):
     """Return R_s by (4.2) from one constant load with the true a1..a12."""
     samples = discharge(CELL, current_a, 1.0)
     samples["voltage_v"] += noise_v * np.random.default_rng(1).standard_normal(samples.size)
@@ -33,20 +33,20 @@ def curve(current_a, noise_v=0.0):
 
 
 @pytest.fixture(scope="module")
-def curves():
-    return [curve(current_a, noise_v=0.5e-3) for current_a in CURRENTS_A]
+def r_s_of_loads():
+    return [r_s_of_load(current_a, noise_v=0.5e-3) for current_a in CURRENTS_A]
 
 
 def test_equation_4_2_gives_the_true_resistance_at_every_current():
     for current_a in CURRENTS_A:
-        found = curve(current_a)
-        assert found.soc.size > 95
-        inside = found.soc > 0.05
-        assert found.r_s_ohm[inside] == pytest.approx(true_ohm(found.soc)[inside], rel=0.01)
+        result = r_s_of_load(current_a)
+        assert result.soc.size > 95
+        inside = result.soc > 0.05
+        assert result.r_s_ohm[inside] == pytest.approx(true_ohm(result.soc)[inside], rel=0.01)
 
 
-def test_fit_to_several_noisy_currents_is_within_2_percent(curves):
-    fit = fit_series_resistance(mean_of(curves), 0.05)
+def test_fit_to_several_noisy_currents_is_within_2_percent(r_s_of_loads):
+    fit = fit_series_resistance(mean_of(r_s_of_loads), 0.05)
     assert fit(SOC) == pytest.approx(true_ohm(SOC), rel=0.02)
     assert fit.a == pytest.approx(CELL.a[13:16], rel=0.05)
     assert np.isfinite(fit.std).all()
@@ -56,51 +56,56 @@ def test_fit_to_several_noisy_currents_is_within_2_percent(curves):
 
 
 def test_steps_with_rests_give_the_series_resistance():
-    """Another cell at 1 Hz with 0.5 mV of noise. Only samples under load contribute."""
+    """Samples of the cell at 1 Hz have 0.5 mV of noise. Only samples under load contribute."""
     samples = capture(steps(3), soc=0.98)
     run = predict(TRUTH, samples, 0.98, lowest_soc=0.05)
-    found = series_resistance(TRUTH, run)
-    assert found.r_s_ohm == pytest.approx(true_ohm(found.soc, TRUTH), rel=0.03)  # a bin may hold a few samples only
-    fit = fit_series_resistance(found)
-    soc = np.linspace(found.soc.min(), 0.95, 50)
+    result = series_resistance(TRUTH, run)
+    assert result.r_s_ohm == pytest.approx(true_ohm(result.soc, TRUTH), rel=0.03)  # some bins have few samples
+    fit = fit_series_resistance(result)
+    soc = np.linspace(result.soc.min(), 0.95, 50)
     assert fit(soc) == pytest.approx(true_ohm(soc, TRUTH), rel=0.02)
 
 
 def test_mean_over_currents_is_weighted_by_the_squared_current():
     first = SeriesResistance(np.array([0.205, 0.305, 0.405]), np.full(3, 1.0), np.full(3, 3.0))
     second = SeriesResistance(np.array([0.305, 0.405, 0.505]), np.full(3, 3.0), np.full(3, 1.0))
-    both = mean_of([first, second])
-    assert both.soc == pytest.approx([0.205, 0.305, 0.405, 0.505])
-    assert both.r_s_ohm == pytest.approx([1.0, 1.5, 1.5, 3.0])
-    assert both.weight == pytest.approx([3.0, 4.0, 4.0, 1.0])
+    mean_curve = mean_of([first, second])
+    assert mean_curve.soc == pytest.approx([0.205, 0.305, 0.405, 0.505])
+    assert mean_curve.r_s_ohm == pytest.approx([1.0, 1.5, 1.5, 3.0])
+    assert mean_curve.weight == pytest.approx([3.0, 4.0, 4.0, 1.0])
 
 
 def test_an_error_of_the_open_circuit_voltage_has_the_weight_of_its_current():
-    """10 mV are 65 mohm at C/20 of a cell of 3 Ah (E19): beside 1.5 A they move R_s by their share of the squares."""
+    """By erratum 19 of the thesis, 10 mV are 65 mohm at C/20 of a cell of 3 Ah.
+
+    In the mean with a load of 1.5 A, R_s by each load is weighted by the square of its current.
+    """
     cell = TRUTH.model_copy(
         update={"ocv": TRUTH.ocv.model_copy(update={"ocv_v": tuple(v + 0.01 for v in TRUTH.ocv.ocv_v)})}
     )
     runs = [
-        predict(TRUTH, capture(constant(amps, seconds), soc=0.9, noise_v=0.0), 0.9, lowest_soc=0.3)
-        for amps, seconds in ((0.153, 40_000), (1.5, 5_000))
+        predict(TRUTH, capture(constant(load_a, seconds), soc=0.9, noise_v=0.0), 0.9, lowest_soc=0.3)
+        for load_a, seconds in ((0.153, 40_000), (1.5, 5_000))
     ]
     slow, fast = (series_resistance(cell, run) for run in runs)
-    slow_off, fast_off = (curve.r_s_ohm - true_ohm(curve.soc, TRUTH) for curve in (slow, fast))
-    assert np.median(slow_off) == pytest.approx(0.01 / 0.153, rel=0.01)
-    assert np.median(fast_off) == pytest.approx(0.01 / 1.5, rel=0.01)
-    both = mean_of([slow, fast])
+    slow_error_ohm, fast_error_ohm = (
+        r_s_of_load.r_s_ohm - true_ohm(r_s_of_load.soc, TRUTH) for r_s_of_load in (slow, fast)
+    )
+    assert np.median(slow_error_ohm) == pytest.approx(0.01 / 0.153, rel=0.01)
+    assert np.median(fast_error_ohm) == pytest.approx(0.01 / 1.5, rel=0.01)
+    mean_curve = mean_of([slow, fast])
     expected = (0.153 * 0.01 + 1.5 * 0.01) / (0.153**2 + 1.5**2)
-    assert np.median(both.r_s_ohm - true_ohm(both.soc, TRUTH)) == pytest.approx(expected, rel=0.01)
+    assert np.median(mean_curve.r_s_ohm - true_ohm(mean_curve.soc, TRUTH)) == pytest.approx(expected, rel=0.01)
 
 
 def test_errors_of_the_rc_pairs_become_part_of_r_s():
-    """Under a slow load only the sum of the resistances is determined (Table 6)."""
+    """Under a slow load only the sum of the resistances is determined, as in Table 6 of the thesis."""
     a = np.array(CELL.a)
     a[3] += 0.02  # R_ts too high by 20 mohm
     samples = discharge(CELL, 0.1, 1.0)
-    found = series_resistance(CELL, predict(CELL, samples, 1.0, a=a, lowest_soc=0.1))
-    settled = (found.soc > 0.2) & (found.soc < 0.9)
-    assert found.r_s_ohm[settled] == pytest.approx(true_ohm(found.soc)[settled] - 0.02, abs=5e-4)
+    result = series_resistance(CELL, predict(CELL, samples, 1.0, a=a, lowest_soc=0.1))
+    settled = (result.soc > 0.2) & (result.soc < 0.9)
+    assert result.r_s_ohm[settled] == pytest.approx(true_ohm(result.soc)[settled] - 0.02, abs=5e-4)
 
 
 def test_a_constant_resistance_has_no_amplitude_and_no_std():

@@ -370,7 +370,7 @@ def test_unlikely_hypotheses_are_removed_and_similar_ones_merged() -> None:
 
 @pytest.mark.parametrize("true", [0, 1])
 def test_a_hypothesis_with_a_large_bias_loses_weight(true: int) -> None:
-    """The biases of the soc_error hypothesis, 0.2 V, have absorbed its error, so that its innovations are small."""
+    """The biases of the wrong hypothesis, 0.2 V, have absorbed its error, so that its innovations are small."""
     p, socs = make_settings(), (0.4, 0.7)
     s, _ = make_hypotheses(p, 2)
     voltage_v = 0.0
@@ -395,7 +395,7 @@ FAST = Case("100 Hz", rate_hz=100.0, hours=0.25, unseen_h=0.3, seed=5)
 
 
 def make_estimator(drive, soc_error=0.2):
-    """Return an estimator with a soc_error initial SOC."""
+    """Return an estimator with a wrong initial SOC."""
     return Estimator(drive.cell, initial_soc=float(drive.soc[0] + soc_error))
 
 

@@ -15,7 +15,7 @@ PARAMETERS = len(chen_mora_sensitivity.NAMES)
 CONSTANTS = np.array([0.075, 0.047, 33.0, 0.05, 223.0, 3.8, 0.0, 0.0])
 """Constants of the model: R_s [ohm], R_ts [ohm], tau_ts [s], R_tl [ohm], tau_tl [s], OCV [V], and two unused ones."""
 LOAD = [(0.3, 1.0), (-0.2, 40.0), (0.0, 300.0), (0.5, 0.01), (0.1, 90.0)]
-"""Currents [FILE_A] and durations [s]."""
+"""Load: currents [A] and durations [s]."""
 thetas = st.lists(st.floats(-1.2, 1.2), min_size=PARAMETERS, max_size=PARAMETERS)
 
 
