@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.edge.block import Block, encode
 from bms_estimator.edge import subjects
+from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs import pack_bucket, pack_row
 from tests.command_line import run
