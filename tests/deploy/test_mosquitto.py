@@ -235,12 +235,12 @@ async def test_too_large_message_is_not_forwarded(broker):
         await estimator.subscribe("bms/pack/request/+")
         with contextlib.suppress(aiomqtt.MqttError):
             async with client(broker, "homeassistant") as flooder, asyncio.timeout(LONG_S):
-                sender_client = asyncio.create_task(
+                publication = asyncio.create_task(
                     flooder.publish("bms/pack/request/publish_rate", bytes(5_000_000), qos=1)
                 )
                 with pytest.raises(aiomqtt.MqttError):
                     await anext(flooder.messages)  # the broker ends the connection
-        sender_client.cancel()
+        publication.cancel()
         async with client(broker, "homeassistant") as other:
             await other.publish("bms/pack/request/last", b"{}", qos=1)
         async with asyncio.timeout(LONG_S):

@@ -1,4 +1,4 @@
-"""Service started as by systemd: notify messages, and cache of compiled_kernels kernels."""
+"""Service started as by systemd: notify messages, and cache of compiled kernels."""
 
 import contextlib
 import os
@@ -75,7 +75,7 @@ def start(folder: Path) -> Iterator[Systemd]:
 
 
 def compiled_kernels(cache: Path) -> dict[str, int]:
-    """Return the modification time of each compiled_kernels kernel in the cache [ns]."""
+    """Return the modification time of each compiled kernel in the cache [ns]."""
     return {str(path.relative_to(cache)): path.stat().st_mtime_ns for path in cache.rglob("*.nb?")}
 
 

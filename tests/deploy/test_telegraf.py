@@ -53,7 +53,7 @@ def flatten(value: Any, name: str = "") -> list[tuple[str, Any]]:
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
     if inner is None:
         return [(name, value)]
-    return [item_of_list for key, item in inner for item_of_list in flatten(item, f"{name}_{key}".strip("_"))]
+    return [pair for key, item in inner for pair in flatten(item, f"{name}_{key}".strip("_"))]
 
 
 def sink_metric(line: str) -> tuple[str, dict[str, str], dict[str, Any]]:

@@ -180,12 +180,12 @@ async def test_blocks_lost_by_the_stream_are_sent_again(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     """A leader may be killed after acknowledging messages that no other node has."""
-    receiver.lose = {5, 6, 14, 30}
+    receiver.dropped_once = {5, 6, 14, 30}
     simulated = SimulatedEdge(receiver, tmp_path, url(engine))
     async with simulated.edge:
         simulated.add(40)
         await simulated.assert_all_received()
-    assert receiver.lose == set()
+    assert receiver.dropped_once == set()
     assert receiver.gaps > 0
 
 

@@ -74,7 +74,7 @@ async def browser() -> AsyncIterator[Browser]:
 
 @pytest.fixture(scope="module")
 def hours(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with hours of twelve packs that lose 6 % of their capacity in a year; one has half the others' capacity."""
+    """Return a folder with hours of twelve packs that lose 6 % of their capacity in a year; one has half the others' capacity."""
     folder, rng = tmp_path_factory.mktemp("hours"), np.random.default_rng(1)
     truth = np.full((12, 1), -0.02) - 0.06 * np.arange(30) / 365.25
     truth[0] -= 0.7
