@@ -503,12 +503,12 @@ class TestInvalidBlocks:
         )
     )
     @settings(max_examples=60, deadline=None)
-    def test_no_header_or_sample_value_raises(self, sent) -> None:
+    def test_no_header_or_sample_value_causes_an_exception(self, sent) -> None:
         stream = Stream(Partition(5, table))
         rows = pulses(hours=0.02)[0][:3]
         for store, number, oldest, arrival_s, time_s, value in sent:
             rows["time_s"][1], rows["voltage_v"][2] = time_s, value
-            block = Block(store, number, min(oldest, number), arrival_s, rows)
+            block = Block(store=store, number=number, oldest=min(oldest, number), arrival_s=arrival_s, samples=rows)
             for pack in ("a", "unknown"):
                 stream.send(pack, encode(replace(block, samples=rows)))
             stream.take_over()
@@ -519,11 +519,11 @@ def test_long_block_equals_many_short_ones(stream, samples) -> None:
     last = [short.send("a", data) for data in blocks_of(samples, size=MAX_PART_SAMPLES // 2)][-1]
     assert_state_equals(stream, "a", record_of_one_run(samples))
     assert_state_equals(short, "a", record_of_one_run(samples))
-    of_long, of_short = (json.loads(result.state) for result in (long, last))
-    assert of_long["sample_rate_hz"] == of_short["sample_rate_hz"] == 1.0
-    assert of_long["voltage_v"] == pytest.approx(samples["voltage_v"].mean())
-    net = [state["charge_out_ah"] - state["charge_in_ah"] for state in (of_long, of_short)]
-    assert net[0] == pytest.approx(net[1])
+    long_state, short_state = (json.loads(result.state) for result in (long, last))
+    assert long_state["sample_rate_hz"] == short_state["sample_rate_hz"] == 1.0
+    assert long_state["voltage_v"] == pytest.approx(samples["voltage_v"].mean())
+    net_charge_ah = [state["charge_out_ah"] - state["charge_in_ah"] for state in (long_state, short_state)]
+    assert net_charge_ah[0] == pytest.approx(net_charge_ah[1])
 
 
 def test_packs_of_different_types_are_independent(samples) -> None:
