@@ -7,7 +7,7 @@ import structlog
 
 MIN_LOG_INTERVAL_S = 30.0
 """Minimum interval between two log lines on faults [s]."""
-_NORMAL_EVENTS = ("bytes_received", "rejected_bytes", "frames_received", "before_hello", "reconnects", "retained")
+_NORMAL_EVENTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects", "retained")
 """Counters of normal events, which are not logged.
 
 Bytes and samples before the hello are normal if opening the port does not reset the board. Retained messages are

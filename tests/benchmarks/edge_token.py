@@ -30,7 +30,7 @@ from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.benchmarks.table import Row
 from tests.fleet.tenant import Tenant, heavy_block, mqtt_client, numbered, one_tenant
-from tests.fleet.workers import KIND, PERIOD_S, SAMPLES, Heartbeats, Process, block
+from tests.fleet.workers import PACK_ROW, PERIOD_S, SAMPLES, Heartbeats, Process, block
 from tests.patience import LONG_S
 
 ATTACKER = "attacker"
@@ -152,7 +152,7 @@ async def measure(folder: Path, seconds: float) -> list[Row]:
     with one_tenant(folder) as tenant:
         await tenant.make_streams(PARTITIONS, RAW_BYTES)
         admin, reader = await tenant.program(Role.ADMIN), await tenant.program(Role.READER)
-        await write_bucket(admin, subjects.PACKS_BUCKET, dict.fromkeys([*PACKS, ATTACKER], KIND))
+        await write_bucket(admin, subjects.PACKS_BUCKET, dict.fromkeys([*PACKS, ATTACKER], PACK_ROW))
         worker = Process(folder, tenant.cluster.url, "w", "--creds", tenant.file(Role.WORKER))
         try:
             async with Heartbeats(reader) as heartbeats, connect_honest_edges(tenant, reader) as packs:

@@ -1,4 +1,4 @@
-"""Checkpoints: restored for the same pack, after any change of settings or version."""
+"""Checkpoints: restored for their pack, after any change of settings or version."""
 
 import asyncio
 import itertools
@@ -33,10 +33,11 @@ from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
 SETTINGS = Settings.model_validate({"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}})
-NEW = RunCounters(0, new_totals(0.0))
+NEW_COUNTERS = RunCounters(0, new_totals(0.0))
+"""Counters of a first run."""
 
 
-def edit(section: str, **values: Any) -> Settings:
+def edit_settings(section: str, **values: Any) -> Settings:
     tables = SETTINGS.model_dump(by_alias=True, exclude_none=True)
     return Settings.model_validate(tables | {section: tables[section] | values})
 
@@ -52,7 +53,7 @@ def learned_estimator() -> Estimator:
 
 @dataclass
 class RunResult:
-    """Result of a run."""
+    """Result of a run of the service."""
 
     estimator: Estimator
     health: Health
@@ -87,9 +88,9 @@ async def test_restart_continues_from_the_checkpoint(tmp_path: Path) -> None:
 
 
 async def test_restart_continues_without_the_identifier(tmp_path: Path) -> None:
-    counting = edit("identifier", enabled=False)
-    await run_samples(tmp_path, counting)
-    second = await run_samples(tmp_path, counting, samples=2)
+    without_identifier = edit_settings("identifier", enabled=False)
+    await run_samples(tmp_path, without_identifier)
+    second = await run_samples(tmp_path, without_identifier, samples=2)
     assert second.health.restarts == 1
     unseen_s = second.estimator.record["unseen_s"][0]
     assert second.estimator.state["soc"][0] == pytest.approx(0.4 - (unseen_s + 1.0) / 3600.0, abs=1e-9)
@@ -114,67 +115,67 @@ async def test_gap_lasts_until_the_first_valid_sample(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize(
     "settings",
     [
-        edit("observer", lock_time_s=20.0),
-        edit("observer", law="scheme-1"),
-        edit("observer", law="learning"),
-        edit("identifier", map_memory_h=100.0),
-        edit("identifier", current_offset_std_a=0.1),
-        edit("sensor", voltage_noise_v=0.01),
-        edit("sensor", port="/dev/ttyUSB7"),
-        edit("pack", initial_soc=0.9),
+        edit_settings("observer", lock_time_s=20.0),
+        edit_settings("observer", law="scheme-1"),
+        edit_settings("observer", law="learning"),
+        edit_settings("identifier", map_memory_h=100.0),
+        edit_settings("identifier", current_offset_std_a=0.1),
+        edit_settings("sensor", voltage_noise_v=0.01),
+        edit_settings("sensor", port="/dev/ttyUSB7"),
+        edit_settings("pack", initial_soc=0.9),
     ],
     ids=lambda settings: str(settings.model_dump(exclude_defaults=True)),
 )
 async def test_learned_state_is_restored_under_edited_settings(tmp_path: Path, settings: Settings) -> None:
     learned = learned_estimator()
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW_COUNTERS)
     run = await run_samples(tmp_path, settings, samples=1)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
     assert run.estimator.record["map"].tobytes() == learned.record["map"].tobytes()
 
 
 async def test_adaptive_law_is_restored_only_under_its_own_settings(tmp_path: Path) -> None:
-    settings = edit("observer", law="learning")
+    settings = edit_settings("observer", law="learning")
     learned = new_estimator(settings, CELL)
     for i in range(3600):
         learned.step(float(i), 0.3 * (i // 60 % 2), 3.8 - 0.03 * (i // 60 % 2))
     theta = learned.record[0]["learning"]["theta"].copy()
     assert theta.any()
-    CheckpointFile(tmp_path, settings, CELL).save(learned.record, NEW)
-    again = await run_samples(tmp_path, settings, samples=1)
-    assert (again.estimator.record[0]["learning"]["theta"] == theta).all()
-    assert again.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
-    other = await run_samples(tmp_path, edit("observer", law="learning", lock_time_s=20.0), samples=1)
-    assert not other.estimator.record[0]["learning"]["theta"].any()
+    CheckpointFile(tmp_path, settings, CELL).save(learned.record, NEW_COUNTERS)
+    restored = await run_samples(tmp_path, settings, samples=1)
+    assert (restored.estimator.record[0]["learning"]["theta"] == theta).all()
+    assert restored.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
+    relearned = await run_samples(tmp_path, edit_settings("observer", law="learning", lock_time_s=20.0), samples=1)
+    assert not relearned.estimator.record[0]["learning"]["theta"].any()
 
 
 async def test_checkpoint_without_the_fields_of_the_adaptive_law_is_restored(tmp_path: Path) -> None:
     learned = learned_estimator()
     file = CheckpointFile(tmp_path, SETTINGS, CELL)
-    file.save(learned.record, NEW)
+    file.save(learned.record, NEW_COUNTERS)
     with np.load(file.path) as saved:
         state = saved["state"]
         before = dict(saved) | {"state": repack_fields(state[[n for n in state.dtype.names if n != "learning"]])}
     np.savez(file.path, **before)
-    run = await run_samples(tmp_path, edit("observer", law="learning"), samples=1)
+    run = await run_samples(tmp_path, edit_settings("observer", law="learning"), samples=1)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
 
 async def test_learned_state_is_restored_under_an_edited_description(tmp_path: Path) -> None:
     learned = learned_estimator()
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW_COUNTERS)
     described = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"name": "mine", "description": "new"})})
     run = await run_samples(tmp_path, cell=described, samples=2)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
 
 def test_identity_depends_on_cell_layout_capacity_curve_and_sign() -> None:
-    known = pack_identity(SETTINGS, CELL)
+    original = pack_identity(SETTINGS, CELL)
     larger = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"capacity_ah": 3.0})})
     curve = CELL.model_copy(update={"ocv": CELL.ocv.model_copy(update={"constant_v": 3.7})})
-    turned = edit("sensor", current_sign="charge_positive")
+    reversed_sign = edit_settings("sensor", current_sign="charge_positive")
     others = [pack_identity(SETTINGS, cell) for cell in (larger, curve, CELL.pack(2, 1), CELL.pack(1, 2))]
-    assert len({known, *others, pack_identity(turned, CELL)}) == 6
+    assert len({original, *others, pack_identity(reversed_sign, CELL)}) == 6
 
 
 def test_known_fields_of_another_version_are_restored() -> None:
@@ -191,24 +192,27 @@ def test_known_fields_of_another_version_are_restored() -> None:
 
 
 def test_filter_states_of_an_earlier_version_are_restored() -> None:
-    """The OCV states were added last: they start unknown, and capacity and offset keep their covariance."""
+    """Restore filter states without the OCV states, which a later version added.
+
+    The OCV states start with their prior; capacity and offset have the restored covariance.
+    """
     learned = learned_estimator()
-    cut = {"filter.mean": 1, "filter.covariance": 2, "checks.good_mean": 1, "checks.good_covariance": 2}
+    truncated_axes = {"filter.mean": 1, "filter.covariance": 2, "checks.good_mean": 1, "checks.good_covariance": 2}
     saved = dict(fields(learned.record.copy()))
-    for name, axes in cut.items():
+    for name, axes in truncated_axes.items():
         saved[name] = saved[name][(..., *axes * (slice(NODE),))]
     estimator = new_estimator(SETTINGS, CELL)
     assert restore_state(estimator, saved, 1.0) == ""
     learned.resume(1.0)
-    now, before = (one.record[0]["filter"] for one in (estimator, learned))
-    assert np.array_equal(now["covariance"][:, :NODE, :NODE], before["covariance"][:, :NODE, :NODE])
-    assert np.array_equal(now["mean"][:, :NODE], before["mean"][:, :NODE])
-    for q in range(now["count"]):
-        assert (now["mean"][q, NODE:] == 0.0).all()
-        assert (np.diag(now["covariance"][q])[NODE:] == 1.0).all()
-    assert np.linalg.eigvalsh(now["covariance"][0]).min() > -1e-12
+    restored, expected = (each.record[0]["filter"] for each in (estimator, learned))
+    assert np.array_equal(restored["covariance"][:, :NODE, :NODE], expected["covariance"][:, :NODE, :NODE])
+    assert np.array_equal(restored["mean"][:, :NODE], expected["mean"][:, :NODE])
+    for q in range(restored["count"]):
+        assert (restored["mean"][q, NODE:] == 0.0).all()
+        assert (np.diag(restored["covariance"][q])[NODE:] == 1.0).all()
+    assert np.linalg.eigvalsh(restored["covariance"][0]).min() > -1e-12
     good = estimator.record[0]["checks"]["good_mean"]
-    assert np.array_equal(good[:NODE], saved["filter.mean"][0, now["best"]])
+    assert np.array_equal(good[:NODE], saved["filter.mean"][0, restored["best"]])
     assert (good[NODE:] == 0.0).all()
 
 
@@ -217,7 +221,7 @@ def save_as(
     file: CheckpointFile,
     estimator: Estimator,
     monkeypatch: pytest.MonkeyPatch,
-    counters: RunCounters = NEW,
+    counters: RunCounters = NEW_COUNTERS,
 ) -> None:
     """Save a checkpoint of another format."""
     with monkeypatch.context() as patch:
@@ -238,10 +242,10 @@ async def test_invalid_checkpoint_is_rejected_with_the_reason(
         estimator.state["a"][0][3], reason = np.nan, "refused: a of the observer is not finite"
     if damage == "range":
         estimator.state["soc"], reason = 1.7, r"refused: soc = 1.7 is outside 0.0..1.0"
-    file.save(estimator.record, NEW)
+    file.save(estimator.record, NEW_COUNTERS)
     if damage == "other cell":
         other = CheckpointFile(tmp_path, SETTINGS, CELL.pack(2, 1))
-        other.save(estimator.record, NEW)
+        other.save(estimator.record, NEW_COUNTERS)
         other.path.replace(file.path)
         reason = "refused: it belongs to another pack or cell"
     if damage in ("truncated", "garbage"):
@@ -262,8 +266,8 @@ async def test_invalid_checkpoint_is_rejected_with_the_reason(
 
 
 async def test_each_cell_has_its_own_checkpoint(tmp_path: Path) -> None:
-    tried = [CELL, CELL.pack(2, 1), CELL.pack(3, 1), CELL]
-    runs = [await run_samples(tmp_path, cell=cell) for cell in tried]
+    cells = [CELL, CELL.pack(2, 1), CELL.pack(3, 1), CELL]
+    runs = [await run_samples(tmp_path, cell=cell) for cell in cells]
     assert [run.health.restarts for run in runs] == [0, 0, 0, 1]
     last = runs[-1].estimator
     assert last.state["soc_coulomb"][0] == pytest.approx(0.3 - last.record["unseen_s"][0] / 3600.0, abs=1e-6)
@@ -274,7 +278,7 @@ def test_number_of_checkpoints_of_a_pack_is_bounded(tmp_path: Path) -> None:
     (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
     for series in range(1, MAX_FILES + 4):
         file = CheckpointFile(tmp_path, SETTINGS, CELL.pack(series, 1))
-        file.save(estimator.record, NEW)
+        file.save(estimator.record, NEW_COUNTERS)
         os.utime(file.path, (series, series))
     names = {path.name for path in tmp_path.iterdir()}
     assert len(names) == MAX_FILES + 1
@@ -286,7 +290,7 @@ def test_file_is_private_and_symlinks_are_not_followed(tmp_path: Path) -> None:
     file, victim = CheckpointFile(tmp_path, SETTINGS, CELL), tmp_path / "victim"
     victim.write_text("precious")
     file.path.with_suffix(".new").symlink_to(victim)
-    file.save(new_estimator(SETTINGS, CELL).record, NEW)
+    file.save(new_estimator(SETTINGS, CELL).record, NEW_COUNTERS)
     assert victim.read_text() == "precious"
     assert stat.S_IMODE(file.path.lstat().st_mode) == 0o600
 
@@ -297,9 +301,9 @@ def offset_covariance(estimator: Estimator) -> np.ndarray:
 
 
 def test_offset_that_becomes_a_state_starts_as_configured() -> None:
-    before = new_estimator(edit("identifier", current_offset_std_a=0.0), CELL)
+    before = new_estimator(edit_settings("identifier", current_offset_std_a=0.0), CELL)
     before.step(0.0, 0.1, 3.8)
-    after = new_estimator(edit("identifier", current_offset_std_a=0.1), CELL)
+    after = new_estimator(edit_settings("identifier", current_offset_std_a=0.1), CELL)
     assert restore_state(after, dict(fields(before.record)), 1.0) == ""
     assert offset_covariance(after)[OFFSET] == pytest.approx(0.01)
     after.step(0.0, 0.1, 3.8)
@@ -308,7 +312,7 @@ def test_offset_that_becomes_a_state_starts_as_configured() -> None:
 
 
 def test_identifier_that_is_switched_on_starts_at_the_counted_soc() -> None:
-    counted = new_estimator(edit("identifier", enabled=False), CELL)
+    counted = new_estimator(edit_settings("identifier", enabled=False), CELL)
     counted.step(0.0, 0.1, 3.8)
     identifying = new_estimator(SETTINGS, CELL)
     assert restore_state(identifying, dict(fields(counted.record)), 1.0) == ""
@@ -363,7 +367,7 @@ async def test_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
 async def test_changes_of_soc_are_saved_for_any_checkpoint_interval(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first sample is saved, and then each state whose SOC has changed by 0.28 %."""
+    """Expect a save at the first sample, and at each SOC change of 0.28 %."""
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     saved: asyncio.Queue[float] = asyncio.Queue()
     loop = asyncio.get_running_loop()
@@ -417,7 +421,7 @@ async def test_full_disk_is_not_retried_repeatedly(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     attempts = []
 
-    class Full(CheckpointFile):
+    class FullDiskFile(CheckpointFile):
         def save(self, state: Any, counters: RunCounters) -> None:
             attempts.append((state, counters))
             raise OSError(28, "No space left on device")
@@ -426,7 +430,7 @@ async def test_full_disk_is_not_retried_repeatedly(tmp_path: Path, monkeypatch: 
         SETTINGS.model_dump(by_alias=True, exclude_none=True) | {"state": {"checkpoint_s": 1e6}}
     )
     source, sink = ScriptedSource(), Collector()
-    checkpoint = Full(tmp_path, settings, CELL)
+    checkpoint = FullDiskFile(tmp_path, settings, CELL)
     task = asyncio.create_task(
         run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
     )
@@ -442,12 +446,12 @@ async def test_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("bms_estimator.service.publisher.SLOW_S", 0.05)
     states = []
 
-    class Counting(CheckpointFile):
+    class CountingFile(CheckpointFile):
         def save(self, state: Any, counters: RunCounters) -> None:
             super().save(state, counters)
             states.append(state["observer"]["samples"][0])
 
-    async with run_with_frequent_saves(Counting(tmp_path, SETTINGS, CELL)) as (source, sink, _):
+    async with run_with_frequent_saves(CountingFile(tmp_path, SETTINGS, CELL)) as (source, sink, _):
         for second in range(2):
             source.give((float(second), 0.1, 3.8))
             source.give((float(second), 0.1, 9.9))  # dropped, because its voltage is implausible

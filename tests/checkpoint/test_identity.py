@@ -15,24 +15,22 @@ from bms_estimator.model.fuel_cell import PackModel, load_any
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.settings.pack import Settings
 
-FILE = Path(__file__).with_name("checkpoint_format_7.npz")
+CHECKPOINT_FILE = Path(__file__).with_name("checkpoint_format_7.npz")
 """State after 30 min of a simulated ``chen_mora`` cell under current steps; SOC 0.3710."""
-STEPS = {"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}}
-COUNTING = {"sensor": {"current_sign": "charge_positive"}, "identifier": {"enabled": False}}
+IDENTIFYING = {"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}}
+COULOMB_COUNTING = {"sensor": {"current_sign": "charge_positive"}, "identifier": {"enabled": False}}
 
 
 @pytest.mark.parametrize(
     ("settings", "cell", "pack", "observer", "fleet"),
     [
-        (STEPS, load_any("chen_mora"), "5613cbc091ec7ec4", "77ac24e88a0d1f8b", 7982649347889426607),
-        (COUNTING, load_cell("leaf").pack(2, 3), "1f291d5895e57362", "06eca6aa573c6d46", 18356988707096645357),
+        (IDENTIFYING, load_any("chen_mora"), "5613cbc091ec7ec4", "77ac24e88a0d1f8b", 7982649347889426607),
+        (COULOMB_COUNTING, load_cell("leaf").pack(2, 3), "1f291d5895e57362", "06eca6aa573c6d46", 18356988707096645357),
         ({}, load_any("pem_30w"), "c5d3c64ecb5da3be", "443c82b27a91fe8c", 7478971766825826181),
     ],
     ids=["chen_mora", "leaf", "pem_30w"],
 )
-def test_identity_stays_the_same(
-    settings: dict[str, Any], cell: PackModel, pack: str, observer: str, fleet: int
-) -> None:
+def test_identity_is_unchanged(settings: dict[str, Any], cell: PackModel, pack: str, observer: str, fleet: int) -> None:
     checked = Settings.model_validate(settings)
     assert pack_identity(checked, cell).startswith(pack)
     assert observer_identity(checked, cell).startswith(observer)
@@ -40,16 +38,16 @@ def test_identity_stays_the_same(
 
 
 def test_state_has_the_fields_of_format_7() -> None:
-    with np.load(FILE) as file:
+    with np.load(CHECKPOINT_FILE) as file:
         assert file["state"].dtype == ESTIMATOR_STATE
 
 
 def test_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
-    settings, cell = Settings.model_validate(STEPS), load_any("chen_mora")
-    with np.load(FILE) as file:
+    settings, cell = Settings.model_validate(IDENTIFYING), load_any("chen_mora")
+    with np.load(CHECKPOINT_FILE) as file:
         minute_later = BootTimestamp(float(file["wall_s"]) + 60.0, True, 0.0, "another boot")
     checkpoint = CheckpointFile(tmp_path, settings, cell, lambda: minute_later)
-    checkpoint.path.write_bytes(FILE.read_bytes())
+    checkpoint.path.write_bytes(CHECKPOINT_FILE.read_bytes())
     restored = checkpoint.load()
     assert restored.reason == ""
     assert restored.counters.restarts == 4

@@ -1,4 +1,4 @@
-"""``--out`` never replaces a file without --force, and inputs are read once."""
+"""``--out`` replaces a file only with ``--force``, and an input that is given twice is rejected."""
 
 import shutil
 from pathlib import Path
@@ -51,18 +51,18 @@ def test_existing_file_is_replaced_only_with_force(command, options, name, captu
     ids=lambda command: command[0],
 )
 @pytest.mark.parametrize(
-    ("again_by", "why"),
+    ("make_duplicate", "message"),
     [(Path.symlink_to, "given twice"), (lambda again, path: shutil.copy(path, again), "the same as")],
     ids=["link", "copy"],
 )
-def test_duplicate_capture_is_rejected(command, again_by, why, capture, tmp_path, capsys, monkeypatch):
+def test_duplicate_capture_is_rejected(command, make_duplicate, message, capture, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     again = tmp_path / "again.csv"
-    again_by(again, capture)
+    make_duplicate(again, capture)
     with pytest.raises(SystemExit) as ended:
         main([command[0], str(capture), str(again), *command[1:]])
     assert ended.value.code == 2
     err = capsys.readouterr().err.replace(f"{tmp_path}/", "")
-    assert f"error: again.csv: {why}" in err
+    assert f"error: again.csv: {message}" in err
     assert "it would count twice" in err
     assert not list(tmp_path.glob("mine*"))

@@ -14,7 +14,7 @@ from tests.deploy import kernel_cache
 PROJECT = Path(__file__).parents[2]
 LINKS = {"bin": "usr/bin", "sbin": "usr/sbin", "lib": "usr/lib", "lib64": "usr/lib64"}
 FOLDERS = ("etc/systemd/system/multi-user.target.wants", "etc/udev/rules.d", "opt/bms-estimator/bin", "root/bin")
-EMPTY = ("usr", "var", "run", "tmp", "proc", "sys", "dev", "home", "opt/python", "opt/packages", "opt/project")
+MOUNT_POINTS = ("usr", "var", "run", "tmp", "proc", "sys", "dev", "home", "opt/python", "opt/packages", "opt/project")
 ACCOUNTS = ("passwd", "group", "os-release", "nsswitch.conf")
 
 PYTHON = f"""#!/bin/sh
@@ -74,7 +74,7 @@ StandardError=append:/root/report
 ExecStart=/root/judge
 """
 
-STAND_INS = {
+REPLACED_PROGRAMS = {
     "sudo": 'exec "$@"',
     "apt": "",
     "python3": "",  # the environment exists
@@ -88,14 +88,14 @@ def commands_of_page(section: str, block: int = 0, page: str = "service") -> str
     """Return the commands of a page of docs/pack: a block of indented lines in a section."""
     text = (PROJECT / f"docs/pack/{page}.md").read_text()
     inside = re.split(rf"(?m)^##+ {section}\n", text)[1].split("\n##")[0]
-    return [found for found in re.findall(r"(?:(?:^    .*)?\n)+", inside, re.MULTILINE) if found.strip()][block]
+    return [part for part in re.findall(r"(?:(?:^    .*)?\n)+", inside, re.MULTILINE) if part.strip()][block]
 
 
 def make_root(root: Path) -> None:
     """Create the container's own files. All programs are mounted read-only from this machine."""
     root.mkdir(exist_ok=True)
     root.chmod(0o755)  # the container's root folder must be readable by all users
-    for folder in (*FOLDERS, *EMPTY):
+    for folder in (*FOLDERS, *MOUNT_POINTS):
         (root / folder).mkdir(parents=True, exist_ok=True)
     for name, target in LINKS.items():
         (root / name).symlink_to(target)
@@ -106,8 +106,8 @@ def make_root(root: Path) -> None:
     write_program(root / "opt/bms-estimator/bin/bms-estimator", PROGRAM)
     write_program(root / "opt/bms-estimator/bin/clock", CLOCK)
     write_program(root / "opt/bms-estimator/bin/pip", "#!/bin/sh\n")
-    for name, does in STAND_INS.items():
-        write_program(root / "root/bin" / name, f"#!/bin/sh\n{does}\n")
+    for name, body in REPLACED_PROGRAMS.items():
+        write_program(root / "root/bin" / name, f"#!/bin/sh\n{body}\n")
     write_program(root / "root/judge", Path(__file__).with_name("container_script.sh").read_text())
     for name, port in (("pack", "board"), ("second", "absent")):
         (root / f"root/{name}.toml").write_text(PACK.format(name=name, port=port))
@@ -135,10 +135,10 @@ def make_root(root: Path) -> None:
     (system / "judge.service").write_text(SCRIPT_UNIT)
     state = root / "var/lib/private/bms-estimator"
     for folder in (state.parent, state):
-        folder.mkdir(mode=0o700, parents=True)  # as systemd wants it
+        folder.mkdir(mode=0o700, parents=True)  # mode required by systemd
     shutil.copy(PROJECT / "tests/checkpoint/checkpoint_format_7.npz", state / "pack-5613cbc0.npz")
     private = root / "var/cache/private"
-    private.mkdir(mode=0o700, parents=True)  # as systemd wants it
+    private.mkdir(mode=0o700, parents=True)  # mode required by systemd
     kernel_cache.fill(private / "bms-estimator", Path("/opt/project/bms_estimator"))
     shutil.copytree(private / "bms-estimator", root / "root/cache")
 

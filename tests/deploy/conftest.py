@@ -12,7 +12,7 @@ DEPLOY = Path(__file__).parents[2] / "deploy"
 
 @pytest.fixture
 def program() -> Callable[[str], str]:
-    """Function that returns the path of a program, or skips the test and names its Debian package."""
+    """Return a function that returns the path of a program. Without the program it skips the test and names the Debian package."""
 
     def find(name: str, package: str) -> str:
         path = shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin:/sbin")

@@ -21,7 +21,7 @@ NODES = "a.example,b.example,c.example"
 
 @pytest.fixture(params=["bms-estimator-fleet.service", "bms-estimator-worker@1.service"])
 def unit(request: pytest.FixtureRequest, deploy: Path, tmp_path: Path) -> Path:
-    """Unit whose program is replaced by one that exists here."""
+    """Return a unit whose program is replaced by one that exists on this machine."""
     text = (deploy / "fleet" / request.param.replace("@1", "@")).read_text()
     path = tmp_path / request.param
     path.write_text(re.sub(r"(?m)^ExecStart=/\S+", f"ExecStart={sys.executable}", text))

@@ -17,6 +17,8 @@ from tests.sinks.snapshots import ONE, SOC_LOW
 DASHBOARD = json.loads((Path(__file__).parents[2] / "deploy/grafana/bms.json").read_text(encoding="utf-8"))
 TARGETS = [(panel["title"], target) for panel in DASHBOARD["panels"] for target in panel["targets"]]
 MODELS = {STATE: Estimate, ALARM: Alarm}
+GRID_COLUMNS = 24
+"""Width of a dashboard of Grafana [columns]."""
 TAGS = {"device", "name", "severity"}
 
 
@@ -61,10 +63,12 @@ def test_every_query_returns_a_value_from_a_real_influxdb(influxdb: InfluxDB) ->
 
 def test_panels_do_not_overlap_and_use_the_selected_source() -> None:
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
-    for one, other in itertools.combinations([panel["gridPos"] for panel in DASHBOARD["panels"]], 2):
-        separate = [a[k] + a[s] <= b[k] for a, b in ((one, other), (other, one)) for k, s in (("x", "w"), ("y", "h"))]
+    for first, second in itertools.combinations([panel["gridPos"] for panel in DASHBOARD["panels"]], 2):
+        separate = [
+            a[k] + a[s] <= b[k] for a, b in ((first, second), (second, first)) for k, s in (("x", "w"), ("y", "h"))
+        ]
         assert any(separate)
-        assert one["x"] + one["w"] <= 24
+        assert first["x"] + first["w"] <= GRID_COLUMNS
     for _, target in TARGETS:
         assert target["datasource"]["uid"] == "${source}"
         assert "\"device\" = '$device' AND $timeFilter" in target["query"]

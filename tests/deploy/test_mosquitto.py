@@ -20,7 +20,7 @@ from tests.patience import LONG_S
 
 PACKS = ("pack", "shed")
 PASSWORDS = {"pack": "one", "shed": "four", "dashboard": "two", "homeassistant": "three"}
-LAST = {
+END_MESSAGES = {
     "bms/#": ("pack", "bms/pack/last"),
     "homeassistant/#": ("homeassistant", "homeassistant/last"),
     "bms/pack/request/+": ("homeassistant", "bms/pack/request/last"),
@@ -31,7 +31,7 @@ LAST = {
 
 @pytest.fixture
 def broker(program, deploy, tmp_path) -> Iterator[int]:
-    """Port of a Mosquitto with the example's files."""
+    """Yield the port of a Mosquitto with the example's files."""
     port = free_port()
     mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
     write_users(tmp_path, deploy, passwd)
@@ -81,19 +81,23 @@ def client(port: int, user: str) -> aiomqtt.Client:
 
 async def received_by(port: int, sender: str, topics: list[str], *, reader: str, subscription: str) -> list[str]:
     """Return the messages of ``sender`` that reach ``reader``."""
-    allowed, last = LAST[subscription]
-    async with client(port, reader) as subscriber, client(port, sender) as sending, client(port, allowed) as ending:
+    end_sender_name, last = END_MESSAGES[subscription]
+    async with (
+        client(port, reader) as subscriber,
+        client(port, sender) as sender_client,
+        client(port, end_sender_name) as end_sender,
+    ):
         await subscriber.subscribe(subscription, qos=1)
         for topic in topics:
-            await sending.publish(topic, b"x", qos=1)
-        await ending.publish(last, b"x", qos=1)
-        seen: list[str] = []
+            await sender_client.publish(topic, b"x", qos=1)
+        await end_sender.publish(last, b"x", qos=1)
+        received_topics: list[str] = []
         async with asyncio.timeout(LONG_S):
             async for message in subscriber.messages:
                 if message.topic.value == last:
                     break
-                seen.append(message.topic.value)
-    return seen
+                received_topics.append(message.topic.value)
+    return received_topics
 
 
 async def test_anonymous_client_is_rejected(broker):
@@ -115,16 +119,18 @@ async def test_dashboard_receives_the_estimator_s_topics(broker):
 
 async def test_estimator_publishes_only_its_own_topics(broker):
     topics = ["homeassistant/light/x/set", "other/topic", "homeassistant/device/bms_pack/config"]
-    seen = await received_by(broker, "pack", topics, reader="homeassistant", subscription="homeassistant/#")
-    assert seen == ["homeassistant/device/bms_pack/config"]
+    received_topics = await received_by(broker, "pack", topics, reader="homeassistant", subscription="homeassistant/#")
+    assert received_topics == ["homeassistant/device/bms_pack/config"]
 
 
 async def test_pack_cannot_publish_another_pack_s_topics(broker):
     topics = ["bms/pack/state", "bms/pack/event", "bms/pack/availability", "bms/pack/response/soc", "bms/shed/state"]
     assert await received_by(broker, "shed", topics, reader="dashboard", subscription="bms/#") == ["bms/shed/state"]
     discovery = ["homeassistant/device/bms_pack/config", "homeassistant/device/bms_shed/config"]
-    seen = await received_by(broker, "shed", discovery, reader="homeassistant", subscription="homeassistant/#")
-    assert seen == discovery[1:]
+    received_topics = await received_by(
+        broker, "shed", discovery, reader="homeassistant", subscription="homeassistant/#"
+    )
+    assert received_topics == discovery[1:]
 
 
 async def test_pack_receives_only_its_own_requests(broker):
@@ -139,8 +145,8 @@ async def test_pack_receives_only_its_own_requests(broker):
 
 
 @pytest.fixture
-def certified(program, deploy, tmp_path) -> Iterator[int]:
-    """Port of the listener for other machines, with certificates made by the commands of docs/pack/mosquitto.md."""
+def tls_port(program, deploy, tmp_path) -> Iterator[int]:
+    """Yield the port of the listener for other machines, with certificates made by the commands of docs/pack/mosquitto.md."""
     port = free_port()
     mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
     program("openssl", "openssl")
@@ -165,8 +171,8 @@ def with_certificate(port: int, folder: Path, name: str) -> aiomqtt.Client:
     return aiomqtt.Client("localhost", port, tls_params=parameters, timeout=LONG_S)
 
 
-async def test_certificate_decides_which_topics_a_pack_may_publish(certified, tmp_path):
-    async with with_certificate(certified, tmp_path, "pack") as client:
+async def test_certificate_decides_which_topics_a_pack_may_publish(tls_port, tmp_path):
+    async with with_certificate(tls_port, tmp_path, "pack") as client:
         await client.subscribe("bms/pack/availability")
         for topic in ("bms/shed/availability", "bms/pack/availability"):
             await client.publish(topic, topic, qos=1)
@@ -174,22 +180,22 @@ async def test_certificate_decides_which_topics_a_pack_may_publish(certified, tm
             assert (await anext(client.messages)).topic.value == "bms/pack/availability"
 
 
-def test_clients_without_a_valid_certificate_are_rejected(certified, tmp_path):
+def test_clients_without_a_valid_certificate_are_rejected(tls_port, tmp_path):
     for name in (None, "stranger"):
         context = ssl.create_default_context(cafile=tmp_path / "ca.crt")
         if name:
             context.load_cert_chain(tmp_path / f"{name}.crt", tmp_path / f"{name}.key")
-        line = socket.create_connection(("localhost", certified), LONG_S)
-        refused = pytest.raises((ssl.SSLError, ConnectionError))
-        with line, refused, context.wrap_socket(line, server_hostname="localhost") as secured:
+        line = socket.create_connection(("localhost", tls_port), LONG_S)
+        rejected = pytest.raises((ssl.SSLError, ConnectionError))
+        with line, rejected, context.wrap_socket(line, server_hostname="localhost") as secured:
             secured.recv(1)  # an accepting broker would wait for a first message
 
 
 async def test_home_assistant_may_send_requests_but_the_dashboard_may_not(broker):
     topics = ["bms/pack/request/soc"]
-    ask = {"reader": "pack", "subscription": "bms/pack/request/+"}
-    assert await received_by(broker, "dashboard", topics, **ask) == []
-    assert await received_by(broker, "homeassistant", topics, **ask) == topics
+    as_estimator = {"reader": "pack", "subscription": "bms/pack/request/+"}
+    assert await received_by(broker, "dashboard", topics, **as_estimator) == []
+    assert await received_by(broker, "homeassistant", topics, **as_estimator) == topics
 
 
 async def test_only_the_estimator_may_publish_state(broker):
@@ -198,8 +204,8 @@ async def test_only_the_estimator_may_publish_state(broker):
 
 
 async def test_estimator_receives_the_birth_message(broker):
-    seen = await received_by(broker, "homeassistant", [], reader="pack", subscription="homeassistant/status")
-    assert seen == []  # apart from the last message, which ends the reception
+    received_topics = await received_by(broker, "homeassistant", [], reader="pack", subscription="homeassistant/status")
+    assert received_topics == []  # apart from the last message, which ends the reception
 
 
 async def test_estimator_receives_its_availability_topics(broker):
@@ -229,10 +235,12 @@ async def test_too_large_message_is_not_forwarded(broker):
         await estimator.subscribe("bms/pack/request/+")
         with contextlib.suppress(aiomqtt.MqttError):
             async with client(broker, "homeassistant") as flooder, asyncio.timeout(LONG_S):
-                sending = asyncio.create_task(flooder.publish("bms/pack/request/publish_rate", bytes(5_000_000), qos=1))
+                publication = asyncio.create_task(
+                    flooder.publish("bms/pack/request/publish_rate", bytes(5_000_000), qos=1)
+                )
                 with pytest.raises(aiomqtt.MqttError):
                     await anext(flooder.messages)  # the broker ends the connection
-        sending.cancel()
+        publication.cancel()
         async with client(broker, "homeassistant") as other:
             await other.publish("bms/pack/request/last", b"{}", qos=1)
         async with asyncio.timeout(LONG_S):

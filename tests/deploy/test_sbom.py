@@ -1,4 +1,4 @@
-"""The SBOM in the wheel: its dependencies, with the versions and hashes of requirements.lock."""
+"""SBOM in the wheel: it lists the dependencies with the versions and hashes of requirements.lock."""
 
 import importlib.metadata
 import json
@@ -12,7 +12,7 @@ PROJECT = Path(__file__).parents[2]
 
 
 def runtime_dependencies(name: str, found: set[str]) -> set[str]:
-    """Return the installed dependencies of a package, without its extras."""
+    """Add the installed dependencies of a package, without its extras, to ``found``, and return it."""
     for line in importlib.metadata.requires(name) or ():
         other = re.split(r"[^\w.-]", line)[0].lower().replace("_", "-")
         if ";" not in line and other not in found:

@@ -81,7 +81,7 @@ async def test_password_and_key_are_never_shown(tmp_path: Path, line: Line, brok
     assert len(written) >= 2
     outputs += [path.read_bytes() for path in written]
     assert b"broker connected" in outputs[2]
-    assert [secret for secret in secrets if any(secret in one for one in outputs)] == []
+    assert [secret for secret in secrets if any(secret in output for output in outputs)] == []
     assert {oct(path.stat().st_mode & 0o777) for path in written if path.parent.name == "state"} == {"0o600"}
 
 

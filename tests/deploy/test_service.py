@@ -1,4 +1,4 @@
-"""The service as systemd starts it: its notify messages, and its cache of kernels."""
+"""Service started as by systemd: notify messages, and cache of compiled kernels."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ PACK = '[pack]\ncell = "chen_mora"\n[sensor]\nport = "/dev/bms/absent"\n'
 
 
 class Systemd:
-    """The service, with a notify socket and the directories that the unit gives it; homes are not there."""
+    """Service with a notify socket and the directories of the unit, but without a home directory."""
 
     def __init__(self, folder: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -49,13 +49,13 @@ class Systemd:
         """Wait for a notice, skipping others."""
         deadline = time.monotonic() + LONG_S
         while notice not in self.next_notice().split("\n"):
-            assert time.monotonic() < deadline, f"{notice} did not come"
+            assert time.monotonic() < deadline, f"{notice} did not arrive"
 
     def stop(self) -> tuple[int, str]:
-        """End the service as systemd does. Returns its exit code and what it logged."""
+        """Send SIGTERM, as systemd does. Return exit code and log."""
         self.process.send_signal(signal.SIGTERM)
-        _, logged = self.process.communicate(timeout=LONG_S)
-        return self.process.returncode, logged
+        _, log = self.process.communicate(timeout=LONG_S)
+        return self.process.returncode, log
 
     def close(self) -> None:
         self._socket.close()
@@ -74,8 +74,8 @@ def start(folder: Path) -> Iterator[Systemd]:
         systemd.close()
 
 
-def compiled(cache: Path) -> dict[str, int]:
-    """Kernels in the cache and when each was written."""
+def compiled_kernels(cache: Path) -> dict[str, int]:
+    """Return the modification time of each compiled kernel in the cache [ns]."""
     return {str(path.relative_to(cache)): path.stat().st_mtime_ns for path in cache.rglob("*.nb?")}
 
 
@@ -85,22 +85,22 @@ def test_ready_watchdog_and_stopping_arrive(tmp_path):
         assert systemd.next_notice().startswith("READY=1\n")
         for _ in range(3):
             systemd.until("WATCHDOG=1")
-        code, logged = systemd.stop()
-        assert code == 0, logged
+        code, log = systemd.stop()
+        assert code == 0, log
         systemd.until("STOPPING=1")
-        assert "Traceback" not in logged
-        assert "/dev/bms/absent" in logged
+        assert "Traceback" not in log
+        assert "/dev/bms/absent" in log
 
 
-def test_a_kernel_that_the_cache_lacks_is_compiled_into_it_once(tmp_path):
+def test_missing_kernel_is_compiled_into_the_cache_once(tmp_path):
     cache = tmp_path / "cache"
     kernel_cache.fill(cache)
-    seen = [compiled(cache)]
+    seen = [compiled_kernels(cache)]
     for _ in range(2):
         with start(tmp_path) as systemd:
             systemd.until("READY=1")
             assert systemd.stop()[0] == 0
-        seen.append(compiled(cache))
+        seen.append(compiled_kernels(cache))
     before, first, second = seen
     written = {Path(name).name for name, at_ns in first.items() if before.get(name) != at_ns}
     assert written
@@ -108,7 +108,7 @@ def test_a_kernel_that_the_cache_lacks_is_compiled_into_it_once(tmp_path):
     assert second == first
 
 
-def test_a_wrong_setting_ends_with_code_2_which_systemd_does_not_restart(tmp_path, deploy):
+def test_wrong_setting_ends_with_code_2_after_which_systemd_does_not_restart(tmp_path, deploy):
     (tmp_path / "pack.toml").write_text("[pack]\nseries = 0\n")
     command = [PROGRAM, "run", tmp_path / "pack.toml"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)

@@ -1,4 +1,4 @@
-"""The udev rule, read by udev."""
+"""Udev rule, read by udev."""
 
 import os
 import subprocess
@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
-# a /run/udev of its own, in a mount namespace that ends with the shell
-READ = 'mount -t tmpfs none /run/udev && mkdir /run/udev/rules.d && cp "$1" /run/udev/rules.d/ && exec "$2" test "$3"'
+# mounts a separate /run/udev in a mount namespace, which ends with the shell
+READ_RULES_SCRIPT = (
+    'mount -t tmpfs none /run/udev && mkdir /run/udev/rules.d && cp "$1" /run/udev/rules.d/ && exec "$2" test "$3"'
+)
 
 
 def read_rules(program, rules: Path) -> list[str]:
@@ -18,20 +20,20 @@ def read_rules(program, rules: Path) -> list[str]:
     device = next(Path("/sys/class/tty").iterdir(), None)
     if device is None or subprocess.run([unshare, "--mount", "true"], capture_output=True, check=False).returncode:
         pytest.skip("this machine has no tty devices or allows no mount namespaces")
-    Path("/run/udev").mkdir(exist_ok=True)  # the place to mount over
-    command = [unshare, "--mount", "sh", "-c", READ, "sh", str(rules), udevadm, str(device)]
+    Path("/run/udev").mkdir(exist_ok=True)  # the mount point must exist
+    command = [unshare, "--mount", "sh", "-c", READ_RULES_SCRIPT, "sh", str(rules), udevadm, str(device)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     lines = (done.stdout + done.stderr).splitlines()
-    ours = [line for line in lines if rules.name in line]
-    assert any(line.startswith("Reading rules file") for line in ours), lines
-    return [line for line in ours if not line.startswith("Reading rules file")]
+    messages = [line for line in lines if rules.name in line]
+    assert any(line.startswith("Reading rules file") for line in messages), lines
+    return [line for line in messages if not line.startswith("Reading rules file")]
 
 
-def test_udev_finds_nothing_wrong_in_the_rule(program, deploy):
+def test_udev_reports_no_error_in_the_rule(program, deploy):
     assert read_rules(program, deploy / "99-bms-estimator.rules") == []
 
 
-def test_udev_would_find_a_wrong_key(program, tmp_path):
+def test_udev_reports_a_misspelled_key(program, tmp_path):
     rules = tmp_path / "99-wrong.rules"
     rules.write_text('SUBSISTEM=="tty", SYMLINK+="bms"\n')
     assert any("SUBSISTEM" in line for line in read_rules(program, rules))

@@ -24,15 +24,15 @@ def test_a_minute_at_1_hz_is_60_samples() -> None:
 
 
 @given(st.lists(st.lists(st.floats(0.0, 30.0), max_size=40), max_size=20), st.integers(1, 7))
-def test_blocks_contain_all_samples_in_order(reads: list[list[float]], most: int) -> None:
-    batcher, time_s, added_s, blocks = Batcher(20.0, most), 0.0, [], []
+def test_blocks_contain_all_samples_in_order(reads: list[list[float]], max_samples: int) -> None:
+    batcher, time_s, all_times_s, blocks = Batcher(20.0, max_samples), 0.0, [], []
     for steps in reads:
         times_s = time_s + np.cumsum(steps)
         time_s = times_s[-1] if times_s.size else time_s
-        added_s.append(times_s)
+        all_times_s.append(times_s)
         blocks += batcher.add(samples(times_s), time_s)
     blocks += batcher.cut()
-    assert all(1 <= block.samples.size <= most for block in blocks)
+    assert all(1 <= block.samples.size <= max_samples for block in blocks)
     assert all(np.ptp(block.samples["time_s"]) < 20.0 for block in blocks)
-    divided = [block.samples["time_s"] for block in blocks]
-    assert np.concatenate([*divided, []]).tolist() == np.concatenate([*added_s, []]).tolist()
+    block_times_s = [block.samples["time_s"] for block in blocks]
+    assert np.concatenate([*block_times_s, []]).tolist() == np.concatenate([*all_times_s, []]).tolist()

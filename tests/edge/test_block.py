@@ -21,7 +21,9 @@ def samples(count: int = 60) -> SampleBlock:
     return rows
 
 
-BLOCK = Block(1_700_000_000_000_000_000, 7, 3, 1.7e9, samples())
+BLOCK = Block(store=1_700_000_000 * 10**9, number=7, oldest=3, arrival_s=1.7e9, samples=samples())
+HEADER_BYTES = 40
+"""Length of the header of an encoded block [bytes]."""
 
 
 @given(
@@ -32,7 +34,7 @@ BLOCK = Block(1_700_000_000_000_000_000, 7, 3, 1.7e9, samples())
     )
 )
 def test_samples_are_encoded_bit_for_bit(rows: SampleBlock) -> None:
-    decoded = decode(encode(Block(1, 1, 1, 0.0, rows))).samples
+    decoded = decode(encode(Block(store=1, number=1, oldest=1, arrival_s=0.0, samples=rows))).samples
     for name in SAMPLE.names or ():
         assert decoded[name].tobytes() == rows[name].tobytes()
 
@@ -49,12 +51,12 @@ def test_a_minute_at_a_constant_period_takes_few_bytes() -> None:
 @pytest.mark.parametrize("count", [0, MAX_SAMPLES + 1])
 def test_empty_and_long_blocks_are_not_encoded(count: int) -> None:
     with pytest.raises(ValueError, match=f"{count} samples in a block"):
-        encode(Block(1, 1, 1, 0.0, samples(count)))
+        encode(Block(store=1, number=1, oldest=1, arrival_s=0.0, samples=samples(count)))
 
 
 @given(st.binary(max_size=200))
 def test_invalid_bytes_are_rejected(data: bytes) -> None:
-    for invalid in (data, b"BMSB" + data, encode(BLOCK)[:40] + data):
+    for invalid in (data, b"BMSB" + data, encode(BLOCK)[:HEADER_BYTES] + data):
         with pytest.raises(BlockError):
             decode(invalid)
 
@@ -73,7 +75,7 @@ def test_bytes_after_a_block_are_rejected() -> None:
 
 
 def test_decompression_is_bounded() -> None:
-    header = encode(BLOCK)[:40]
+    header = encode(BLOCK)[:HEADER_BYTES]
     with pytest.raises(BlockError, match="does not hold 60 samples"):
         decode(header + zlib.compress(bytes(50_000_000)))
 
@@ -85,11 +87,11 @@ def test_decompression_is_bounded() -> None:
 def test_implausible_header_is_rejected(store: int, number: int, oldest: int, arrival_s: float) -> None:
     header = struct.pack("<4sBxHQQQd", b"BMSB", 1, 60, store, number, oldest, arrival_s)
     with pytest.raises(BlockError, match="implausible header"):
-        decode(header + encode(BLOCK)[40:])
+        decode(header + encode(BLOCK)[HEADER_BYTES:])
 
 
 def test_later_version_is_rejected() -> None:
     data = bytearray(encode(BLOCK))
-    data[4] = 2
+    data[4] = 2  # version, after the magic bytes
     with pytest.raises(BlockError, match="version 2; this program reads version 1"):
         decode(bytes(data))

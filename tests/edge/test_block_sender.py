@@ -42,7 +42,7 @@ async def receiver(engine: NatsCluster, request: pytest.FixtureRequest) -> Async
         yield receiver
 
 
-class Feed:
+class SimulatedEdge:
     """Block sender with one sample a second, by clocks that the test advances."""
 
     def __init__(self, receiver: Receiver, folder: Path, url: str, **settings: float) -> None:
@@ -80,9 +80,9 @@ class Feed:
         assert equal(self.receiver.samples, np.concatenate(self._reads[:completed]))
 
 
-def equal(some: SampleBlock, others: SampleBlock) -> bool:
+def equal(first: SampleBlock, second: SampleBlock) -> bool:
     """Return True if both are equal bit for bit, apart from padding between the columns."""
-    return all(some[name].tobytes() == others[name].tobytes() for name in SAMPLE.names or ())
+    return all(first[name].tobytes() == second[name].tobytes() for name in SAMPLE.names or ())
 
 
 def url(engine: NatsCluster) -> str:
@@ -95,50 +95,50 @@ async def until(condition) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_samples_arrive_in_blocks_and_the_open_one_at_shutdown(
+async def test_samples_arrive_in_blocks_and_the_open_block_at_shutdown(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
-    feed = Feed(receiver, tmp_path, url(engine))
-    async with feed.edge:
-        feed.add(30.5)
+    simulated = SimulatedEdge(receiver, tmp_path, url(engine))
+    async with simulated.edge:
+        simulated.add(30.5)
         await receiver.until(30 * 60)
-        await until(lambda: feed.edge.store.oldest > 20)  # the worker has confirmed 20 blocks
-    await feed.assert_all_received()
+        await until(lambda: simulated.edge.store.oldest > 20)  # the worker has confirmed 20 blocks
+    await simulated.assert_all_received()
     assert [block.number for block in receiver.blocks] == list(range(1, 32))
     assert {block.samples.size for block in receiver.blocks[:-1]} == {60}
-    assert receiver.blocks[-1].arrival_s == WALL_S + feed.now_s - 1.0
-    assert (receiver.resends, receiver.gaps, feed.edge.store.dropped) == (0, 0, 0)
+    assert receiver.blocks[-1].arrival_s == WALL_S + simulated.now_s - 1.0
+    assert (receiver.resends, receiver.gaps, simulated.edge.store.dropped) == (0, 0, 0)
 
 
 async def test_no_sample_is_lost_by_a_cut_connection(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
     async with Proxy(engine.mqtt_port) as network:
-        feed = Feed(receiver, tmp_path, network.url)
-        async with feed.edge:
-            feed.add(5)
-            await feed.assert_all_received()
+        simulated = SimulatedEdge(receiver, tmp_path, network.url)
+        async with simulated.edge:
+            simulated.add(5)
+            await simulated.assert_all_received()
             for _ in range(3):
-                network.leave()
-                feed.add(40)
-                await until(lambda: not feed.edge.store.connected)
-                network.away = False
-                feed.add(1)
-                await feed.assert_all_received()
-        assert feed.edge.delivery.losses == 3
+                network.disconnect_network()
+                simulated.add(40)
+                await until(lambda: not simulated.edge.store.connected)
+                network.rejects_connections = False
+                simulated.add(1)
+                await simulated.assert_all_received()
+        assert simulated.edge.delivery.losses == 3
 
 
 async def test_samples_keep_their_period_in_a_store_later_than_the_clock(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
-    feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:9")  # no server listens there
-    async with feed.edge:
-        feed.add(2)
+    simulated = SimulatedEdge(receiver, tmp_path, "mqtt://127.0.0.1:9")  # no server listens at this port
+    async with simulated.edge:
+        simulated.add(2)
         later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
-        await until(lambda: feed.edge.store._on_disk.state.next == 2)  # on disk
-        feed.edge.store.on_request(later)
-        await until(lambda: feed.edge.store.last_s > WALL_S + 1e8)
-        feed.add(4)
+        await until(lambda: simulated.edge.store._on_disk.state.next == 2)  # the blocks are on disk
+        simulated.edge.store.on_request(later)
+        await until(lambda: simulated.edge.store.last_s > WALL_S + 1e8)
+        simulated.add(4)
         async with asyncio.timeout(LONG_S):
-            first, second, third = [decode((await feed.edge.store.take(1))[0].message.payload) for _ in range(3)]
+            first, second, third = [decode((await simulated.edge.store.take(1))[0].message.payload) for _ in range(3)]
     assert (first.number, first.store > later.store) == (1, True)
     assert (first.samples["time_s"] == 0.0).all()  # they were timestamped before the request
     assert second.samples["time_s"].tolist() == [*np.arange(60.0)]
@@ -148,27 +148,27 @@ async def test_samples_keep_their_period_in_a_store_later_than_the_clock(
 async def test_no_sample_is_lost_by_a_killed_server(tmp_path: Path) -> None:
     with running(tmp_path, partitions=4) as engine:
         async with Receiver(engine.url, "pack") as receiver:
-            feed = Feed(receiver, tmp_path, url(engine))
-            async with feed.edge:
+            simulated = SimulatedEdge(receiver, tmp_path, url(engine))
+            async with simulated.edge:
                 for kill in range(2):
-                    feed.add(200)
+                    simulated.add(200)
                     await receiver.until((205 * kill + 1) * 60)
                     await asyncio.to_thread(engine.kill, 0)
-                    feed.add(5)
+                    simulated.add(5)
                     await asyncio.to_thread(engine.start, 0)
-                feed.add(1)
-                await feed.assert_all_received()
+                simulated.add(1)
+                await simulated.assert_all_received()
 
 
 async def test_restarted_edge_sends_unconfirmed_blocks_first(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
-    feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:1")
-    async with feed.edge:
-        feed.add(50)
-    earlier = feed._reads
-    restarted = Feed(receiver, tmp_path, url(engine))
-    restarted.now_s, restarted._count, restarted._reads = feed.now_s, feed.count, earlier
+    simulated = SimulatedEdge(receiver, tmp_path, "mqtt://127.0.0.1:1")
+    async with simulated.edge:
+        simulated.add(50)
+    earlier = simulated._reads
+    restarted = SimulatedEdge(receiver, tmp_path, url(engine))
+    restarted.now_s, restarted._count, restarted._reads = simulated.now_s, simulated.count, earlier
     async with restarted.edge:
         restarted.add(10)
         await restarted.assert_all_received()
@@ -180,38 +180,38 @@ async def test_blocks_lost_by_the_stream_are_sent_again(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     """A leader may be killed after acknowledging messages that no other node has."""
-    receiver.lose = {5, 6, 14, 30}
-    feed = Feed(receiver, tmp_path, url(engine))
-    async with feed.edge:
-        feed.add(40)
-        await feed.assert_all_received()
-    assert receiver.lose == set()
+    receiver.dropped_once = {5, 6, 14, 30}
+    simulated = SimulatedEdge(receiver, tmp_path, url(engine))
+    async with simulated.edge:
+        simulated.add(40)
+        await simulated.assert_all_received()
+    assert receiver.dropped_once == set()
     assert receiver.gaps > 0
 
 
 async def test_full_edge_announces_its_oldest_block(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
     async with Proxy(engine.mqtt_port) as network:
-        network.away = True
-        feed = Feed(receiver, tmp_path, network.url, store_mib=0.1)
-        async with feed.edge:
+        network.rejects_connections = True
+        simulated = SimulatedEdge(receiver, tmp_path, network.url, store_mib=0.1)
+        async with simulated.edge:
             for _ in range(3):
-                feed.add(60)
-                await until(lambda: not feed.edge.store._waiting)
-            dropped = feed.edge.store.dropped
-            network.away = False
+                simulated.add(60)
+                await until(lambda: not simulated.edge.store._waiting)
+            dropped = simulated.edge.store.dropped
+            network.rejects_connections = False
             await receiver.until(180 * 60 - 60 - 60 * dropped)
-    await receiver.until(feed.count - 60 * dropped)
+    await receiver.until(simulated.count - 60 * dropped)
     assert dropped > 0
     assert receiver.gaps == 0
     assert receiver.blocks[0].oldest == receiver.blocks[0].number == dropped + 1
-    assert equal(receiver.samples, np.concatenate(feed._reads[60 * dropped :]))
+    assert equal(receiver.samples, np.concatenate(simulated._reads[60 * dropped :]))
 
 
 async def test_invalid_requests_are_ignored(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
-    feed = Feed(receiver, tmp_path, url(engine))
-    async with feed.edge:
-        feed.add(3)
-        await feed.assert_all_received()
+    simulated = SimulatedEdge(receiver, tmp_path, url(engine))
+    async with simulated.edge:
+        simulated.add(3)
+        await simulated.assert_all_received()
         store = receiver.blocks[0].store
         garbage = [b"", b"\xff\x00", b"{}", b'{"store": -1, "number": 1, "resend": false}', b"9" * 10_000, b"[" * 9_000]
         garbage += [f'{{"store": {n}, "number": {n}, "resend": true}}'.encode() for n in (10**30, 10**400)]
@@ -219,9 +219,9 @@ async def test_invalid_requests_are_ignored(receiver: Receiver, engine: NatsClus
             await receiver.reply(payload)
         await receiver.reply(BlockRequest(store=1, number=1, resend=True))
         await receiver.reply(BlockRequest(store=store, number=1, resend=False))
-        await until(lambda: feed.edge.unread == len(garbage))
-        feed.add(3)
-        await feed.assert_all_received()
+        await until(lambda: simulated.edge.unread == len(garbage))
+        simulated.add(3)
+        await simulated.assert_all_received()
 
 
 async def test_blocks_are_sent_to_any_mqtt_broker(broker: Broker, tmp_path: Path) -> None:
@@ -247,9 +247,9 @@ async def test_blocks_are_sent_to_any_mqtt_broker(broker: Broker, tmp_path: Path
 async def test_open_block_is_sent_if_the_source_falls_silent(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
-    feed = Feed(receiver, tmp_path, url(engine), block_s=1.0)
-    async with feed.edge:
-        feed.add(1 / 60)
+    simulated = SimulatedEdge(receiver, tmp_path, url(engine), block_s=1.0)
+    async with simulated.edge:
+        simulated.add(1 / 60)
         await receiver.until(1)
 
 
@@ -259,9 +259,9 @@ async def test_unreadable_password_file_raises_an_error(engine: NatsCluster, tmp
 
 
 async def test_stream_stores_blocks_by_pack(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
-    feed = Feed(receiver, tmp_path, url(engine))
-    async with feed.edge:
-        feed.add(2)
+    simulated = SimulatedEdge(receiver, tmp_path, url(engine))
+    async with simulated.edge:
+        simulated.add(2)
         await receiver.until(60)
     async with contextlib.AsyncExitStack() as stack:
         nc = await nats.connect(engine.url)

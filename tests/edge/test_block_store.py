@@ -23,6 +23,7 @@ from bms_estimator.store.database import Database
 from tests.patience import LONG_S
 
 WALL_S = 1.7e9
+"""Wall clock at the creation of the store [s since 1970]."""
 UNLIMITED_BYTES = 1 << 30
 """Size limit that no test reaches [bytes]."""
 
@@ -36,7 +37,9 @@ def block_at(at_s: float, count: int = 5) -> ReadyBlock:
 
 
 @contextlib.asynccontextmanager
-async def opened(path: Path, most_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S) -> AsyncIterator[BlockStore]:
+async def open_store(
+    path: Path, most_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S
+) -> AsyncIterator[BlockStore]:
     database = Database(path, tables=EDGE_TABLES, sync_s=0.0, retry_s=0.0)
     store = BlockStore(database, "raw/pack", most_bytes, wall=lambda: wall_s, resend_s=0.0)
     async with database, store:
@@ -49,20 +52,21 @@ async def until(condition) -> None:
             await asyncio.sleep(0.002)
 
 
-async def written(store: BlockStore, *blocks: ReadyBlock) -> None:
+async def write_blocks(store: BlockStore, *blocks: ReadyBlock) -> None:
     for block in blocks:
         store.put(block)
     await until(lambda: not store._waiting)
 
 
 async def take(store: BlockStore, count: int) -> list[Block]:
+    """Take ``count`` blocks, and check topic and numbers of their messages."""
     blocks = list[Block]()
     async with asyncio.timeout(LONG_S):
         while len(blocks) < count:
-            taken = await store.take(count - len(blocks))
-            assert {waiting.message.topic for waiting in taken} == {"raw/pack"}
-            blocks += [decode(waiting.message.payload) for waiting in taken]
-            assert [waiting.number for waiting in taken] == [block.number for block in blocks[-len(taken) :]]
+            messages = await store.take(count - len(blocks))
+            assert {waiting.message.topic for waiting in messages} == {"raw/pack"}
+            blocks += [decode(waiting.message.payload) for waiting in messages]
+            assert [waiting.number for waiting in messages] == [block.number for block in blocks[-len(messages) :]]
     return blocks
 
 
@@ -71,32 +75,33 @@ def numbers(blocks: list[Block]) -> list[int]:
 
 
 def minutes(count: int, first: int = 0) -> list[ReadyBlock]:
+    """Return blocks at intervals of one minute, beginning ``first`` minutes after ``WALL_S``."""
     return [block_at(WALL_S + 60.0 * i) for i in range(first, first + count)]
 
 
 async def test_blocks_are_taken_in_order_with_times_relative_to_the_store(tmp_path: Path) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
+    async with open_store(tmp_path / "s.sqlite") as store:
         ready = minutes(4)
-        await written(store, *ready)
+        await write_blocks(store, *ready)
         blocks = await take(store, 4)
         assert numbers(blocks) == [1, 2, 3, 4]
         assert {block.store for block in blocks} == {int(WALL_S) * NS}
-        for block, one in zip(blocks, ready, strict=True):
-            assert block.arrival_s == one.arrival_s
-            assert (block.store / NS + block.samples["time_s"] == one.samples["time_s"]).all()
-            assert (block.samples["voltage_v"] == one.samples["voltage_v"]).all()
+        for block, original in zip(blocks, ready, strict=True):
+            assert block.arrival_s == original.arrival_s
+            assert (block.store / NS + block.samples["time_s"] == original.samples["time_s"]).all()
+            assert (block.samples["voltage_v"] == original.samples["voltage_v"]).all()
 
 
 async def test_restart_continues_store_numbers_and_time_and_sends_unconfirmed_blocks(tmp_path: Path) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
-        await written(store, *minutes(6))
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, *minutes(6))
         for block in await take(store, 6):
             store.acknowledge(block.number)
         store.on_request(BlockRequest(store=int(WALL_S) * NS, number=4, resend=False))
         assert (store.waiting, store.unconfirmed) == (0, 3)
-    async with opened(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
+    async with open_store(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
         assert store.last_s == WALL_S + 304.0
-        await written(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
+        await write_blocks(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
         blocks = await take(store, 4)
     assert numbers(blocks) == [4, 5, 6, 7]
     assert {block.store for block in blocks} == {int(WALL_S) * NS}
@@ -105,26 +110,26 @@ async def test_restart_continues_store_numbers_and_time_and_sends_unconfirmed_bl
 
 
 async def test_full_store_drops_the_oldest_blocks_and_updates_oldest(tmp_path: Path) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
-        await written(store, *minutes(1))
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, *minutes(1))
         size = store._on_disk.state.bytes
-    async with opened(tmp_path / "s.sqlite", most_bytes=10 * size + size // 2) as store:
+    async with open_store(tmp_path / "s.sqlite", most_bytes=10 * size + size // 2) as store:
         with capture_logs() as lines:
             for block in minutes(60, 1):
-                await written(store, block)
+                await write_blocks(store, block)
         assert [line["reason"] for line in lines if "lost" in line["event"]] == ["the store is full"]
         assert store._on_disk.state.bytes <= 10 * size + size // 2
-        left = store.unconfirmed
-        assert store.dropped == 61 - left
-        blocks = await take(store, left)
-        assert numbers(blocks) == list(range(62 - left, 62))
-        assert {block.oldest for block in blocks} == {62 - left}
-        assert 8 <= left <= 11
+        remaining = store.unconfirmed
+        assert store.dropped == 61 - remaining
+        blocks = await take(store, remaining)
+        assert numbers(blocks) == list(range(62 - remaining, 62))
+        assert {block.oldest for block in blocks} == {62 - remaining}
+        assert 8 <= remaining <= 11
 
 
 async def test_unacknowledged_blocks_are_taken_again_after_a_rewind(tmp_path: Path) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
-        await written(store, *minutes(6))
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, *minutes(6))
         await take(store, 5)
         for number in (1, 2, 4):
             store.acknowledge(number)
@@ -133,8 +138,8 @@ async def test_unacknowledged_blocks_are_taken_again_after_a_rewind(tmp_path: Pa
 
 
 async def test_resend_request_repeats_all_later_blocks(tmp_path: Path) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
-        await written(store, *minutes(8))
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, *minutes(8))
         await take(store, 8)
         store.on_request(BlockRequest(store=int(WALL_S) * NS, number=3, resend=True))
         blocks = await take(store, 6)
@@ -142,54 +147,54 @@ async def test_resend_request_repeats_all_later_blocks(tmp_path: Path) -> None:
 
 
 async def test_repeated_resend_request_is_ignored_for_a_while(tmp_path: Path) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
+    async with open_store(tmp_path / "s.sqlite") as store:
         store._resend_s = LONG_S
-        await written(store, *minutes(8))
+        await write_blocks(store, *minutes(8))
         await take(store, 8)
         request = BlockRequest(store=int(WALL_S) * NS, number=3, resend=True)
         store.on_request(request)
         await take(store, 6)
         store.on_request(request)
-        await written(store, *minutes(1, 8))
+        await write_blocks(store, *minutes(1, 8))
         assert numbers(await take(store, 1)) == [9]
 
 
 @pytest.mark.parametrize(
-    "awaits",
+    "block_request",
     [
         BlockRequest(store=(int(WALL_S) + 77) * NS + 1, number=1, resend=False),
         BlockRequest(store=int(WALL_S) * NS, number=100, resend=True),
     ],
     ids=["a later store", "a later number"],
 )
-async def test_restored_disk_begins_a_later_store(tmp_path: Path, awaits: BlockRequest) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
-        await written(store, *minutes(3))
+async def test_restored_disk_begins_a_later_store(tmp_path: Path, block_request: BlockRequest) -> None:
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, *minutes(3))
         await take(store, 3)
-        store.on_request(awaits)
-        await until(lambda: store._on_disk.state.made_s * NS > awaits.store)
-        await written(store, block_at(WALL_S + 1000.0))
+        store.on_request(block_request)
+        await until(lambda: store._on_disk.state.made_s * NS > block_request.store)
+        await write_blocks(store, block_at(WALL_S + 1000.0))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest) == (1, 1)
-        assert block.store > awaits.store
+        assert block.store > block_request.store
         assert block.store / NS + block.samples["time_s"][0] == WALL_S + 1000.0
         assert store.dropped == 3
 
 
 @pytest.mark.parametrize("store_ns", [0, 5, (1 << 63) - 1])
 async def test_request_with_an_implausible_store_is_ignored(tmp_path: Path, store_ns: int) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
-        await written(store, *minutes(3))
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, *minutes(3))
         store.on_request(BlockRequest(store=store_ns, number=1 << 63, resend=True))
-        await written(store, *minutes(1, 3))
+        await write_blocks(store, *minutes(1, 3))
         assert numbers(await take(store, 4)) == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("damage", ["no database", "deleted", "other tables", "row"])
 async def test_damaged_database_is_replaced_by_a_later_store(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "s.sqlite"
-    async with opened(path) as store:
-        await written(store, *minutes(3))
+    async with open_store(path) as store:
+        await write_blocks(store, *minutes(3))
         before = store._on_disk.state.made_s
     if damage == "no database":
         path.write_bytes(b"nothing of the kind" * 1000)
@@ -200,8 +205,8 @@ async def test_damaged_database_is_replaced_by_a_later_store(tmp_path: Path, dam
             connection.execute("DROP TABLE block" if damage == "other tables" else "UPDATE store SET next = 'x'")
             connection.commit()
     with capture_logs() as lines:
-        async with opened(path, wall_s=WALL_S + 500.0) as store:
-            await written(store, block_at(WALL_S + 500.0))
+        async with open_store(path, wall_s=WALL_S + 500.0) as store:
+            await write_blocks(store, block_at(WALL_S + 500.0))
             (block,) = await take(store, 1)
     assert block.store > before * NS
     assert block.number == 1
@@ -211,10 +216,10 @@ async def test_damaged_database_is_replaced_by_a_later_store(tmp_path: Path, dam
 
 
 async def test_deleted_file_loses_only_its_blocks(tmp_path: Path) -> None:
-    async with opened(tmp_path / "s.sqlite") as store:
-        await written(store, *minutes(3))
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, *minutes(3))
         (tmp_path / "s.sqlite").unlink()
-        await written(store, *minutes(2, 3))
+        await write_blocks(store, *minutes(2, 3))
         blocks = await take(store, 2)
         assert numbers(blocks) == [1, 2]
         assert blocks[0].store == (int(WALL_S) + 180) * NS
@@ -223,13 +228,13 @@ async def test_deleted_file_loses_only_its_blocks(tmp_path: Path) -> None:
 
 async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
     path = tmp_path / "s.sqlite"
-    async with opened(path) as store:
-        await written(store, *minutes(6))
+    async with open_store(path) as store:
+        await write_blocks(store, *minutes(6))
     with contextlib.closing(sqlite3.connect(path)) as connection:
         connection.execute("UPDATE block SET data = zeroblob(200) WHERE number IN (1, 4)")
         connection.execute("DELETE FROM block WHERE number = 5")
         connection.commit()
-    async with opened(path) as store:
+    async with open_store(path) as store:
         blocks = await take(store, 3)
         assert numbers(blocks) == [2, 3, 6]
         assert {block.oldest for block in blocks} == {2}  # no worker has confirmed them
@@ -241,7 +246,7 @@ async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
 
 
 async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(full_disk: Path) -> None:
-    async with opened(full_disk / "s.sqlite") as store:
+    async with open_store(full_disk / "s.sqlite") as store:
         for block in minutes(3):
             store.put(block)
         await until(lambda: store._database.reason)
@@ -254,7 +259,7 @@ async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(ful
 
 async def test_memory_is_bounded_while_the_disk_fails(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    async with opened(tmp_path / "file" / "s.sqlite") as store:
+    async with open_store(tmp_path / "file" / "s.sqlite") as store:
         store._database.path.parent.touch()
         for i in range(60):
             store.put(block_at(WALL_S + 60.0 * i, 20_000))
@@ -262,22 +267,22 @@ async def test_memory_is_bounded_while_the_disk_fails(tmp_path: Path) -> None:
         assert store.dropped == 35
 
 
-WRITER = """
+WRITER_SCRIPT = """
 import asyncio, sys
 from pathlib import Path
-from tests.edge.test_block_store import UNLIMITED_BYTES, minutes, opened, written
+from tests.edge.test_block_store import UNLIMITED_BYTES, minutes, open_store, write_blocks
 async def main():
-    async with opened(Path(sys.argv[1])) as store:
+    async with open_store(Path(sys.argv[1])) as store:
         for block in minutes(10_000):
-            await written(store, block)
+            await write_blocks(store, block)
             print(store._on_disk.state.next, file=sys.stderr, flush=True)
 asyncio.run(main())
 """
 
 
 def kill_while_writing(path: Path) -> int:
-    """Kill a writing process and return the last ``next`` that the process reported."""
-    command, folder = [sys.executable, "-c", WRITER, str(path)], {"PYTHONPATH": "."}
+    """Kill a writing process and return the last next block number that the process reported."""
+    command, folder = [sys.executable, "-c", WRITER_SCRIPT, str(path)], {"PYTHONPATH": "."}
     with subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ | folder
     ) as process:
@@ -289,11 +294,11 @@ def kill_while_writing(path: Path) -> int:
 
 
 async def test_block_numbers_are_unique_over_kills(tmp_path: Path) -> None:
-    path, next_ = tmp_path / "s.sqlite", 0
+    path, next_number = tmp_path / "s.sqlite", 0
     for _ in range(3):
         reported = await asyncio.to_thread(kill_while_writing, path)
-        assert reported >= next_ + 20
-        async with opened(path) as store:
-            next_ = store._on_disk.state.next
-            assert next_ >= reported
-            assert numbers(await take(store, store.unconfirmed)) == list(range(1, next_))
+        assert reported >= next_number + 20
+        async with open_store(path) as store:
+            next_number = store._on_disk.state.next
+            assert next_number >= reported
+            assert numbers(await take(store, store.unconfirmed)) == list(range(1, next_number))

@@ -88,8 +88,10 @@ async def test_killed_edge_sends_completed_blocks_once_and_sigterm_sends_all(
                 process.kill()
             before = log_file.stat().st_size
             async with program(sys.executable, "-X", "importtime", PROGRAM, "edge", pack, stderr=log) as process:
-                async with asyncio.timeout(LONG_S):  # blocks of the first may still come while the second imports
-                    while b"store of blocks" not in log_file.read_bytes()[before:]:  # noqa: ASYNC110 - another process does it
+                async with asyncio.timeout(
+                    LONG_S
+                ):  # blocks of the first process may still arrive while the second process imports its modules
+                    while b"store of blocks" not in log_file.read_bytes()[before:]:  # noqa: ASYNC110 - another process writes the log
                         await asyncio.sleep(0.02)
                 await receiver.until(sum(block.samples.size for block in receiver.blocks) + 1)
                 process.send_signal(signal.SIGTERM)

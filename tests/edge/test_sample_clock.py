@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from bms_estimator.edge.sample_clock import BAND_S, GRID, STEP_S, SampleClock
 
 WALL_S = 1.7e9
-"""Wall clock at the start."""
+"""Wall clock at the start [s since 1970]."""
 
 
 def run(clock: SampleClock, source_s: np.ndarray, delay_s: float | np.ndarray = 0.0, host_s: np.ndarray | None = None):
@@ -115,8 +115,8 @@ def test_restart_is_a_gap_and_never_steps_back() -> None:
 )
 def test_time_never_steps_back(reads: list[tuple[list[float], float, float]]) -> None:
     clock, steady_s, last_s = SampleClock(), 0.0, -math.inf
-    for source_s, wall_s, passed_s in reads:
-        steady_s += passed_s
+    for source_s, wall_s, elapsed_s in reads:
+        steady_s += elapsed_s
         placed = clock.place(np.array(source_s), wall_s, steady_s)
         assert placed.shape == (len(source_s),)
         assert np.isfinite(placed).all()

@@ -22,12 +22,14 @@ BINARY = Path(sys.executable).parent / "nats-server"
 
 
 class NatsCluster:
-    """The nodes, numbered from 0; ``kill`` is SIGKILL.
+    """Cluster of nats-servers, whose nodes are numbered from 0.
 
     Args:
-        folder: For their files; those of an cluster that was there are taken up.
-        nodes: 1 or 3.
-        partitions, accounts, tls: As ``Node`` has them.
+        folder: Folder of the nodes' files. Existing streams in it are restored.
+        nodes: Number of nodes, 1 or 3.
+        partitions: Number of partitions of the fleet.
+        accounts: Accounts of the tenants; None: clients need no credentials.
+        tls: Certificates of the server; None: no TLS.
     """
 
     def __init__(

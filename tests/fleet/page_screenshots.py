@@ -31,6 +31,7 @@ SUSPECTED = {
     161: InputFault.OUTLIERS | InputFault.OCV,
 }
 STEP_S = 0.2
+"""Update interval of the page [s]."""
 TOP_PX = 420
 """Height of the screenshots in dark mode and stale [px]."""
 

@@ -8,24 +8,24 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import PackSettings, Settings
 
-STORE = 480_000 * 3600 * 10**9
-"""Creation time of an edge's store, at the beginning of an hour [ns since 1970]."""
+STORE_ID_NS = 480_000 * 3600 * 10**9
+"""Creation time of an edge's block store, which identifies it; it is the beginning of an hour [ns since 1970]."""
 CELL = load_cell("ncr18650")
 SETTINGS = Settings(pack=PackSettings(cell="ncr18650"))
 SAMPLES = 20
-"""Samples of a block."""
+"""Number of samples of a block."""
 
 
 def table(pack: str):
     return None if pack.startswith("unknown") else (SETTINGS, CELL)
 
 
-def one_block(samples: SampleBlock, number: int, store: int = STORE, oldest: int = 1) -> bytes:
+def one_block(samples: SampleBlock, number: int, store: int = STORE_ID_NS, oldest: int = 1) -> bytes:
     arrival_s = store / 1e9 + float(np.nan_to_num(samples["time_s"][-1]))
-    return encode(Block(store, number, oldest, arrival_s, samples))
+    return encode(Block(store=store, number=number, oldest=oldest, arrival_s=arrival_s, samples=samples))
 
 
-def blocks_of(samples: SampleBlock, store: int = STORE, oldest: int = 1, size: int = SAMPLES) -> list[bytes]:
+def blocks_of(samples: SampleBlock, store: int = STORE_ID_NS, oldest: int = 1, size: int = SAMPLES) -> list[bytes]:
     """Return the samples as blocks, numbered from ``oldest`` on."""
     parts = [samples[first : first + size] for first in range(0, samples.size, size)]
     return [one_block(part, number, store, oldest) for number, part in enumerate(parts, oldest)]

@@ -17,28 +17,34 @@ from tests.fleet.nats_cluster import connected
 from tests.patience import LONG_S, end
 
 POLL_S = 0.01
+"""Poll interval of the stream [s]."""
+REQUEST_EVERY = 5
+"""Number of early blocks after which a missing block is requested again."""
+CONFIRM_EVERY = 10
+"""Number of accepted blocks after which they are confirmed."""
 
 
 class Receiver:
-    """Reads the stream in order; takes blocks in the order of their numbers and requests missing ones.
+    """Reader of the stream. It accepts blocks in the order of their numbers and requests missing ones.
 
     Args:
         url: URL of the server.
         pack: Name of the pack.
 
     Attributes:
-        lose: Numbers of blocks whose first arrival is dropped.
+        dropped_once: Numbers of blocks whose first arrival is dropped.
         blocks: Accepted blocks.
-        resends, gaps: Number of repeated blocks, and of blocks that arrived before a missing one.
+        resends: Number of repeated blocks.
+        gaps: Number of blocks that arrived before a missing one.
         lost: Number of blocks that the edge no longer has.
     """
 
     def __init__(self, url: str, pack: str) -> None:
         self._url, self.pack = url, pack
         self._store, self._next = 0, 1
-        self._asked = 0
+        self._requested = 0
         self.blocks: list[Block] = []
-        self.lose: set[int] = set()
+        self.dropped_once: set[int] = set()
         self.resends = self.gaps = self.lost = 0
 
     async def __aenter__(self) -> Self:
@@ -69,8 +75,8 @@ class Receiver:
                     self._task.result()
                 await asyncio.sleep(POLL_S)
 
-    async def reply(self, awaits: BlockRequest | bytes) -> None:
-        payload = awaits if isinstance(awaits, bytes) else awaits.model_dump_json().encode()
+    async def reply(self, request: BlockRequest | bytes) -> None:
+        payload = request if isinstance(request, bytes) else request.model_dump_json().encode()
         await self.nc.publish(subjects.awaits(self.pack), payload)
         await self.nc.flush()
 
@@ -83,13 +89,13 @@ class Receiver:
                     with contextlib.suppress(NotFoundError):
                         message = await js.get_msg(subjects.RAW_STREAM, sequence)
                         if str(message.subject).endswith(f".raw.{self.pack}"):
-                            await self._take(decode(message.data or b""))
+                            await self._process(decode(message.data or b""))
                     sequence += 1
             await asyncio.sleep(POLL_S)
 
-    async def _take(self, block: Block) -> None:
-        if block.store < self._store or block.number in self.lose:
-            self.lose.discard(block.number)
+    async def _process(self, block: Block) -> None:
+        if block.store < self._store or block.number in self.dropped_once:
+            self.dropped_once.discard(block.number)
             return
         if block.store > self._store:
             self._store, self._next = block.store, block.oldest
@@ -100,11 +106,11 @@ class Receiver:
             self.resends += 1
         elif block.number > self._next:
             self.gaps += 1
-            if self._asked != self._next or self.gaps % 5 == 0:
-                self._asked = self._next
+            if self._requested != self._next or self.gaps % REQUEST_EVERY == 0:
+                self._requested = self._next
                 await self.reply(BlockRequest(store=self._store, number=self._next, resend=True))
         else:
             self._next += 1
             self.blocks.append(block)
-            if self._next % 10 == 2:
+            if self._next % CONFIRM_EVERY == 2:
                 await self.reply(BlockRequest(store=self._store, number=self._next, resend=False))

@@ -20,6 +20,9 @@ from tests.fleet.nats_cluster import NatsCluster, running
 from tests.patience import LONG_S
 
 NAME = "acme"
+"""Name of the tenant."""
+NUMBER_OFFSET = 16
+"""Offset of the number in an encoded block [bytes]."""
 
 
 class Tenant:
@@ -71,13 +74,13 @@ def one_tenant(folder: Path) -> Iterator[Tenant]:
 
 
 def heavy_block(samples: int, period_s: float, store: int = 1) -> bytes:
-    """Return a well-compressed block of many samples, number 1 of its store."""
+    """Return a block of many equal samples, which are compressed to few bytes. Its number is 1."""
     rows = np.zeros(samples, SAMPLE)
     rows["time_s"] = period_s * np.arange(samples)
     rows["voltage_v"], rows["temperature_c"] = 3.7, 25.0
-    return encode(Block(store, 1, 1, 1.79e9, rows))
+    return encode(Block(store=store, number=1, oldest=1, arrival_s=1.79e9, samples=rows))
 
 
 def numbered(data: bytes, number: int) -> bytes:
     """Return a block with another number."""
-    return data[:16] + number.to_bytes(8, "little") + data[24:]
+    return data[:NUMBER_OFFSET] + number.to_bytes(8, "little") + data[NUMBER_OFFSET + 8 :]

@@ -30,11 +30,11 @@ from tests.patience import LONG_S
 
 PERIOD_S = 10.0
 """Interval between two samples [s]."""
-KIND = encode_row(PackSpec(cell="ncr18650", period_s=PERIOD_S))
-STORE = 1_790_000_000 * 10**9
+PACK_ROW = encode_row(PackSpec(cell="ncr18650", period_s=PERIOD_S))
+STORE_ID_NS = 1_790_000_000 * 10**9
 """Creation time of the edges' stores [ns since 1970]."""
 SAMPLES = 60
-"""Samples of a block, ten minutes."""
+"""Number of samples of a block, which lasts ten minutes."""
 
 
 def samples(pack: str, number: int) -> np.ndarray:
@@ -49,20 +49,20 @@ def samples(pack: str, number: int) -> np.ndarray:
 
 
 def block(pack: str, number: int, arrival_s: float = 1.79e9) -> bytes:
-    return encode(Block(STORE, number, 1, arrival_s, samples(pack, number)))
+    return encode(Block(store=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=samples(pack, number)))
 
 
 async def load_packs(nc: Client, packs: list[str]) -> PackRegistry:
     """Write packs to the table, and return a registry with them."""
-    await write_bucket(nc, subjects.PACKS_BUCKET, dict.fromkeys(packs, KIND))
+    await write_bucket(nc, subjects.PACKS_BUCKET, dict.fromkeys(packs, PACK_ROW))
     registry = PackRegistry()
     for pack in packs:
-        registry.set_row(pack, KIND)
+        registry.set_row(pack, PACK_ROW)
     return registry
 
 
 async def send(nc: Client, pack: str, data: bytes) -> None:
-    """Publish until the stream confirms; the stream drops repetitions after a late response."""
+    """Publish a block until the stream acknowledges it. The stream drops repetitions after a late acknowledgment."""
     headers = {"Nats-Msg-Id": f"{pack} {hashlib.sha256(data).hexdigest()}"}
     deadline = time.monotonic() + LONG_S
     while time.monotonic() < deadline:
@@ -111,7 +111,7 @@ class Process:
 
 
 class Heartbeats:
-    """The last heartbeat of each worker."""
+    """Subscriber to heartbeats; ``last`` has the last heartbeat of each worker."""
 
     def __init__(self, nc: Client) -> None:
         self._nc, self.last = nc, dict[str, Heartbeat]()
@@ -134,23 +134,24 @@ class Heartbeats:
         await until(lambda: condition(self.last), lambda: self.last)
 
     async def until_held(self, partitions: int, *workers: str) -> None:
-        """Wait until these workers together have all partitions, each at least one."""
+        """Wait until these workers together hold all partitions, and each holds at least one."""
 
-        def held(last: Mapping[str, Heartbeat]) -> bool:
+        def are_held(last: Mapping[str, Heartbeat]) -> bool:
             parts = [last[worker].partitions if worker in last else () for worker in workers]
             return all(parts) and sorted(number for part in parts for number in part) == list(range(partitions))
 
         self.clear()
-        await self.until(held)
+        await self.until(are_held)
 
 
-async def until(condition: Callable[[], Any], or_else: Callable[[], object]) -> Any:
+async def until(condition: Callable[[], Any], description: Callable[[], object]) -> Any:
+    """Wait until ``condition()`` is true and return its value; on a timeout fail with ``description()``."""
     deadline = time.monotonic() + LONG_S
     while time.monotonic() < deadline:
         if result := condition():
             return result
         await asyncio.sleep(0.02)
-    raise AssertionError(str(or_else()))
+    raise AssertionError(str(description()))
 
 
 async def end_states(nc: Client, registry: PackRegistry, partitions: int) -> dict[int, Partition]:

@@ -12,6 +12,7 @@ from hypothesis.strategies import SearchStrategy
 
 SEEDS = Path(__file__).parents[1] / "data" / "fuzz"
 MAX_EDITS = 4
+"""Maximum number of edits of one input."""
 MAX_OFFSET = 1 << 17
 """Maximum offset of an edit before the modulo by the input's length [bytes]; longer than every seed."""
 MAX_REMOVED = 32
@@ -33,7 +34,7 @@ Keys = tuple[Any, ...]
 
 
 def seeds(name: str) -> list[bytes]:
-    """Return the stored inputs of a reader, including every input that once failed."""
+    """Return the stored inputs of a reader. They include every input that has failed before."""
     return [path.read_bytes() for path in sorted((SEEDS / name).iterdir())]
 
 
@@ -43,7 +44,7 @@ def edited_seeds(
     repair: Callable[[bytes], bytes] | None = None,
     others: SearchStrategy[bytes] = NO_INPUTS,
 ) -> Callable[[Test], Test]:
-    """Decorate a test of one input: all seeds, then edited seeds.
+    """Return a decorator of a test that has one input. The test runs with all seeds, then with edited seeds.
 
     Args:
         name: Folder of the seeds.
@@ -64,7 +65,7 @@ def edited_seeds(
 
 
 def edited(stored: Sequence[bytes], tokens: Sequence[bytes]) -> SearchStrategy[bytes]:
-    """Return a strategy of seeds with up to four splices; seeds of JSON objects also get replaced values."""
+    """Return a strategy of seeds with up to four splices; in seeds of JSON objects values are also replaced."""
     seed = st.sampled_from(stored)
     copied = st.builds(
         lambda data, begin, length: data[begin % (len(data) + 1) :][:length],

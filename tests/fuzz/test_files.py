@@ -1,4 +1,4 @@
-"""Readers of files with edited content: only user errors that name the file."""
+"""Readers of files with edited content: they raise only user errors, which name the file."""
 
 import binascii
 import gzip
@@ -82,49 +82,49 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @edited_seeds("settings", *TOML)
-def test_settings(folder: Path, data: bytes) -> None:
+def test_settings_reader(folder: Path, data: bytes) -> None:
     load_file(folder / "pack.toml", load_settings, data)
 
 
 @edited_seeds("cell", *TOML)
-def test_cell(folder: Path, data: bytes) -> None:
+def test_cell_reader(folder: Path, data: bytes) -> None:
     load_file(folder / "cell.toml", load_any, data)
 
 
 @edited_seeds("csv", b"time_s", b"current_a", b"Voltage / V", b",,", b"\xef\xbb\xbf")
-def test_csv(folder: Path, data: bytes) -> None:
+def test_csv_reader(folder: Path, data: bytes) -> None:
     load_file(folder / "table.csv", load_capture, data)
 
 
 @edited_seeds("csv.gz", repair=lambda data: gzip.compress(data, 1))
-def test_compressed_csv(folder: Path, data: bytes) -> None:
+def test_compressed_csv_reader(folder: Path, data: bytes) -> None:
     load_file(folder / "table.csv.gz", load_capture, data)
 
 
 @edited_seeds("parquet", b"PAR1")
-def test_parquet(folder: Path, data: bytes) -> None:
+def test_parquet_reader(folder: Path, data: bytes) -> None:
     load_file(folder / "table.parquet", load_capture, data)
 
 
 @edited_seeds("curve", b"soc", b"ocv_v", b"hysteresis_v", b",,")
-def test_curve(folder: Path, data: bytes) -> None:
+def test_curve_reader(folder: Path, data: bytes) -> None:
     load_file(folder / "curve.csv", read_curve, data)
 
 
 @edited_seeds("capture", b"null", b'"version"', b": [", b"\\ud800", repair=with_capture_header)
-def test_capture(folder: Path, data: bytes) -> None:
+def test_capture_reader(folder: Path, data: bytes) -> None:
     load_file(folder / "line.bms", load_capture, data)
 
 
 @edited_seeds("checkpoint", b"PK\x03\x04", *ARRAY_HEADER, others=checkpoints())
-def test_checkpoint(folder: Path, data: bytes) -> None:
+def test_checkpoint_reader(folder: Path, data: bytes) -> None:
     file = CheckpointFile(folder, Settings(), CELL)
     file.path.write_bytes(data)
     file.load()
 
 
 @edited_seeds("known_board")
-def test_known_board(folder: Path, data: bytes) -> None:
+def test_known_board_reader(folder: Path, data: bytes) -> None:
     file = KnownBoardFile(folder, "pack")
     file.path.write_bytes(data)
     file.load()

@@ -1,4 +1,4 @@
-"""Foreign messages and names with edited content: requests, published states, USB descriptions."""
+"""Edited requests, published messages and USB descriptions: no exception, and only printable text."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ CONSOLE = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, 
 
 
 @edited_seeds("requests", *JSON)
-def test_requests(data: bytes) -> None:
+def test_each_request_is_counted_and_answered_with_json(data: bytes) -> None:
     stats = DeliveryStats()
     requests = RequestDispatcher(stats, ("set_soc",))
 
@@ -52,7 +52,7 @@ def test_published_messages_show_only_printable_text(data: bytes) -> None:
 
 
 @edited_seeds("ports", b"zigbee", b"auto", b"/dev/", b"../")
-def test_ports(data: bytes) -> None:
+def test_port_descriptions_cause_no_exception(data: bytes) -> None:
     text = data.decode("utf-8", "surrogateescape")
     port = ListPortInfo("ttyUSB0")
     port.vid, port.pid, port.manufacturer, port.product, port.description = 0x1A86, 0x7523, text, text, text

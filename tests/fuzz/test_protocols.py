@@ -88,47 +88,47 @@ def with_jk_checksum(data: bytes) -> bytes:
 
 
 @edited_seeds("frames", DELIMITER, b"\x01\x01", b"\x01\x02", b"\xff\xff\xff\xff", others=FRAMES)
-def test_frames(data: bytes) -> None:
+def test_board_protocol(data: bytes) -> None:
     decode(BoardProtocol(rate_hz=100), data)
 
 
 @edited_seeds("messages", DELIMITER, b"\x01\x02", others=EDITED_PACKETS.map(seal))
-def test_messages(data: bytes) -> None:
+def test_message_decoders_raise_only_protocol_errors(data: bytes) -> None:
     for decode_message in (Hello.decode, Ack.decode, SampleMessage.decode):
         with contextlib.suppress(ProtocolError):
             decode_message(unseal(data))
 
 
 @edited_seeds("text", b"V=", b"I=", b"T=", b"cells=", b'{"voltage":', b";", b" mA", b"kV")
-def test_text(data: bytes) -> None:
+def test_text_protocol(data: bytes) -> None:
     decode(TextProtocol(), data)
 
 
 @edited_seeds("vedirect", b"\r\nV\t", b"\r\nI\t", b"\r\nChecksum\t", b":7F0", repair=with_vedirect_checksums)
-def test_vedirect(data: bytes) -> None:
+def test_vedirect_protocol(data: bytes) -> None:
     decode(VeDirectProtocol(), data)
 
 
 @edited_seeds("junctek", b":r50=1,", b",", b":R50=1,2,1,\r\n", repair=with_junctek_checksums)
-def test_junctek(data: bytes) -> None:
+def test_junctek_protocol(data: bytes) -> None:
     decode(JunctekProtocol(), data)
 
 
 @edited_seeds("pylontech", b"pylon>", b"Power Volt", b"Absent", b"bat 2", b" - ")
-def test_pylontech(data: bytes) -> None:
+def test_pylontech_protocol(data: bytes) -> None:
     decode(PylontechProtocol(), data)
 
 
 @edited_seeds("jbd", b"\xdd\x03\0", b"\xdd\x04\0", b"\x77", repair=with_jbd_checksums)
-def test_jbd(data: bytes) -> None:
+def test_jbd_protocol(data: bytes) -> None:
     decode_polled("jbd", data)
 
 
 @edited_seeds("daly", b"\xa5\x01\x90\x08", b"\xa5\x01\x95\x08", repair=with_daly_checksums)
-def test_daly(data: bytes) -> None:
+def test_daly_protocol(data: bytes) -> None:
     decode_polled("daly", data)
 
 
 @edited_seeds("jk", jk.OLD_START, jk.START, jk.START + b"\x02", b"\xc0\x01", b"\x79", repair=with_jk_checksum)
-def test_jk(data: bytes) -> None:
+def test_jk_protocol(data: bytes) -> None:
     decode_polled("jk", data)

@@ -1,4 +1,4 @@
-"""One Home Assistant, one broker and one service for all of these tests."""
+"""Fixtures of Home Assistant, a broker and a service, shared by all tests of this folder."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A real Home Assistant on loopback with its own folder and Python, and its REST and WebSocket API."""
+"""Real Home Assistant on loopback with its own folder and Python, controlled by its REST and WebSocket APIs."""
 
 import contextlib
 import json
@@ -20,8 +20,8 @@ VERSION = os.environ.get("HOME_ASSISTANT", "2025.2.5")
 ENVIRONMENT = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bms_estimator-home-assistant" / VERSION
 )
-"""Folder of `make home-assistant`."""
-MISSING = f"Home Assistant {VERSION} is not there: `make home-assistant` makes it, which takes two minutes"
+"""Folder in which `make home-assistant` installs Home Assistant."""
+MISSING = f"Home Assistant {VERSION} is not installed: `make home-assistant` installs it in two minutes"
 
 CONFIGURATION = """
 homeassistant:
@@ -49,15 +49,15 @@ lovelace:
       title: Pack
       filename: dashboard.yaml
 """
-CLIENT = "http://127.0.0.1/"
+CLIENT_ID = "http://127.0.0.1/"
 
 
 class HomeAssistant:
-    """One that runs, with an owner.
+    """Running Home Assistant with an owner.
 
     Args:
-        folder: Its configuration.
-        dashboard: Of the dashboard ``the-pack``, YAML.
+        folder: Folder of its configuration.
+        dashboard: YAML file of the dashboard ``the-pack``.
     """
 
     def __init__(self, folder: Path, dashboard: Path) -> None:
@@ -68,7 +68,7 @@ class HomeAssistant:
         self._token = ""
 
     def start(self) -> None:
-        """Until it answers; the first start makes an owner."""
+        """Start Home Assistant and wait until it responds. Create an owner at the first start."""
         command = [str(ENVIRONMENT / "venv/bin/python"), "-m", "homeassistant", "-c", str(self.folder), "--skip-pip"]
         with (self.folder / "console.log").open("ab") as console:
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=console, stderr=console)
@@ -91,13 +91,13 @@ class HomeAssistant:
             self._process = None
 
     def _onboard(self) -> None:
-        owner = {"client_id": CLIENT, "name": "Owner", "username": "owner", "password": "secret", "language": "en"}
+        owner = {"client_id": CLIENT_ID, "name": "Owner", "username": "owner", "password": "secret", "language": "en"}
         code = self.ask("/api/onboarding/users", owner, authorized=False)["auth_code"]
-        form = f"grant_type=authorization_code&code={code}&client_id={CLIENT}".encode()
+        form = f"grant_type=authorization_code&code={code}&client_id={CLIENT_ID}".encode()
         self._token = self._call("/auth/token", form)["access_token"]
 
     def ask(self, path: str, body: Mapping[str, Any] | None = None, *, authorized: bool = True) -> Any:
-        """Return the response of its REST API; with a ``body`` by POST."""
+        """Return the response of the REST API to a GET, or to a POST of ``body``."""
         content = None if body is None else json.dumps(body).encode()
         return self._call(path, content, {"Authorization": f"Bearer {self._token}"} if authorized else {})
 
@@ -109,7 +109,7 @@ class HomeAssistant:
             return json.load(response)
 
     def add_mqtt(self, port: int) -> None:
-        """Set up the integration as its owner would, by the forms."""
+        """Set up the MQTT integration by the forms of its configuration flow."""
         flow = self.ask("/api/config/config_entries/flow", {"handler": "mqtt"})
         broker = {"broker": "127.0.0.1", "port": port}
         done = self.ask(f"/api/config/config_entries/flow/{flow['flow_id']}", broker)
@@ -123,28 +123,28 @@ class HomeAssistant:
         """Call a service, such as ``number.set_value``."""
         self.ask(f"/api/services/{service.replace('.', '/')}", data)
 
-    def until(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """The states, once they are wanted."""
+    def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Wait until a condition holds for the states, and return them."""
         deadline = time.monotonic() + LONG_S
-        while not wanted(states := self.states()):
+        while not condition(states := self.states()):
             assert time.monotonic() < deadline, {name: state["state"] for name, state in states.items()}
             time.sleep(0.1)
         return states
 
     def command(self, kind: str, **arguments: Any) -> Any:
-        """The result of a command of its WebSocket API."""
+        """Return the result of a command of the WebSocket API."""
         with connect(f"ws://127.0.0.1:{self._port}/api/websocket", max_size=None) as connection:
             connection.recv()
             connection.send(json.dumps({"type": "auth", "access_token": self._token}))
             assert json.loads(connection.recv())["type"] == "auth_ok"
             connection.send(json.dumps({"id": 1, "type": kind, **arguments}))
-            answer = json.loads(connection.recv())
-            assert answer["success"], answer
-            return answer["result"]
+            response = json.loads(connection.recv())
+            assert response["success"], response
+            return response["result"]
 
     @property
     def log(self) -> str:
-        """All that it has logged."""
+        """Return the complete log; before the log file exists, the console output."""
         file = self.folder / "home-assistant.log"
         return file.read_text() if file.exists() else (self.folder / "console.log").read_text()
 

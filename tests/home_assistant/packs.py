@@ -1,4 +1,4 @@
-"""The real service with two packs: a board that prints text with its cells, and one of the firmware's kind."""
+"""Real service with two packs: a board that prints text with cell voltages, and a board with the firmware's protocol."""
 
 import asyncio
 import contextlib
@@ -32,15 +32,16 @@ commands = {commands}
 """
 LFP = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4'
 SOC_LOW = "[alarms]\nsoc_low = {limit = 0.1, clear = 0.2, delay_s = 0, clear_delay_s = 0}\n"
-PRINTED_S = 0.1
+PRINT_INTERVAL_S = 0.1
+"""Interval of the printed lines [s]."""
 
 
 class Packs:
-    """A service, and what its boards measure.
+    """Service with two boards.
 
     Attributes:
-        printed: What the board with cells prints, ...
-        silent: ... unless this is set.
+        printed: Values that the text board prints.
+        silent: Event; while set, the text board prints nothing.
     """
 
     def __init__(self, folder: Path, broker: Broker) -> None:
@@ -52,13 +53,14 @@ class Packs:
         self._process: subprocess.Popen[bytes] | None = None
         cells_v = [3.301, 3.302, 3.28, 3.303]
         self.printed: dict[str, Any] = {"voltage": sum(cells_v), "current": 2.0, "temp": 21.5, "cells": cells_v}
-        common = {"url": broker.url, "commands": list(COMMANDS)}
+        shared_settings = {"url": broker.url, "commands": list(COMMANDS)}
         self._line.plug()
         self._board.__enter__()
         texts = {
-            "pack": SETTINGS.format(name="pack", cell=LFP, port=self._line.path, protocol="text", **common) + SOC_LOW,
+            "pack": SETTINGS.format(name="pack", cell=LFP, port=self._line.path, protocol="text", **shared_settings)
+            + SOC_LOW,
             "bench": SETTINGS.format(
-                name="bench", cell='cell = "chen_mora"', port=self._board.path, protocol="binary", **common
+                name="bench", cell='cell = "chen_mora"', port=self._board.path, protocol="binary", **shared_settings
             ),
         }
         self._files = [folder / f"{name}.toml" for name in texts]
@@ -93,18 +95,18 @@ class Packs:
         return (self._folder / "service.log").read_text()
 
     def _print(self) -> None:
-        with contextlib.suppress(OSError):  # nobody has opened it yet
-            self._line.received()  # leaves its end such that a full line holds nobody up
-        while not self._ended.wait(PRINTED_S):
-            with contextlib.suppress(OSError):  # it is full, or nobody has opened it
+        with contextlib.suppress(OSError):  # no process has opened the line yet
+            self._line.received()  # makes writes to a full line fail instead of block
+        while not self._ended.wait(PRINT_INTERVAL_S):
+            with contextlib.suppress(OSError):  # the line is full or not open
                 if not self.silent.is_set():
                     self._line.write(json.dumps(self.printed).encode() + b"\r\n")
 
     def _sample(self) -> None:
         async def sample() -> None:
             running = asyncio.create_task(self._board.run())
-            while not self._ended.is_set():  # noqa: ASYNC110 - of another thread
-                await asyncio.sleep(PRINTED_S)
+            while not self._ended.is_set():  # noqa: ASYNC110 - an event of another thread
+                await asyncio.sleep(PRINT_INTERVAL_S)
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
 

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from typing import Self
 
-REJECTED = b"\x20\x02\x00\x01"
+CONNACK_UNSUPPORTED_VERSION = b"\x20\x02\x00\x01"
 """CONNACK for an unsupported protocol version."""
 
 
@@ -19,15 +19,15 @@ async def read_packet(reader: asyncio.StreamReader) -> bytes:
 
 def qos1_message(packet: bytes) -> tuple[str, bytes] | None:
     """Return topic and packet identifier of a message at QoS 1; None for any other packet."""
-    if packet[0] & 0xF6 != 0x32:
+    if packet[0] & 0xF6 != 0x32:  # PUBLISH at QoS 1, with any DUP and RETAIN
         return None
-    start = next(i for i, byte in enumerate(packet[1:], 2) if not byte & 0x80)
-    end = start + 2 + int.from_bytes(packet[start : start + 2])
-    return packet[start + 2 : end].decode(), packet[end : end + 2]
+    begin = next(i for i, byte in enumerate(packet[1:], 2) if not byte & 0x80)
+    end = begin + 2 + int.from_bytes(packet[begin : begin + 2])
+    return packet[begin + 2 : end].decode(), packet[end : end + 2]
 
 
 class Proxy:
-    """Forwards to the broker on ``port``.
+    """Proxy that forwards to the broker on ``port``.
 
     Args:
         port: Port of the broker.
@@ -35,8 +35,8 @@ class Proxy:
 
     Attributes:
         port: Listening port.
-        swallows: True to lose all bytes of both directions silently. Connections of that time never recover.
-        away: True to close new connections.
+        drops_all: True to drop all bytes of both directions silently. Connections of this time never recover.
+        rejects_connections: True to close new connections.
         reject_code: Reason code by which the proxy rejects messages at QoS 1; 0: forward them.
         rejected: Topics of the rejected messages.
         half_open_ended: Set when the broker has ended a connection that was left half-open.
@@ -46,7 +46,7 @@ class Proxy:
         self._broker_port, self._supports_5 = port, supports_5
         self._clients: list[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = []
         self._tasks: set[asyncio.Task[None]] = set()
-        self._half_open = self.swallows = self.away = False
+        self._half_open = self.drops_all = self.rejects_connections = False
         self.reject_code = 0
         self.rejected: list[str] = []
         self.half_open_ended = asyncio.Event()
@@ -66,26 +66,26 @@ class Proxy:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def leave(self) -> None:
+    def disconnect_network(self) -> None:
         """Disconnect the network: both ends of all connections are closed, and new ones rejected."""
-        self.away = True
+        self.rejects_connections = True
         for client, broker in self._clients:
             client.transport.abort()
             broker.transport.abort()
         self._clients = []
 
-    def cut(self) -> None:
+    def close_clients(self) -> None:
         """Close the clients' connections without informing the broker."""
         self._half_open = True
         for client, _ in self._clients:
             client.transport.abort()
         self._clients = []
 
-    def end(self, reason: int) -> None:
+    def send_disconnect(self, reason: int) -> None:
         """Disconnect all clients with a reason code, as an MQTT 5 broker does."""
         for client, _ in self._clients:
-            client.write(bytes([0xE0, 1, reason]))
-        self.away = True
+            client.write(bytes([0xE0, 1, reason]))  # DISCONNECT
+        self.rejects_connections = True
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -97,14 +97,14 @@ class Proxy:
         self._tasks.discard(task)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self.away:
+        if self.rejects_connections:
             return
         start = await read_packet(reader)
         if b"MQTT\x05" in start and not self._supports_5:
-            writer.write(REJECTED)
+            writer.write(CONNACK_UNSUPPORTED_VERSION)
             await writer.drain()
             return
-        while self.swallows:  # also lose CONNECT
+        while self.drops_all:  # also lose CONNECT
             if not await reader.read(65_536):
                 return
         from_broker, to_broker = await asyncio.open_connection("127.0.0.1", self._broker_port)
@@ -115,7 +115,7 @@ class Proxy:
             await self._pump_to_client(from_broker, writer)
             while await from_broker.read(4096):  # the client is gone, and the broker has not noticed
                 pass
-            if self.swallows:
+            if self.drops_all:
                 await upstream
             if self._half_open:
                 self.half_open_ended.set()
@@ -131,11 +131,11 @@ class Proxy:
         with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
             while not to_broker.transport.is_closing():
                 packet = await read_packet(reader)
-                lost |= self.swallows
+                lost |= self.drops_all
                 message = qos1_message(packet) if self.reject_code else None
                 if message and not lost:
                     self.rejected.append(message[0])
-                    to_client.write(bytes([0x40, 3, *message[1], self.reject_code]))
+                    to_client.write(bytes([0x40, 3, *message[1], self.reject_code]))  # PUBACK
                 elif not lost:
                     to_broker.write(packet)
                     await to_broker.drain()
@@ -145,7 +145,7 @@ class Proxy:
         lost = False
         with contextlib.suppress(ConnectionError):
             while data := await reader.read(65_536):
-                lost |= self.swallows
+                lost |= self.drops_all
                 if writer.transport.is_closing():
                     return
                 if not lost:

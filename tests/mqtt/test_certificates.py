@@ -49,8 +49,8 @@ def strict_broker(folder: Path, tmp_path: Path) -> Iterator[Broker]:
 
 
 def settings(broker: Broker, folder: Path, name: str | None) -> MqttSettings:
-    own = {"cert_file": folder / f"{name}.crt", "key_file": folder / f"{name}.key"} if name else {}
-    return MqttSettings(url=f"mqtts://127.0.0.1:{broker.port}", ca_file=folder / "ca.crt", **own)
+    client_files = {"cert_file": folder / f"{name}.crt", "key_file": folder / f"{name}.key"} if name else {}
+    return MqttSettings(url=f"mqtts://127.0.0.1:{broker.port}", ca_file=folder / "ca.crt", **client_files)
 
 
 def sink(settings: MqttSettings) -> MqttSink:
@@ -102,10 +102,10 @@ def test_minimum_version_is_tls_1_2(folder: Path) -> None:
 def test_key_readable_by_every_user_causes_a_warning(folder: Path, tmp_path: Path) -> None:
     key = tmp_path / "open.key"
     shutil.copy(folder / "pack.key", key)
-    chosen = MqttSettings(url="mqtts://host", cert_file=folder / "pack.crt", key_file=key)
-    assert check(chosen) == []
+    configured = MqttSettings(url="mqtts://host", cert_file=folder / "pack.crt", key_file=key)
+    assert check(configured) == []
     key.chmod(0o644)
-    [warning] = check(chosen)
+    [warning] = check(configured)
     assert f"mqtt.key_file = {key}: every user" in warning
 
 
@@ -129,7 +129,7 @@ def test_key_is_found_in_the_credentials_directory(folder: Path, monkeypatch: py
 )  # fmt: skip
 def test_error_names_the_unusable_certificate(folder: Path, changes: dict[str, Any], error: str) -> None:
     openssl("ec", "-in", folder / "pack.key", "-aes128", "-passout", "pass:word", "-out", folder / "locked.key")
-    chosen = {"url": "mqtts://host", "cert_file": "pack.crt", "key_file": "pack.key"} | changes
-    files = {key: folder / str(name) for key, name in chosen.items() if key != "url" and name is not None}
+    values = {"url": "mqtts://host", "cert_file": "pack.crt", "key_file": "pack.key"} | changes
+    files = {key: folder / str(name) for key, name in values.items() if key != "url" and name is not None}
     with pytest.raises(UserError, match=error):
-        check(MqttSettings(url=chosen["url"], **files))
+        check(MqttSettings(url=values["url"], **files))

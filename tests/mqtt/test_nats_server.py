@@ -75,7 +75,7 @@ def mqtt_url(server: NatsCluster, node: int) -> str:
 
 async def test_restarted_node_receives_all_states(tmp_path: Path) -> None:
     with running(tmp_path) as server:
-        async with Collector(server) as live, Sink(mqtt_url(server, 0), most_kept=10_000) as sink:
+        async with Collector(server) as live, Sink(mqtt_url(server, 0), max_queued=10_000) as sink:
             await publish(sink, 0, COUNT // 2)
             await until(lambda: live.states)
             server.kill(0)
@@ -98,7 +98,7 @@ async def test_killed_cluster_node_loses_no_state(tmp_path: Path, *, serves_clie
             victim = leader if is_leader else (leader + 1) % 3
             first = victim if serves_client else (victim + 1) % 3
             urls = tuple(mqtt_url(server, (first + i) % 3) for i in range(3))
-            async with Sink(urls, most_kept=10_000) as sink:
+            async with Sink(urls, max_queued=10_000) as sink:
                 await until(lambda: live.availability == [b"online"])
                 await publish(sink, 0, COUNT // 2)
                 await until(lambda: len(live.states) > COUNT // 4)

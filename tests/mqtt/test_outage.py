@@ -22,7 +22,7 @@ SHORT_TIMEOUTS = Timeouts(connect_s=1.0, keepalive_s=1, acknowledge_s=1.0)
 
 
 def connect_options(url: str | tuple[str, ...], timeouts: Timeouts = SHORT_TIMEOUTS) -> dict[str, Any]:
-    return {"connect": BrokerConnector(MqttSettings(url=url), timeouts), "most_kept": 10_000}
+    return {"connect": BrokerConnector(MqttSettings(url=url), timeouts), "max_queued": 10_000}
 
 
 @pytest.fixture
@@ -42,15 +42,15 @@ async def network(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterat
 
 
 async def test_states_published_during_outages_arrive_in_order(broker: Broker, network: Proxy) -> None:
-    async with Listener(broker) as live, Sink(network.url, most_kept=10_000) as sink:
+    async with Listener(broker) as live, Sink(network.url, max_queued=10_000) as sink:
         for number in range(1000):
             sink.mqtt.publish(state(number))
             if number % 300 == 250:
                 await until(lambda: numbers(live))  # delivery has begun and is not finished
-                network.leave()
+                network.disconnect_network()
                 live_before = len(numbers(live))
             if number % 300 == 280:
-                network.away = False
+                network.rejects_connections = False
                 await until(lambda: len(numbers(live)) > live_before)  # noqa: B023 - at once
         await until(lambda: sink.delivery.waiting == 0)
         await until(lambda: numbers(live)[-1] == 999)
@@ -59,11 +59,11 @@ async def test_states_published_during_outages_arrive_in_order(broker: Broker, n
 
 
 async def test_live_topics_overtake_a_backlog(broker: Broker, network: Proxy) -> None:
-    network.leave()
-    async with Listener(broker) as live, Sink(network.url, most_kept=10_000) as sink:
+    network.disconnect_network()
+    async with Listener(broker) as live, Sink(network.url, max_queued=10_000) as sink:
         for number in range(2000):
             sink.mqtt.publish(state(number))
-        network.away = False
+        network.rejects_connections = False
         await until(lambda: len(live.all(STATE)) == 2000)
     topics = [topic for topic, _, _ in live.messages]
     for topic in ("availability", "info", "health", "parameters", "home_assistant"):
@@ -72,7 +72,7 @@ async def test_live_topics_overtake_a_backlog(broker: Broker, network: Proxy) ->
 
 async def test_queued_states_are_sent_before_offline_at_shutdown(broker: Broker) -> None:
     async with Listener(broker) as live:
-        async with Sink(broker.url, most_kept=10_000) as sink:
+        async with Sink(broker.url, max_queued=10_000) as sink:
             await live.wait("bms/pack/availability")
             for number in range(300):
                 sink.mqtt.publish(state(number))
@@ -89,7 +89,7 @@ async def test_silent_connection_is_replaced_by_the_next_broker(broker: Broker, 
                     sink.mqtt.publish(state(number))
                 await first.wait_json(STATE, lambda s: s["frames_received"] == 9)
                 await until(lambda: sink.delivery.waiting == 0)
-                silent.swallows = True
+                silent.drops_all = True
                 for number in range(10, 30):
                     sink.mqtt.publish(state(number))
                 await second.wait_json(STATE, lambda s: s["frames_received"] == 29)
@@ -107,9 +107,9 @@ async def test_silent_connection_is_detected_without_traffic(broker: Broker) -> 
         with structlog.testing.capture_logs() as logs:
             async with Sink(silent.url, **connect_options(silent.url, Timeouts(keepalive_s=1))) as sink:
                 await live.wait("bms/pack/schema")
-                silent.swallows = True
+                silent.drops_all = True
                 await until(lambda: any(line["event"] == "broker lost" for line in logs))
-                silent.swallows = False
+                silent.drops_all = False
                 before = len(live.messages)
                 sink.mqtt.publish(ONE)
                 await live.wait(STATE, skip=before)
@@ -195,7 +195,7 @@ def state_denying_broker(tmp_path: Path) -> Iterator[Broker]:
 
 async def test_rejected_states_are_counted_and_do_not_block_others(state_denying_broker: Broker) -> None:
     with structlog.testing.capture_logs() as logs:
-        async with Listener(state_denying_broker) as live, Sink(state_denying_broker.url, most_kept=1000) as sink:
+        async with Listener(state_denying_broker) as live, Sink(state_denying_broker.url, max_queued=1000) as sink:
             for number in range(100):
                 sink.mqtt.publish(state(number))
             await until(lambda: sink.delivery.waiting == 0)

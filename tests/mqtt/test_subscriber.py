@@ -19,22 +19,27 @@ from tests.sinks.service import Sink, until
 from tests.sinks.snapshots import ONE
 
 
-class Watch:
-    """Subscriber whose callbacks wake waiting tests."""
+class WatchedSubscriber:
+    """Subscriber whose callbacks wake waiting tests.
+
+    Attributes:
+        received: Messages passed to the callback.
+        lost_since_changes: Values of ``lost_since`` after each change of the connection.
+    """
 
     def __init__(self, url: str, **options: Any) -> None:
         self.received: list[DeviceMessage] = []
-        self.links: list[float | None] = []
+        self.lost_since_changes: list[float | None] = []
         self._changed = asyncio.Event()
         settings = MqttSettings(url=url, **options)
-        self.subscriber = Subscriber(settings, self._on_message, self._on_link_change, first_delay_s=0.1)
+        self.subscriber = Subscriber(settings, self._on_message, self._on_connection_change, first_delay_s=0.1)
 
     def _on_message(self, message: DeviceMessage) -> None:
         self.received.append(message)
         self._changed.set()
 
-    def _on_link_change(self) -> None:
-        self.links.append(self.subscriber.lost_since)
+    def _on_connection_change(self) -> None:
+        self.lost_since_changes.append(self.subscriber.lost_since)
         self._changed.set()
 
     async def until(self, condition: Any) -> None:
@@ -52,69 +57,69 @@ class Watch:
 async def test_published_messages_are_stored_and_passed_to_the_callback(broker: Broker, *, supports_5: bool) -> None:
     async with Proxy(broker.port, supports_5=supports_5) as proxy, Sink(broker.url) as sink:
         sink.mqtt.publish(ONE)
-        watch = Watch(proxy.url)
-        async with watch.subscriber:
-            await watch.until(lambda: watch.stored("pack", "health") and watch.stored("pack", "schema"))
-            assert watch.subscriber.lost_since is None
+        watched = WatchedSubscriber(proxy.url)
+        async with watched.subscriber:
+            await watched.until(lambda: watched.stored("pack", "health") and watched.stored("pack", "schema"))
+            assert watched.subscriber.lost_since is None
             sink.mqtt.publish(ONE)
-            await watch.until(lambda: watch.stored("pack", "state"))
+            await watched.until(lambda: watched.stored("pack", "state"))
             assert ONE.estimate
-            assert watch.stored("pack", "state") == ONE.estimate.model_dump(mode="json")
-            assert watch.stored("pack", "availability") == "online"
-            assert DeviceMessage("pack", "availability", "online") in watch.received
+            assert watched.stored("pack", "state") == ONE.estimate.model_dump(mode="json")
+            assert watched.stored("pack", "availability") == "online"
+            assert DeviceMessage("pack", "availability", "online") in watched.received
             await sink.mqtt.__aexit__(None, None, None)
-            await watch.until(lambda: watch.stored("pack", "availability") == "offline")
-    assert watch.subscriber.lost_messages == 0
-    assert watch.links[0] is None
-    assert watch.links[-1] is not None
+            await watched.until(lambda: watched.stored("pack", "availability") == "offline")
+    assert watched.subscriber.lost_messages == 0
+    assert watched.lost_since_changes[0] is None
+    assert watched.lost_since_changes[-1] is not None
 
 
 async def test_invalid_messages_do_not_end_the_subscriber(broker: Broker) -> None:
-    watch = Watch(broker.url)
-    async with watch.subscriber, Listener(broker) as other:
-        await watch.until(lambda: watch.links)
+    watched = WatchedSubscriber(broker.url)
+    async with watched.subscriber, Listener(broker) as other:
+        await watched.until(lambda: watched.lost_since_changes)
         await other.publish("bms/pack/state", b"\xff\xfe no json", qos=1)
         await other.publish("bms/no device/state", b"1", qos=1)
         await other.publish("bms/pack/info", bytes(2 * MAX_BYTES), qos=1)
         await other.publish("bms/pack/health", json.dumps({"uptime_s": 1}), qos=1)
-        await watch.until(lambda: watch.stored("pack", "health"))
-        assert "no json" in watch.stored("pack", "state")
-        assert list(watch.subscriber.devices) == ["pack"]
-        assert watch.stored("pack", "info") is None
+        await watched.until(lambda: watched.stored("pack", "health"))
+        assert "no json" in watched.stored("pack", "state")
+        assert list(watched.subscriber.devices) == ["pack"]
+        assert watched.stored("pack", "info") is None
 
 
-async def test_reconnects_to_a_restarted_broker(broker: Broker) -> None:
-    watch = Watch(broker.url)
-    async with watch.subscriber:
-        await watch.until(lambda: watch.links == [None])
+async def test_subscriber_reconnects_to_a_restarted_broker(broker: Broker) -> None:
+    watched = WatchedSubscriber(broker.url)
+    async with watched.subscriber:
+        await watched.until(lambda: watched.lost_since_changes == [None])
         async with Listener(broker) as other:
             await other.publish("bms/pack/state", b"1", qos=1)
-        await watch.until(lambda: watch.stored("pack", "state") == 1)
+        await watched.until(lambda: watched.stored("pack", "state") == 1)
         broker.stop()
-        await watch.until(lambda: len(watch.links) == 2)
-        lost_since = watch.links[1]
+        await watched.until(lambda: len(watched.lost_since_changes) == 2)
+        lost_since = watched.lost_since_changes[1]
         assert lost_since is not None
-        await until(lambda: watch.subscriber.trouble)
-        assert watch.subscriber.lost_since == lost_since
-        assert watch.stored("pack", "state") == 1
+        await until(lambda: watched.subscriber.trouble)
+        assert watched.subscriber.lost_since == lost_since
+        assert watched.stored("pack", "state") == 1
         broker.start()
-        await watch.until(lambda: len(watch.links) == 3)
-        assert watch.subscriber.lost_since is None
+        await watched.until(lambda: len(watched.lost_since_changes) == 3)
+        assert watched.subscriber.lost_since is None
         async with Listener(broker) as other:
             await other.publish("bms/pack/state", b"2", qos=1)
-        await watch.until(lambda: watch.stored("pack", "state") == 2)
+        await watched.until(lambda: watched.stored("pack", "state") == 2)
 
 
-async def test_lost_since_start_until_the_first_connection(broker: Broker) -> None:
+async def test_connection_counts_as_lost_from_the_start_until_the_first_connection(broker: Broker) -> None:
     broker.stop()
-    watch = Watch(broker.url)
-    async with watch.subscriber:
-        since = watch.subscriber.lost_since
+    watched = WatchedSubscriber(broker.url)
+    async with watched.subscriber:
+        since = watched.subscriber.lost_since
         assert since is not None
-        await until(lambda: watch.subscriber.trouble)
-        assert watch.subscriber.lost_since == since
+        await until(lambda: watched.subscriber.trouble)
+        assert watched.subscriber.lost_since == since
         broker.start()
-        await watch.until(lambda: watch.links == [None])
+        await watched.until(lambda: watched.lost_since_changes == [None])
 
 
 async def test_exception_of_the_callback_is_raised(broker: Broker) -> None:
@@ -139,25 +144,25 @@ def broker_with_passwords(tmp_path: Path) -> Iterator[Broker]:
 
 
 async def test_rejected_connection_is_reported_with_the_reason(broker_with_passwords: Broker) -> None:
-    watch = Watch(broker_with_passwords.url)
-    async with watch.subscriber:
-        await until(lambda: watch.subscriber.trouble)
-        assert "mqtt.password_file" in str(watch.subscriber.trouble)
-        assert watch.subscriber.lost_since is not None
+    watched = WatchedSubscriber(broker_with_passwords.url)
+    async with watched.subscriber:
+        await until(lambda: watched.subscriber.trouble)
+        assert "mqtt.password_file" in str(watched.subscriber.trouble)
+        assert watched.subscriber.lost_since is not None
 
 
 async def test_long_messages_are_dropped_with_one_log_line(broker: Broker) -> None:
     """An MQTT 5 broker withholds long messages; an MQTT 3.1.1 broker cannot."""
     with structlog.testing.capture_logs() as lines:
         async with Proxy(broker.port, supports_5=False) as proxy, Listener(broker) as live:
-            watch = Watch(proxy.url)
-            async with watch.subscriber:
-                await watch.until(lambda: watch.subscriber.lost_since is None)
+            watched = WatchedSubscriber(proxy.url)
+            async with watched.subscriber:
+                await watched.until(lambda: watched.subscriber.lost_since is None)
                 for number in range(5):
                     await live.publish(f"bms/pack/t{number}", b"x" * (MAX_BYTES + 1), qos=1)
                 await live.publish("bms/pack/state", b"1", qos=1)
-                await watch.until(lambda: watch.stored("pack", "state"))
-                assert watch.subscriber.lost_messages == 5
+                await watched.until(lambda: watched.stored("pack", "state"))
+                assert watched.subscriber.lost_messages == 5
     assert [line["reason"] for line in lines if line["event"] == "messages are dropped"] == ["longer than 65536 bytes"]
 
 
@@ -165,8 +170,8 @@ async def test_retained_payload_of_16_mib_is_withheld(broker: Broker) -> None:
     async with Listener(broker, "other/#") as live:
         await live.publish("bms/pack/info", bytes(16 * 2**20), qos=1, retain=True)
         await live.publish("bms/pack/state", b"1", qos=1, retain=True)
-        watch = Watch(broker.url)
-        async with watch.subscriber:
-            await watch.until(lambda: watch.stored("pack", "state"))
-            assert watch.stored("pack", "info") is None
-            assert watch.subscriber.lost_since is None
+        watched = WatchedSubscriber(broker.url)
+        async with watched.subscriber:
+            await watched.until(lambda: watched.stored("pack", "state"))
+            assert watched.stored("pack", "info") is None
+            assert watched.subscriber.lost_since is None

@@ -20,15 +20,15 @@ from tests.sinks.snapshots import NOW, ONE
 
 
 def test_all_published_messages_are_stored_by_device_and_topic():
-    published = TopicCache("site/bms")
+    cache = TopicCache("site/bms")
     messages = MessageBuilder("site/bms", "pack")
     for message in (
         *messages.birth_messages(),
         *messages.must_deliver(None, ONE),
         *messages.live_messages(PublishedState(), ONE, NOW)[0],
     ):
-        published.take(message.topic, message.payload, NOW)
-    [(name, device)] = published.devices.items()
+        cache.take(message.topic, message.payload, NOW)
+    [(name, device)] = cache.devices.items()
     assert name == "pack"
     assert ONE.estimate
     assert device.topics["state"] == ONE.estimate.model_dump(mode="json")
@@ -48,79 +48,79 @@ def test_invalid_json_is_returned_as_text():
 
 
 def test_cleared_topics_are_removed_and_with_the_last_one_the_device():
-    published = TopicCache("bms")
-    published.take("bms/pack/state", b"1", NOW)
-    published.take("bms/pack/info", b"2", NOW)
-    assert published.take("bms/pack/info", b"", NOW) == DeviceMessage("pack", "info", None)
-    assert published.take("bms/pack/info", b"", NOW) is None
-    assert published.devices["pack"].topics == {"state": 1}
-    published.take("bms/pack/state", b"", NOW)
-    assert published.devices == {}
+    cache = TopicCache("bms")
+    cache.take("bms/pack/state", b"1", NOW)
+    cache.take("bms/pack/info", b"2", NOW)
+    assert cache.take("bms/pack/info", b"", NOW) == DeviceMessage("pack", "info", None)
+    assert cache.take("bms/pack/info", b"", NOW) is None
+    assert cache.devices["pack"].topics == {"state": 1}
+    cache.take("bms/pack/state", b"", NOW)
+    assert cache.devices == {}
 
 
 def test_topics_without_a_device_are_ignored():
-    published = TopicCache("bms")
+    cache = TopicCache("bms")
     for topic in ("bms", "bms/", "bms/pack", "bms/pack/", "bms//state", "other/pack/state", "bms/a b/state"):
-        assert published.take(topic, b"1", NOW) is None, topic
+        assert cache.take(topic, b"1", NOW) is None, topic
     for topic in ("bms/pack/request/set_soc", "bms/pack/response/state", "bms/\x1b[2J/state", f"bms/{'x' * 65}/state"):
-        assert published.take(topic, b"1", NOW) is None, topic
-    assert published.devices == {}
+        assert cache.take(topic, b"1", NOW) is None, topic
+    assert cache.devices == {}
 
 
-def test_devices_topics_and_bytes_are_bounded_and_known_devices_are_updated() -> None:
-    published = TopicCache("bms")
+def test_devices_topics_and_bytes_are_bounded_and_stored_devices_are_updated() -> None:
+    cache = TopicCache("bms")
     for number in range(2 * MAX_DEVICES):
-        published.take(f"bms/d{number}/state", b"1", NOW)
-    assert (len(published.devices), published.hidden) == (MAX_DEVICES, MAX_DEVICES)
+        cache.take(f"bms/d{number}/state", b"1", NOW)
+    assert (len(cache.devices), cache.hidden) == (MAX_DEVICES, MAX_DEVICES)
     for number in range(2 * MAX_TOPICS):
-        published.take(f"bms/d0/t{number}", b"1", NOW)
-    assert len(published.devices["d0"].topics) == MAX_TOPICS
+        cache.take(f"bms/d0/t{number}", b"1", NOW)
+    assert len(cache.devices["d0"].topics) == MAX_TOPICS
     quarter = json.dumps("x" * (MAX_DEVICE_BYTES // 4)).encode()
-    taken = [published.take(f"bms/d1/t{number}", quarter, NOW) for number in range(10)]
-    assert sum(message is not None for message in taken) == 3
-    assert published.take("bms/d1/state", b"2", NOW + 1.0) == DeviceMessage("d1", "state", 2)
-    published.take("bms/d1/t0", b"", NOW)
-    assert published.take("bms/d1/t9", quarter, NOW) is not None
+    stored = [cache.take(f"bms/d1/t{number}", quarter, NOW) for number in range(10)]
+    assert sum(message is not None for message in stored) == 3
+    assert cache.take("bms/d1/state", b"2", NOW + 1.0) == DeviceMessage("d1", "state", 2)
+    cache.take("bms/d1/t0", b"", NOW)
+    assert cache.take("bms/d1/t9", quarter, NOW) is not None
 
 
-def test_a_new_device_replaces_the_one_that_has_been_silent_longest() -> None:
-    left_out = list[str]()
-    published = TopicCache("bms", left_out.append)
+def test_new_device_replaces_the_device_that_has_been_silent_longest() -> None:
+    rejected = list[str]()
+    cache = TopicCache("bms", rejected.append)
     for number in range(MAX_DEVICES):
-        published.take(f"bms/d{number}/state", b"1", NOW + number)
-    published.take("bms/d0/state", b"1", NOW + MAX_DEVICES)
-    assert published.take("bms/new/state", b"1", NOW + SILENT_S) is None
-    assert left_out == ["new"]
-    assert published.take("bms/new/state", b"1", NOW + SILENT_S + MAX_DEVICES) == DeviceMessage("new", "state", 1)
-    assert left_out == ["new", "d1"]
-    assert published.hidden == 1
-    assert {"new", "d0"} <= published.devices.keys()
+        cache.take(f"bms/d{number}/state", b"1", NOW + number)
+    cache.take("bms/d0/state", b"1", NOW + MAX_DEVICES)
+    assert cache.take("bms/new/state", b"1", NOW + SILENT_S) is None
+    assert rejected == ["new"]
+    assert cache.take("bms/new/state", b"1", NOW + SILENT_S + MAX_DEVICES) == DeviceMessage("new", "state", 1)
+    assert rejected == ["new", "d1"]
+    assert cache.hidden == 1
+    assert {"new", "d0"} <= cache.devices.keys()
 
 
 def test_device_with_a_raised_alarm_is_stored_at_once_and_not_replaced() -> None:
-    published = TopicCache("bms")
+    cache = TopicCache("bms")
     for number in range(2 * MAX_DEVICES):
-        published.take(f"bms/d{number}/state", b"1", NOW)
+        cache.take(f"bms/d{number}/state", b"1", NOW)
     alarm = "bms/new/alarm/over_temperature"
-    assert published.take(alarm, b'{"active": false}', NOW) is None
-    assert published.take(alarm, b'{"active": true}', NOW) is not None
+    assert cache.take(alarm, b'{"active": false}', NOW) is None
+    assert cache.take(alarm, b'{"active": true}', NOW) is not None
     for number in range(2 * MAX_DEVICES):
-        published.take(f"bms/later{number}/state", b"1", NOW + 10.0 * SILENT_S)
-    assert "new" in published.devices
-    published.take(alarm, b'{"active": false}', NOW)
-    published.take("bms/last/state", b"1", NOW + 20.0 * SILENT_S)
-    assert "new" not in published.devices
+        cache.take(f"bms/later{number}/state", b"1", NOW + 10.0 * SILENT_S)
+    assert "new" in cache.devices
+    cache.take(alarm, b'{"active": false}', NOW)
+    cache.take("bms/last/state", b"1", NOW + 20.0 * SILENT_S)
+    assert "new" not in cache.devices
 
 
 def test_raised_alarms_of_new_devices_do_not_replace_a_device_with_a_raised_alarm() -> None:
-    published = TopicCache("bms")
+    cache = TopicCache("bms")
     for number in range(2 * MAX_DEVICES):
-        published.take(f"bms/d{number}/alarm/over_temperature", b'{"active": true}', NOW)
-    assert set(published.devices) == {f"d{number}" for number in range(MAX_DEVICES)}
+        cache.take(f"bms/d{number}/alarm/over_temperature", b'{"active": true}', NOW)
+    assert set(cache.devices) == {f"d{number}" for number in range(MAX_DEVICES)}
 
 
 @given(st.text(string.printable), st.binary(max_size=200))
-def test_no_message_raises(topic, payload):
-    published = TopicCache("bms")
+def test_no_message_causes_an_exception(topic, payload):
+    cache = TopicCache("bms")
     for full in (topic, f"bms/{topic}", f"bms/pack/{topic}"):
-        published.take(full, payload, NOW)
+        cache.take(full, payload, NOW)

@@ -11,7 +11,7 @@ from bms_estimator.settings.pack import Settings, load_settings
 CHEN_MORA = Path(__file__).parents[2] / "bms_estimator" / "model" / "cells" / "chen_mora.toml"
 
 
-def edited(tmp_path: Path, old: str, new: str) -> Path:
+def write_edited_cell(tmp_path: Path, old: str, new: str) -> Path:
     text = CHEN_MORA.read_text()
     assert old in text
     path = tmp_path / "cell.toml"
@@ -45,11 +45,13 @@ def test_error_in_a_cell_file_names_key_value_and_allowed_values(
     tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     with pytest.raises(UserError, match=message):
-        load_cell(edited(tmp_path, old, new))
+        load_cell(write_edited_cell(tmp_path, old, new))
 
 
 def test_all_invalid_keys_are_reported_together(tmp_path: Path) -> None:
-    path = edited(tmp_path, "capacity_ah = 0.275\nnominal_voltage_v = 3.7", "capacity_ah = 0\nnominal_voltage_v = -1")
+    path = write_edited_cell(
+        tmp_path, "capacity_ah = 0.275\nnominal_voltage_v = 3.7", "capacity_ah = 0\nnominal_voltage_v = -1"
+    )
     with pytest.raises(UserError) as error:
         load_cell(path)
     assert len(str(error.value).splitlines()) >= 2

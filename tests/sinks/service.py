@@ -1,4 +1,4 @@
-"""MQTT sink as in the service, and states with numbers."""
+"""MQTT sink with the counters of a service, and numbered states for it."""
 
 import asyncio
 import itertools
@@ -21,21 +21,26 @@ STATE = "bms/pack/state"
 
 
 class Sink:
-    """MQTT sink of a pack with its counters; each request is answered with its name."""
+    """MQTT sink of a pack with its counters. The response to each request has the request's name.
 
-    def __init__(self, url: str | tuple[str, ...], most_kept: int = 4, **options: Any) -> None:
+    Attributes:
+        requested: Names of the received requests.
+    """
+
+    def __init__(self, url: str | tuple[str, ...], max_queued: int = 4, **options: Any) -> None:
         self.delivery = DeliveryStats()
         self.requests = RequestDispatcher(self.delivery, COMMANDS)
-        self.asked: list[str] = []
+        self.requested: list[str] = []
         for name in COMMANDS:
             self.requests.register(name, self._handler(name))
+        # short delays, so that tests do not wait
         options = {"first_delay_s": 0.1, "birth_delay_s": 0.1} | options
-        outbox = Outbox(None, most=most_kept)
+        outbox = Outbox(None, most=max_queued)
         self.mqtt = MqttSink(MqttSettings(url=url), "pack", self.requests, self.delivery, outbox, **options)
 
     def _handler(self, name: str) -> Any:
         async def answer(_: Mapping[str, Any]) -> Mapping[str, Any]:
-            self.asked.append(name)
+            self.requested.append(name)
             return {"name": name}
 
         return answer
@@ -49,7 +54,7 @@ class Sink:
 
 
 def state(number: int) -> Snapshot:
-    """Return a snapshot with a number in its estimate."""
+    """Return a snapshot whose ``frames_received`` is ``number``."""
     assert ONE.estimate
     return ONE._replace(estimate=ONE.estimate.model_copy(update={"frames_received": number}))
 
@@ -59,10 +64,10 @@ def numbers(live: Listener) -> list[int]:
     return [json.loads(payload)["frames_received"] for payload in live.all(STATE)]
 
 
-def assert_all_in_order(come: list[int], count: int) -> None:
+def assert_all_in_order(received: list[int], count: int) -> None:
     """Check that all states from 0 on arrived in order. Only states in flight at a disconnect may arrive twice."""
-    assert list(dict.fromkeys(come)) == list(range(count))
-    for before, after in itertools.pairwise(come):
+    assert list(dict.fromkeys(received)) == list(range(count))
+    for before, after in itertools.pairwise(received):
         assert before - WINDOW < after <= before + 1, f"{before}, then {after}"
 
 

@@ -1,4 +1,4 @@
-"""Snapshots like those of the service."""
+"""Snapshots for tests, composed as by the service."""
 
 import numpy as np
 
@@ -18,8 +18,9 @@ from bms_estimator.telemetry.remaining_charge import remaining_charge
 from bms_estimator.telemetry.state import make_info_payload, make_state_payload
 
 NOW = 1_700_000_000.0
+"""Wall clock of the snapshots [s since 1970]."""
 
-IDLE = LoopHealth(
+IDLE_LOOP = LoopHealth(
     latency_p50_s=None,
     latency_p99_s=None,
     latency_max_s=None,
@@ -32,26 +33,26 @@ IDLE = LoopHealth(
 
 def snapshot(sensor_message: str | None = None, delivery: DeliveryStats | None = None) -> Snapshot:
     cell = load_cell("chen_mora")
-    return _of(cell, Estimator(cell, identifier=None, initial_soc=0.5), 3.8, sensor_message, delivery)
+    return _make_snapshot(cell, Estimator(cell, identifier=None, initial_soc=0.5), 3.8, sensor_message, delivery)
 
 
 def _capacity_ah(cell: PackModel) -> float | None:
     return cell.cell.capacity_ah if isinstance(cell, CellModel) else None
 
 
-def of_fuel_cell() -> Snapshot:
+def fuel_cell_snapshot() -> Snapshot:
     stack = load_fuel_cell("pem_30w")
-    return _of(stack, Estimator(stack), 13.0)
+    return _make_snapshot(stack, Estimator(stack), 13.0)
 
 
-def _of(
+def _make_snapshot(
     cell: PackModel,
     estimator: Estimator,
     voltage_v: float,
     sensor_message: str | None = None,
     delivery: DeliveryStats | None = None,
 ) -> Snapshot:
-    """After two samples without a load."""
+    """Return the snapshot of an estimator after two samples without a load."""
     window = Window()
     block = np.zeros(2, dtype=SAMPLE)
     block["time_s"], block["voltage_v"], block["temperature_c"] = [0.0, 0.1], voltage_v, np.nan
@@ -77,7 +78,7 @@ def _of(
             delivery=delivery or DeliveryStats(),
             total=new_totals(NOW),
             unseen_s=None,
-            loop=IDLE,
+            loop=IDLE_LOOP,
             recording=None,
         ),
         make_info_payload(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW, temperature_sensor=False),
@@ -85,7 +86,9 @@ def _of(
 
 
 ONE = snapshot()
-STACK = of_fuel_cell()
+"""Snapshot of a cell at SOC 0.5."""
+STACK = fuel_cell_snapshot()
+"""Snapshot of a fuel cell stack."""
 NOTHING_YET = ONE._replace(
     estimate=None, parameters=make_parameters_payload(Estimator(load_cell("chen_mora"), identifier=None), NOW)
 )

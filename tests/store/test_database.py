@@ -49,13 +49,13 @@ async def test_files_are_readable_only_by_their_owner(path):
 
 
 async def test_failed_transaction_is_rolled_back(path):
-    def half(connection: sqlite3.Connection) -> None:
+    def insert_and_fail(connection: sqlite3.Connection) -> None:
         put(1)(connection)
         raise sqlite3.OperationalError("half way")
 
     async with Database(path, retry_s=0.0) as database:
         with pytest.raises(StoreError, match="half way"):
-            await database.call(half)
+            await database.call(insert_and_fail)
         assert await database.call(numbers) == []
 
 
@@ -170,13 +170,13 @@ async def test_deleted_folder_is_recreated(tmp_path):
 
 
 async def test_hung_disk_does_not_block_and_is_used_again_later(path):
-    gate = threading.Event()
+    may_return = threading.Event()
     async with Database(path, hang_s=0.05, retry_s=0.0) as database:
         with pytest.raises(StoreError, match="has not answered"):
-            await database.call(lambda _: gate.wait(LONG_S))
+            await database.call(lambda _: may_return.wait(LONG_S))
         with pytest.raises(StoreError, match="has not answered"):
             await database.call(numbers)  # fails at once, without a disk access
-        gate.set()
+        may_return.set()
         async with asyncio.timeout(LONG_S):
             while database.reason:
                 try:
@@ -187,16 +187,16 @@ async def test_hung_disk_does_not_block_and_is_used_again_later(path):
 
 async def test_shutdown_with_a_hung_disk_has_one_deadline_for_all_writes(path, monkeypatch):
     monkeypatch.setattr(database_module, "SHUTDOWN_TIMEOUT_S", 0.05)
-    gate = threading.Event()
+    may_return = threading.Event()
     async with asyncio.timeout(LONG_S):
         async with Database(path, hang_s=10 * LONG_S) as database:
             async with Outbox(database, most=10) as outbox, History(database, days=1) as history:
-                hung = asyncio.create_task(database.call(lambda _: gate.wait(2 * LONG_S)))
+                hung = asyncio.create_task(database.call(lambda _: may_return.wait(2 * LONG_S)))
                 history.publish(ONE)
                 outbox.put(Message("t", b"", 1, retain=False))
             with pytest.raises(StoreError, match="has not answered"):
                 await hung
-    gate.set()
+    may_return.set()
 
 
 async def test_internal_error_is_raised(path):
@@ -232,7 +232,7 @@ asyncio.run(main())
 
 
 def test_process_ends_although_the_disk_hangs(path):
-    ended = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", HUNG_DISK_SCRIPT, path], timeout=LONG_S, capture_output=True, check=True
     )
-    assert b"has not answered" in ended.stdout
+    assert b"has not answered" in process.stdout

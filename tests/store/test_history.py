@@ -26,7 +26,7 @@ BEGIN_S = 1_700_000_040
 
 
 def at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, **changes: object) -> Snapshot:
-    """Return a publication ``second`` seconds after ``BEGIN_S``."""
+    """Return a snapshot published ``second`` seconds after ``BEGIN_S``."""
     assert ONE.estimate
     measured = {
         "time": iso_utc(BEGIN_S + second),
@@ -58,8 +58,8 @@ def past_events(path: Path) -> list[PastEvent]:
 
 
 async def test_row_has_means_extremes_and_sums_of_the_publications(path):
-    currents = [3.6] * 30 + [-7.2] * 30
-    await record(path, [at(float(s), a, soc=0.5 + s / 1000, temperature_c=None) for s, a in enumerate(currents)])
+    currents_a = [3.6] * 30 + [-7.2] * 30
+    await record(path, [at(float(s), a, soc=0.5 + s / 1000, temperature_c=None) for s, a in enumerate(currents_a)])
     [row] = rows(path)
     assert (row.time_s, row.publications, row.seen_s) == (BEGIN_S, 60, 59.0)
     assert (row.current_a, row.current_min_a, row.current_max_a) == (pytest.approx(-1.8), -7.2, 3.6)
@@ -79,15 +79,15 @@ async def test_source_with_a_period_of_one_minute_has_no_gaps(path):
 
 
 async def test_restarted_service_merges_rows_of_one_minute(path):
-    whole = [
+    snapshots = [
         at(float(s), s / 10, 3.0 + s / 100, soc_std=s / 1e3, temperature_c=20.0 + s if s % 2 else None)
         for s in range(60)
     ]
-    await record(path.with_name("whole.sqlite"), whole)
-    await record(path, whole[:25])
-    await record(path, whole[25:])
+    await record(path.with_name("whole.sqlite"), snapshots)
+    await record(path, snapshots[:25])
+    await record(path, snapshots[25:])
     [row], [expected] = rows(path), rows(path.with_name("whole.sqlite"))
-    lost_ah = 2.5 / 3600  # of the second between the two runs
+    lost_ah = 2.5 / 3600  # charge of the second between the two runs
     # means are weighted by all publications of a run, also by those without a temperature
     assert row.temperature_c == pytest.approx(expected.temperature_c, abs=0.5)
     assert row._replace(temperature_c=None) == pytest.approx(
@@ -101,15 +101,15 @@ async def test_restarted_service_merges_rows_of_one_minute(path):
 
 
 async def test_minutes_repeated_by_a_clock_set_back_are_not_merged(path):
-    once = [at(float(s), 10.0) for s in range(300)]
-    again = [at(float(s), -10.0, board_time_s=300.0 + s) for s in range(300)]
-    await record(path, once + again)
+    before = [at(float(s), 10.0) for s in range(300)]
+    after = [at(float(s), -10.0, board_time_s=300.0 + s) for s in range(300)]
+    await record(path, before + after)
     stored = rows(path)
     assert len(stored) == 10
     assert max(row.seen_s for row in stored) <= 60.0
     assert [row.current_a for row in stored] == [10.0, -10.0] * 5
-    [whole] = rows(path, 86400)
-    assert (whole.charge_out_ah, whole.charge_in_ah) == (pytest.approx(299 / 360), pytest.approx(300 / 360))
+    [day] = rows(path, 86400)
+    assert (day.charge_out_ah, day.charge_in_ah) == (pytest.approx(299 / 360), pytest.approx(300 / 360))
 
 
 async def test_longer_steps_aggregate_minutes(path):
@@ -197,7 +197,7 @@ def test_unreadable_history_raises_an_error(path):
         rows(path)
 
 
-class LostResults(Database):
+class DatabaseWithLostResults(Database):
     """Database that commits its first transactions but reports a failure."""
 
     remaining = 0
@@ -211,7 +211,7 @@ class LostResults(Database):
 
 
 async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path):
-    async with LostResults(path, retry_s=0.0) as database, History(database, days=366) as history:
+    async with DatabaseWithLostResults(path, retry_s=0.0) as database, History(database, days=366) as history:
         database.remaining = 2
         for second in range(0, 190, 10):
             history.publish(at(float(second)))
@@ -223,15 +223,15 @@ async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path):
 
 
 async def test_shutdown_during_a_write_writes_each_row_once(path):
-    gate = threading.Event()
+    may_return = threading.Event()
     async with Database(path) as database, History(database, days=366) as history:
         history.publish(at(0.0))
-        busy = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
+        busy = asyncio.create_task(database.call(lambda _: may_return.wait(LONG_S)))
         await asyncio.sleep(0)
         history.publish(at(60.0))
         await asyncio.sleep(0)
         await asyncio.sleep(0)  # the write waits for the blocked transaction
-        asyncio.get_running_loop().call_soon(gate.set)
+        asyncio.get_running_loop().call_soon(may_return.set)
     await busy
     assert [row.publications for row in rows(path)] == [1, 1]
 
@@ -246,7 +246,7 @@ async def test_failed_vacuum_does_not_undo_a_transaction(path, monkeypatch):
         assert not database.reason
 
 
-class Faulty(Database):
+class BrokenDatabase(Database):
     """Database with an internal error."""
 
     async def call(self, _: Callable[[sqlite3.Connection], Any]) -> Any:
@@ -262,6 +262,6 @@ async def publish_forever(history: History) -> None:
 
 
 async def test_internal_error_of_the_writing_task_is_raised(path):
-    history = await History(Faulty(path), days=366).__aenter__()
+    history = await History(BrokenDatabase(path), days=366).__aenter__()
     with pytest.raises(KeyError, match="internal"):
         await publish_forever(history)

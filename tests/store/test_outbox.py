@@ -24,38 +24,38 @@ def message(number: int) -> Message:
     return Message("bms/pack/state", str(number).encode(), 1, retain=False)
 
 
-def filled(count: int, *, most: int = 100) -> Outbox:
-    outbox = Outbox(None, most=most)
+def filled_outbox(count: int, *, max_messages: int = 100) -> Outbox:
+    outbox = Outbox(None, most=max_messages)
     for number in range(count):
         outbox.put(message(number))
     return outbox
 
 
-async def taken(outbox: Outbox, most: int) -> list[int]:
+async def take_numbers(outbox: Outbox, max_messages: int) -> list[int]:
     async with asyncio.timeout(LONG_S):
-        return [int(waiting.message.payload) for waiting in await outbox.take(most)]
+        return [int(waiting.message.payload) for waiting in await outbox.take(max_messages)]
 
 
 async def test_messages_are_taken_once_and_in_order():
-    outbox = filled(5)
-    assert await taken(outbox, 2) == [0, 1]
-    assert await taken(outbox, 9) == [2, 3, 4]
+    outbox = filled_outbox(5)
+    assert await take_numbers(outbox, 2) == [0, 1]
+    assert await take_numbers(outbox, 9) == [2, 3, 4]
     assert outbox.waiting == 5
 
 
 async def test_unacknowledged_messages_are_taken_again_before_newer_ones():
-    outbox = filled(3)
+    outbox = filled_outbox(3)
     first, *_ = await outbox.take(3)
     outbox.acknowledge(first.number)
     outbox.put(message(3))
     outbox.rewind()
-    assert await taken(outbox, 9) == [1, 2, 3]
+    assert await take_numbers(outbox, 9) == [1, 2, 3]
     assert outbox.waiting == 3
 
 
 async def test_take_waits_for_a_message():
-    outbox = filled(0)
-    task = asyncio.create_task(taken(outbox, 1))
+    outbox = filled_outbox(0)
+    task = asyncio.create_task(take_numbers(outbox, 1))
     await asyncio.sleep(0)
     assert not task.done()
     outbox.put(message(7))
@@ -63,17 +63,17 @@ async def test_take_waits_for_a_message():
 
 
 async def test_full_queue_drops_and_counts_the_oldest_message_not_in_flight():
-    outbox = filled(3, most=3)
-    assert await taken(outbox, 1) == [0]
+    outbox = filled_outbox(3, max_messages=3)
+    assert await take_numbers(outbox, 1) == [0]
     outbox.put(message(3))
     outbox.put(message(4))
     assert outbox.dropped == 2
-    assert await taken(outbox, 9) == [3, 4]
+    assert await take_numbers(outbox, 9) == [3, 4]
     outbox.rewind()
-    assert await taken(outbox, 9) == [0, 3, 4]
+    assert await take_numbers(outbox, 9) == [0, 3, 4]
 
 
-class Counting(Database):
+class CountingDatabase(Database):
     """Database that counts its transactions."""
 
     calls = 0
@@ -97,7 +97,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 def on_disk(path: Path) -> list[int]:
-    """Numbers of the messages in the database."""
+    """Return the numbers of the messages in the database."""
     try:
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
             return [int(payload) for (payload,) in connection.execute("SELECT payload FROM outbox ORDER BY number")]
@@ -106,7 +106,7 @@ def on_disk(path: Path) -> list[int]:
 
 
 async def test_nothing_is_written_while_the_broker_acknowledges(path):
-    async with Counting(path) as database, Outbox(database, most=100) as outbox:
+    async with CountingDatabase(path) as database, Outbox(database, most=100) as outbox:
         outbox.connected = True
         for number in range(50):
             outbox.put(message(number))
@@ -133,28 +133,28 @@ async def test_messages_of_an_earlier_run_precede_newer_ones(path):
         outbox.acknowledge(first.number)
     async with Database(path) as database, Outbox(database, most=100) as outbox:
         outbox.put(message(5))
-        got: list[int] = []
-        while len(got) < 5:
-            got += await taken(outbox, 99)
-    assert got == [1, 2, 3, 4, 5]
+        received: list[int] = []
+        while len(received) < 5:
+            received += await take_numbers(outbox, 99)
+    assert received == [1, 2, 3, 4, 5]
 
 
 async def test_backlog_beyond_memory_is_read_from_disk_in_order(path):
     count = 3 * MAX_TAIL
-    got: list[int] = []
+    received: list[int] = []
     async with Database(path) as database, Outbox(database, most=10 * count) as outbox:
         for number in range(count):
             outbox.put(message(number))
             if number % 1000 == 0:
                 await until(lambda number=number: on_disk(path)[-1:] == [number])
         await until(lambda: len(on_disk(path)) == count)
-        while len(got) < count:
+        while len(received) < count:
             async with asyncio.timeout(LONG_S):
                 for waiting in await outbox.take(50):
-                    got.append(int(waiting.message.payload))
+                    received.append(int(waiting.message.payload))
                     outbox.acknowledge(waiting.number)
         await until(lambda: on_disk(path) == [])
-    assert got == list(range(count))
+    assert received == list(range(count))
     assert (outbox.dropped, outbox.waiting) == (0, 0)
 
 
@@ -165,7 +165,7 @@ async def test_hung_disk_does_not_block_messages(path):
         hung = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
         for number in range(5):
             outbox.put(message(number))
-        assert await taken(outbox, 9) == [0, 1, 2, 3, 4]
+        assert await take_numbers(outbox, 9) == [0, 1, 2, 3, 4]
         with pytest.raises(StoreError):
             await hung
         gate.set()
@@ -178,7 +178,7 @@ async def test_start_with_a_hung_disk_sends_new_messages(path):
         hung = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
         async with Outbox(database, most=100) as outbox:
             outbox.put(message(0))
-            assert await taken(outbox, 9) == [0]
+            assert await take_numbers(outbox, 9) == [0]
             gate.set()
             with pytest.raises(StoreError):
                 await hung
@@ -193,11 +193,11 @@ async def test_deleted_database_loses_and_counts_only_messages_on_disk_alone(pat
             file.unlink()
         outbox.put(message(1500))
         await until(lambda: outbox.dropped == 500)
-        assert [*await taken(outbox, 1000), *await taken(outbox, 1000)] == [*range(1000), 1500]
+        assert [*await take_numbers(outbox, 1000), *await take_numbers(outbox, 1000)] == [*range(1000), 1500]
         await until(lambda: len(on_disk(path)) == 1001)
 
 
-class Faulty(Database):
+class BrokenDatabase(Database):
     """Database with an internal error."""
 
     async def call(self, _: Callable[[sqlite3.Connection], Any]) -> Any:
@@ -212,7 +212,7 @@ async def put_forever(outbox: Outbox) -> None:
 
 
 async def test_internal_error_of_the_writing_task_is_raised(path):
-    outbox = await Outbox(Faulty(path), most=100).__aenter__()
+    outbox = await Outbox(BrokenDatabase(path), most=100).__aenter__()
     with pytest.raises(KeyError, match="internal"):
         await put_forever(outbox)
 
@@ -243,10 +243,10 @@ async def test_damaged_row_is_skipped_and_counted(path, column, value):
         connection.execute(f"UPDATE outbox SET {column} = {value} WHERE payload = CAST('1' AS BLOB)")
     async with Database(path) as database, Outbox(database, most=100) as outbox:
         outbox.put(message(3))
-        got: list[int] = []
-        while len(got) < 3:
-            got += await taken(outbox, 9)
-        assert (got, outbox.dropped, database.reason) == ([0, 2, 3], 1, "")
+        received: list[int] = []
+        while len(received) < 3:
+            received += await take_numbers(outbox, 9)
+        assert (received, outbox.dropped, database.reason) == ([0, 2, 3], 1, "")
     assert on_disk(path) == [0, 2, 3]
 
 
@@ -269,7 +269,7 @@ async def test_memory_is_bounded_while_the_disk_fails(path):
         path.rmdir()
 
 
-PUBLISHER = """
+PUBLISHER_SCRIPT = """
 import asyncio, sys
 from pathlib import Path
 from bms_estimator.sinks.mqtt.messages import Message
@@ -289,13 +289,13 @@ asyncio.run(main())
 
 def test_kill_9_loses_only_unwritten_messages(tmp_path):
     path = tmp_path / "pack.sqlite"
-    with subprocess.Popen([sys.executable, "-c", PUBLISHER, path], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([sys.executable, "-c", PUBLISHER_SCRIPT, path], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
-        seen: list[int] = []
-        while len(seen) < 2:
+        stored_before_kill: list[int] = []
+        while len(stored_before_kill) < 2:
             process.stdout.readline()
-            seen = on_disk(path)
+            stored_before_kill = on_disk(path)
         process.kill()
     stored = on_disk(path)
     assert stored == list(range(len(stored)))
-    assert len(stored) >= len(seen)
+    assert len(stored) >= len(stored_before_kill)

@@ -21,23 +21,28 @@ from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
 
 PAGE = 4
+"""Size of a page of the queue [messages]; small, so that the tests read many pages."""
 OPERATIONS = st.lists(st.sampled_from(["put", "take", "first", "last", "rewind"]), max_size=5)
 
 
 class FaultyDatabase(Database):
-    """Database that can fail before or after a commit, and that runs callbacks before and after a transaction."""
+    """Database that can fail before or after a commit, and that runs callbacks before and after a transaction.
 
-    fails: str | None = None
+    Attributes:
+        failure: "before" or "after" the commit; None: no failure.
+    """
+
+    failure: str | None = None
     before: Callable[[], None] = staticmethod(lambda: None)
     after: Callable[[], None] = staticmethod(lambda: None)
 
     async def call(self, work: Callable[[sqlite3.Connection], Any]) -> Any:
         self.before()
-        if self.fails == "before":
+        if self.failure == "before":
             raise StoreError("full")
         result = await super().call(work)
         self.after()
-        if self.fails == "after":
+        if self.failure == "after":
             raise StoreError("unknown result")
         return result
 
@@ -47,8 +52,8 @@ class OutboxMachine(RuleBasedStateMachine):
 
     Attributes:
         pending: Numbers that the broker must still receive.
-        out: Numbers in flight, with their queue numbers.
-        safe: Numbers on disk after the last write.
+        in_flight: Numbers in flight, with their queue numbers.
+        on_disk: Numbers on disk after the last write.
     """
 
     def __init__(self) -> None:
@@ -61,8 +66,8 @@ class OutboxMachine(RuleBasedStateMachine):
         self.folder = tempfile.TemporaryDirectory(prefix="store-")
         self.next, self.dropped = 0, 0
         self.pending: list[int] = []
-        self.out: dict[int, int] = {}
-        self.safe: set[int] = set()
+        self.in_flight: dict[int, int] = {}
+        self.on_disk: set[int] = set()
         self.acknowledged: set[int] = set()
         self.strict = True
 
@@ -87,10 +92,10 @@ class OutboxMachine(RuleBasedStateMachine):
             self.pending.append(self.next)
             self.next += 1
             if len(self.pending) > self.most:
-                self.pending.remove(next(number for number in self.pending if number not in self.out))
+                self.pending.remove(next(number for number in self.pending if number not in self.in_flight))
                 self.dropped += 1
 
-    @precondition(lambda self: len(self.pending) > len(self.out) and len(self.out) < 5)
+    @precondition(lambda self: len(self.pending) > len(self.in_flight) and len(self.in_flight) < 5)
     @rule(most=st.integers(1, 3))
     def take(self, most: int) -> None:
         self.sync(write=False)  # reads a missing page
@@ -100,86 +105,86 @@ class OutboxMachine(RuleBasedStateMachine):
     def take_from_queue(self, most: int) -> None:
         if not self.outbox._queue.can_take:
             return
-        taken = self.outbox._queue.take_next(most)
-        numbers = [int(waiting.message.payload) for waiting in taken]
-        expected = [number for number in self.pending if number not in self.out]
+        messages = self.outbox._queue.take_next(most)
+        numbers = [int(waiting.message.payload) for waiting in messages]
+        expected = [number for number in self.pending if number not in self.in_flight]
         assert numbers
         assert set(numbers) <= set(expected)
         if self.strict:
             assert numbers == expected[: len(numbers)]
-        self.out |= {int(waiting.message.payload): waiting.number for waiting in taken}
+        self.in_flight |= {int(waiting.message.payload): waiting.number for waiting in messages}
 
-    @precondition(lambda self: self.out)
+    @precondition(lambda self: self.in_flight)
     @rule(data=st.data())
     def sent(self, data: st.DataObject) -> None:
-        self.acknowledge(data.draw(st.sampled_from(sorted(self.out))))
+        self.acknowledge(data.draw(st.sampled_from(sorted(self.in_flight))))
 
     def acknowledge(self, number: int) -> None:
-        self.outbox.acknowledge(self.out.pop(number))
+        self.outbox.acknowledge(self.in_flight.pop(number))
         self.pending.remove(number)
         self.acknowledged.add(number)
 
     @rule()
     def rewind(self) -> None:
         self.outbox.rewind()
-        self.out.clear()
+        self.in_flight.clear()
 
     @rule()
     def write(self) -> None:
         self.sync(write=True)
-        if self.database.fails is None:
-            self.safe = set(self.pending)
+        if self.database.failure is None:
+            self.on_disk = set(self.pending)
 
     @rule(before=OPERATIONS, after=OPERATIONS, write=st.booleans())
     def operate_during_transaction(self, before: list[str], after: list[str], *, write: bool) -> None:
         """Operate on the queue during a transaction."""
-        safe = set(self.pending)
+        on_disk = set(self.pending)
         self.database.before, self.database.after = partial(self.operate, before), partial(self.operate, after)
         self.sync(write=write)
         del self.database.before, self.database.after
-        if write and self.database.fails is None:
-            self.safe = safe
+        if write and self.database.failure is None:
+            self.on_disk = on_disk
 
     def operate(self, steps: list[str]) -> None:
         for step in steps:
             if step == "put":
                 self.put(3)
-            elif step == "take" and len(self.out) < 5:
+            elif step == "take" and len(self.in_flight) < 5:
                 self.take_from_queue(2)
-            elif step in ("first", "last") and self.out:
-                self.acknowledge(min(self.out) if step == "first" else max(self.out))
+            elif step in ("first", "last") and self.in_flight:
+                self.acknowledge(min(self.in_flight) if step == "first" else max(self.in_flight))
             elif step == "rewind":
                 self.rewind()
             self.counts_agree()
 
     @precondition(lambda self: self.most == 10_000)
-    @rule(fails=st.sampled_from(["before", "after"]))
-    def fail(self, fails: str) -> None:
+    @rule(failure=st.sampled_from(["before", "after"]))
+    def fail(self, failure: str) -> None:
         """Fail the disk; newer messages then overtake those that cannot be read."""
-        self.database.fails, self.strict = fails, False
+        self.database.failure, self.strict = failure, False
 
     @rule()
     def heal(self) -> None:
-        self.database.fails = None
+        self.database.failure = None
 
     @rule(clean=st.booleans())
     def reopen(self, clean: bool) -> None:
         """Restart after a clean shutdown or a kill: only numbers that were not on disk may be missing."""
-        if clean and self.database.fails is None:
+        if clean and self.database.failure is None:
             self.outbox.rewind()
             self.sync(write=True)
-            self.safe = set(self.pending)
+            self.on_disk = set(self.pending)
         self.loop.run_until_complete(self.database.__aexit__())
         with sqlite3.connect(Path(self.folder.name) / "pack.sqlite") as connection:
             stored = [int(payload) for (payload,) in connection.execute("SELECT payload FROM outbox ORDER BY number")]
         connection.close()
         assert len(set(stored)) == len(stored)
-        assert self.safe & set(self.pending) <= set(stored)
-        if clean and self.database.fails is None:
+        assert self.on_disk & set(self.pending) <= set(stored)
+        if clean and self.database.failure is None:
             assert set(stored) == set(self.pending)
         if self.strict:
             assert [number for number in stored if number in self.pending] == [n for n in self.pending if n in stored]
-        self.pending, self.safe, self.out, self.strict = stored, set(stored), {}, True
+        self.pending, self.on_disk, self.in_flight, self.strict = stored, set(stored), {}, True
         self.open()
 
     @invariant()
@@ -190,18 +195,18 @@ class OutboxMachine(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         if hasattr(self, "outbox"):
-            self.database.fails = None
+            self.database.failure = None
             self.outbox.rewind()
-            self.out.clear()
-            got: list[int] = []
-            rounds = self.outbox.waiting + 10
-            while self.outbox.waiting and (rounds := rounds - 1):
+            self.in_flight.clear()
+            received: list[int] = []
+            reads_left = self.outbox.waiting + 10
+            while self.outbox.waiting and (reads_left := reads_left - 1):
                 self.sync(write=False)
                 for waiting in self.outbox._queue.take_next(PAGE):
-                    got.append(int(waiting.message.payload))
+                    received.append(int(waiting.message.payload))
                     self.outbox.acknowledge(waiting.number)
-            assert sorted(got) == sorted(self.pending)
-            assert not self.strict or got == self.pending
+            assert sorted(received) == sorted(self.pending)
+            assert not self.strict or received == self.pending
             self.sync(write=True)
             self.loop.run_until_complete(self.database.__aexit__())
             with sqlite3.connect(Path(self.folder.name) / "pack.sqlite") as connection:
@@ -219,14 +224,14 @@ TestOutbox.settings = settings(max_examples=15, stateful_step_count=40, deadline
 @pytest.mark.parametrize("seed", range(4))
 def test_invariants_hold_for_a_full_outbox_with_a_slow_disk(seed: int) -> None:
     """Read pages while their oldest messages are dropped, which hypothesis rarely generates."""
-    dice, machine = random.Random(seed), OutboxMachine()
+    random_, machine = random.Random(seed), OutboxMachine()
     machine.begin(12)
 
     def steps() -> list[str]:
-        return dice.choices(["put", "take", "first", "last", "rewind"], [5, 2, 1, 1, 1], k=dice.randint(0, 3))
+        return random_.choices(["put", "take", "first", "last", "rewind"], [5, 2, 1, 1, 1], k=random_.randint(0, 3))
 
     for _ in range(60):
         machine.operate(steps())
-        machine.operate_during_transaction(steps(), steps(), write=dice.random() < 0.6)
+        machine.operate_during_transaction(steps(), steps(), write=random_.random() < 0.6)
     machine.reopen(clean=True)
     machine.teardown()

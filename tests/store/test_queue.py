@@ -4,7 +4,7 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.store.outbox_queue import LOWEST, PAGE, OutboxQueue
 
 
-def filled(count: int) -> OutboxQueue:
+def queue_with(count: int) -> OutboxQueue:
     """Return a queue with ``count`` written messages."""
     queue = OutboxQueue(most=10 * PAGE)
     for number in range(count):
@@ -14,30 +14,30 @@ def filled(count: int) -> OutboxQueue:
     return queue
 
 
-def numbers(queue: OutboxQueue, most: int) -> list[int]:
-    return [int(waiting.message.payload) for waiting in queue.take_next(most)]
+def take_numbers(queue: OutboxQueue, max_messages: int) -> list[int]:
+    return [int(waiting.message.payload) for waiting in queue.take_next(max_messages)]
 
 
 def test_messages_in_flight_precede_ready_ones_after_a_rewind():
-    queue = filled(5)
-    assert numbers(queue, 2) == [0, 1]
+    queue = queue_with(5)
+    assert take_numbers(queue, 2) == [0, 1]
     queue.rewind()
-    assert numbers(queue, 5) == [0, 1, 2, 3, 4]
+    assert take_numbers(queue, 5) == [0, 1, 2, 3, 4]
 
 
 def test_memory_holds_one_page_and_newer_messages_wait_for_stored_ones():
-    queue = filled(PAGE + 7)
+    queue = queue_with(PAGE + 7)
     assert list(queue.stored) == [range(PAGE, PAGE + 7)]
     queue.put(Message("t", b"9999", 1, retain=False))
-    assert numbers(queue, 2 * PAGE) == list(range(PAGE))
+    assert take_numbers(queue, 2 * PAGE) == list(range(PAGE))
     assert not queue.can_take
     assert queue.needs_page
     queue.skip_disk = True
-    assert numbers(queue, 5) == [9999]
+    assert take_numbers(queue, 5) == [9999]
 
 
 def test_acknowledged_messages_are_deleted_only_if_written():
-    queue = filled(2)
+    queue = queue_with(2)
     queue.put(Message("t", b"2", 1, retain=False))
     _, second, third = queue.take_next(3)
     queue.acknowledge(third.number)

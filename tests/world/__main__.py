@@ -1,8 +1,8 @@
-"""``make simulate``: worlds from seeds.
+"""Program of ``make simulate``, which runs worlds determined by seeds.
 
-python -m tests.world --seed 5              one world; its log where something does not hold
-python -m tests.world --seeds 1000          many, on all processors
-python -m tests.world --seed 5 --hours 24   longer
+python -m tests.world --seed 5              Run one world and print its last log lines.
+python -m tests.world --seeds 1000          Run 1000 worlds on all processors.
+python -m tests.world --seed 5 --hours 24   Run one world for 24 h.
 """
 
 import argparse
@@ -31,56 +31,57 @@ def run(seed: int, seconds: float) -> Result:
 def main() -> int:
     """Run the requested worlds; return 1 if an invariant was violated."""
     parser = argparse.ArgumentParser(prog="make simulate", description="The whole service, simulated from one seed.")
-    parser.add_argument("--seed", type=int, default=None, help="one world")
-    parser.add_argument("--seeds", type=int, default=20, help="so many worlds")
-    parser.add_argument("--first", type=int, default=0, help="the first seed of many")
-    parser.add_argument("--hours", type=float, default=1.0, help="how long a world lasts")
-    parser.add_argument("--processes", type=int, default=os.cpu_count(), help="worlds at the same time")
+    parser.add_argument("--seed", type=int, default=None, help="seed of a single world")
+    parser.add_argument("--seeds", type=int, default=20, help="number of worlds")
+    parser.add_argument("--first", type=int, default=0, help="first seed of several worlds")
+    parser.add_argument("--hours", type=float, default=1.0, help="duration of a world [h]")
+    parser.add_argument("--processes", type=int, default=os.cpu_count(), help="number of worlds at the same time")
     options = parser.parse_args()
     load_kernels()
     gc.disable()  # no collection during a world
     gc.freeze()  # shared objects are not scanned after each world
     if options.seed is not None:
-        return _show(run(options.seed, options.hours * HOUR_S), log=True)
-    return _many(options)
+        return _print_result(run(options.seed, options.hours * HOUR_S), log=True)
+    return _run_many(options)
 
 
-def _show(result: Result, *, log: bool = False) -> int:
-    """Print the result of a world, with its last log lines if it failed."""
+def _print_result(result: Result, *, log: bool = False) -> int:
+    """Print the result of a world, with its last log lines if ``log`` is set. Return 1 if an invariant was violated."""
     if log:
-        _say("\n".join(result.log))
-    band = result.band
-    share = 100.0 * band.inside / max(band.states, 1)
+        _print_line("\n".join(result.log))
+    errors = result.soc_errors
+    coverage_percent = 100.0 * errors.within_interval / max(errors.states, 1)
     figures = ", ".join(f"{name} {value:g}" for name, value in result.figures.items())
-    _say(
-        f"seed {result.seed}: {result.wrong or 'all holds'}; SOC off by {100.0 * band.worst_error:.1f} % and "
-        f"{band.worst_stds:.1f} std at most, {share:.0f} % within 2 std; {figures}; digest {result.digest}"
+    _print_line(
+        f"seed {result.seed}: {result.violation or 'all holds'}; SOC off by {100.0 * errors.max_error:.1f} % and "
+        f"{errors.max_stds:.1f} std at most, {coverage_percent:.0f} % within 2 std; {figures}; digest {result.digest}"
     )
-    return int(bool(result.wrong))
+    return int(bool(result.violation))
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
 
-def _many(options: argparse.Namespace) -> int:
-    begun_s, failed, bands = time.monotonic(), [], []
+def _run_many(options: argparse.Namespace) -> int:
+    begin_s, failed, errors = time.monotonic(), [], []
     seeds = range(options.first, options.first + options.seeds)
     context = multiprocessing.get_context("fork")  # inherits the compiled kernels
     with ProcessPoolExecutor(options.processes, context) as pool:
         for result in pool.map(partial(run, seconds=options.hours * HOUR_S), seeds):
-            bands.append(result.band)
-            if result.wrong:
+            errors.append(result.soc_errors)
+            if result.violation:
                 failed.append(result.seed)
-                _say(f"make simulate SEED={result.seed}: {result.wrong}")
-    seconds, cpu = time.monotonic() - begun_s, resource.getrusage(resource.RUSAGE_CHILDREN)
-    inside = sum(band.inside for band in bands) / max(sum(band.states for band in bands), 1)
-    _say(
+                _print_line(f"make simulate SEED={result.seed}: {result.violation}")
+    seconds, cpu = time.monotonic() - begin_s, resource.getrusage(resource.RUSAGE_CHILDREN)
+    states = sum(each.states for each in errors)
+    coverage = sum(each.within_interval for each in errors) / max(states, 1)
+    _print_line(
         f"{len(seeds)} worlds of {options.hours:g} h in {seconds:.0f} s, on {options.processes} processors, "
         f"{(cpu.ru_utime + cpu.ru_stime) / len(seeds):.2f} s of processor each; SOC off by "
-        f"{100.0 * max(band.worst_error for band in bands):.1f} % and {max(band.worst_stds for band in bands):.1f} std at "
-        f"most, {100.0 * inside:.1f} % of {sum(band.states for band in bands)} states within 2 std; "
+        f"{100.0 * max(each.max_error for each in errors):.1f} % and {max(each.max_stds for each in errors):.1f} std at "
+        f"most, {100.0 * coverage:.1f} % of {states} states within 2 std; "
         f"{len(failed)} failed"
     )
     return int(bool(failed))

@@ -1,7 +1,8 @@
-"""The broker, and the client library's way to it: what paho does is done here, all above that is the service's own.
+"""Simulated MQTT broker, and a replacement of the paho client. All code above paho is that of the service.
 
-A connection carries packets both ways in order, with delays. It can be cut, so that both ends see it; half open, so that
-neither does; and the broker can be down, frozen, restarted with or without what it retained, or older than MQTT 5.
+A connection carries packets in both directions in order, with random delays. A connection can be cut, which both ends
+notice, or half open, which neither notices. The broker can be down, frozen, restarted with or without its retained
+messages, or limited to MQTT 3.1.1.
 """
 
 import contextlib
@@ -18,21 +19,24 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 
-LATE_S = 0.03
+MAX_DELAY_S = 0.03
 """Maximum delay of a packet [s]."""
 CONNECT_TIMEOUT_S = 5.0
 """Timeout of paho for a host that does not respond [s]."""
 KEEPALIVE_CHECK_S = 2.0
 """Interval between two keepalive checks [s]."""
-REFUSED_VERSION = ReasonCode(PacketTypes.CONNACK, identifier=132)
-ACCEPTED = ReasonCode(PacketTypes.CONNACK, identifier=0)
-TAKEN = ReasonCode(PacketTypes.PUBACK, identifier=0)
-LOST = ReasonCode(PacketTypes.DISCONNECT, "Unspecified error")
-SILENT = ReasonCode(PacketTypes.DISCONNECT, "Keep alive timeout")
-PARTED = ReasonCode(PacketTypes.DISCONNECT, "Normal disconnection")
+UNSUPPORTED_VERSION = ReasonCode(PacketTypes.CONNACK, identifier=132)
+CONNACK_OK = ReasonCode(PacketTypes.CONNACK, identifier=0)
+PUBACK_OK = ReasonCode(PacketTypes.PUBACK, identifier=0)
+CONNECTION_LOST = ReasonCode(PacketTypes.DISCONNECT, "Unspecified error")
+KEEPALIVE_TIMEOUT = ReasonCode(PacketTypes.DISCONNECT, "Keep alive timeout")
+NORMAL_DISCONNECT = ReasonCode(PacketTypes.DISCONNECT, "Normal disconnection")
 NO_FLAGS = SimpleNamespace(is_disconnect_packet_from_server=False, session_present=False)
 MAX_IN_FLIGHT = 20
-GRANTED = ReasonCode(PacketTypes.SUBACK, identifier=0)
+"""Default of paho for QoS 1 messages without an acknowledgment."""
+KEEPALIVE_TOLERANCE = 1.5
+"""Keepalive intervals without a packet after which a broker ends a connection (section 3.1.2.10 of MQTT 5)."""
+SUBACK_OK = ReasonCode(PacketTypes.SUBACK, identifier=0)
 
 
 class LateError(Exception):
@@ -56,7 +60,17 @@ class Packet:
 
 @dataclass
 class Connection:
-    """TCP connection, possibly half open without either side noticing."""
+    """TCP connection, possibly half open without either side noticing.
+
+    Attributes:
+        arrival_at_broker_s: Arrival of the last packet to the broker; later packets arrive after it [s].
+        arrival_at_client_s: Arrival of the last packet to the client [s].
+        received_by_broker_s: Time of the last packet that the broker has received [s].
+        received_by_client_s: Time of the last packet that the client has received [s].
+        sent_by_client_s: Time of the last packet that the client has sent [s].
+        pinged_s: Time of an unanswered ping [s]; None: all pings are answered.
+        topic_filters: Subscriptions of the client.
+    """
 
     client: "VirtualPaho"
     loop: ProcessLoop
@@ -64,22 +78,22 @@ class Connection:
     client_open: bool = True
     broker_open: bool = True
     accepted: bool = False
-    to_broker_s: float = 0.0
-    to_client_s: float = 0.0
-    heard_by_broker_s: float = 0.0
-    heard_by_client_s: float = 0.0
-    said_by_client_s: float = 0.0
+    arrival_at_broker_s: float = 0.0
+    arrival_at_client_s: float = 0.0
+    received_by_broker_s: float = 0.0
+    received_by_client_s: float = 0.0
+    sent_by_client_s: float = 0.0
     pinged_s: float | None = None
-    wanted: list[str] = field(default_factory=list)
+    topic_filters: list[str] = field(default_factory=list)
     acknowledged: dict[int, float] = field(default_factory=dict)
     """QoS 1 messages whose acknowledgment the client has received, with the time [s]."""
 
     @property
     def usable(self) -> bool:
-        """Whether the client can send.
+        """True if the client can send.
 
         Raises:
-            KilledError: Its process has ended; what is thrown away with it sends nothing.
+            KilledError: The client's process has ended. Its remaining objects must not send anything.
         """
         if not self.loop.alive:
             raise KilledError
@@ -87,12 +101,12 @@ class Connection:
 
 
 class Broker:
-    """One broker.
+    """MQTT broker.
 
     Args:
-        timeline: The world's.
-        dice: Delays.
-        received: Told of each message that it takes: the message, and on which connection; None: its own, such as a will.
+        timeline: Timeline of the world.
+        dice: Generator of the random delays.
+        received: Called with each received message and its connection; None: no connection, as of a will.
     """
 
     def __init__(
@@ -101,22 +115,22 @@ class Broker:
         self._timeline, self._dice, self._received = timeline, dice, received
         self.up = True
         self.reachable = True
-        self.knows_five = True
+        self.supports_mqtt5 = True
         self.frozen_until_s = 0.0
         self.retained: dict[str, bytes] = {}
         self.connections: list[Connection] = []
         self.loop: ProcessLoop | None = None
-        """Loop of the process that connects now."""
+        """Loop of the running process, whose clients may connect; None: no process runs."""
 
     # faults
 
-    def stop(self, *, forgets: bool) -> None:
+    def stop(self, *, loses_retained: bool) -> None:
         """Stop the broker; all clients notice."""
         self.up = False
         for connection in list(self.connections):
-            self._end(connection, says_will=False)
+            self._end(connection, publishes_will=False)
             self._hang_up(connection)
-        if forgets:
+        if loses_retained:
             self.retained.clear()
 
     def start(self) -> None:
@@ -127,7 +141,7 @@ class Broker:
     def drop(self) -> None:
         """Cut all connections; both ends notice."""
         for connection in list(self.connections):
-            self._end(connection, says_will=True)
+            self._end(connection, publishes_will=True)
             self._hang_up(connection)
 
     def half_open(self) -> None:
@@ -143,20 +157,20 @@ class Broker:
                 if silently:
                     connection.half_open = True
                 else:
-                    self._send_to_broker(connection, lambda c=connection: self._end(c, says_will=True))
+                    self._send_to_broker(connection, lambda c=connection: self._end(c, publishes_will=True))
 
-    def say(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
-        """Publish as another client."""
+    def publish_as_other(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
+        """Publish a message of another client."""
         if self.up:
-            self._take(Packet(topic, payload, 0, retain, 0), None)
+            self._receive(Packet(topic, payload, 0, retain, 0), None)
 
     # requests of clients
 
     def connect(self, client: "VirtualPaho") -> Connection:
-        """A client opens a connection.
+        """Open a connection of a client.
 
         Raises:
-            LateError: Nobody answers.
+            LateError: The host does not respond.
             ConnectionRefusedError: The broker is down.
         """
         if self.loop is None or not self.reachable:
@@ -164,15 +178,15 @@ class Broker:
         if not self.up:
             raise ConnectionRefusedError(111, "Connection refused")
         connection = Connection(client, self.loop, half_open=False)
-        connection.heard_by_broker_s = connection.heard_by_client_s = self._timeline.now_s
+        connection.received_by_broker_s = connection.received_by_client_s = self._timeline.now_s
         self.connections.append(connection)
-        self._send_to_broker(connection, lambda: self._greet(connection))
-        self._timeline.after(KEEPALIVE_CHECK_S, lambda: self._look(connection))
+        self._send_to_broker(connection, lambda: self._accept(connection))
+        self._timeline.after(KEEPALIVE_CHECK_S, lambda: self._check_keepalive(connection))
         return connection
 
     def publish(self, connection: Connection, packet: Packet) -> None:
         """Send a client's message to the broker."""
-        self._send_to_broker(connection, lambda: self._take_from(connection, packet))
+        self._send_to_broker(connection, lambda: self._receive_from(connection, packet))
 
     def subscribe(self, connection: Connection, topics: list[str], mid: int) -> None:
         """Send a client's subscription to the broker."""
@@ -180,35 +194,37 @@ class Broker:
 
     def disconnect(self, connection: Connection) -> None:
         """Disconnect a client cleanly."""
-        self._send_to_broker(connection, lambda: self._end(connection, says_will=False))
+        self._send_to_broker(connection, lambda: self._end(connection, publishes_will=False))
         connection.client_open = False
 
     # behavior
 
-    def _greet(self, connection: Connection) -> None:
+    def _accept(self, connection: Connection) -> None:
         client = connection.client
-        if client.protocol == paho.MQTTv5 and not self.knows_five:
-            self._send_to_client(connection, lambda: client.on_connect(client, None, NO_FLAGS, REFUSED_VERSION, None))
-            self._end(connection, says_will=False)
+        if client.protocol == paho.MQTTv5 and not self.supports_mqtt5:
+            self._send_to_client(
+                connection, lambda: client.on_connect(client, None, NO_FLAGS, UNSUPPORTED_VERSION, None)
+            )
+            self._end(connection, publishes_will=False)
             return
         for other in list(self.connections):
             if other is not connection and other.accepted and other.client.identifier == client.identifier:
-                self._end(other, says_will=True)
+                self._end(other, publishes_will=True)
                 self._hang_up(other)
         connection.accepted = True
-        self._send_to_client(connection, lambda: client.connected(ACCEPTED))
+        self._send_to_client(connection, lambda: client.connected(CONNACK_OK))
 
-    def _take_from(self, connection: Connection, packet: Packet) -> None:
-        self._take(packet, connection)
+    def _receive_from(self, connection: Connection, packet: Packet) -> None:
+        self._receive(packet, connection)
         if packet.qos:
 
             def acknowledge() -> None:
                 connection.acknowledged[packet.mid] = self._timeline.now_s
-                connection.client.on_publish(connection.client, None, packet.mid, TAKEN, None)
+                connection.client.on_publish(connection.client, None, packet.mid, PUBACK_OK, None)
 
             self._send_to_client(connection, acknowledge)
 
-    def _take(self, packet: Packet, source: Connection | None) -> None:
+    def _receive(self, packet: Packet, source: Connection | None) -> None:
         if packet.retain:
             if packet.payload:
                 self.retained[packet.topic] = packet.payload
@@ -216,98 +232,104 @@ class Broker:
                 self.retained.pop(packet.topic, None)
         self._received(packet, source)
         for connection in self.connections:
-            if any(matches(packet.topic, wanted) for wanted in connection.wanted):
+            if any(matches(packet.topic, topic_filter) for topic_filter in connection.topic_filters):
                 as_published = packet.retain and "/request/" in packet.topic
-                self._hand_on(connection, packet.topic, packet.payload, retain=as_published)
+                self._forward(connection, packet.topic, packet.payload, retain=as_published)
 
     def _subscribe(self, connection: Connection, topics: list[str], mid: int) -> None:
-        connection.wanted += topics
+        connection.topic_filters += topics
         client = connection.client
-        self._send_to_client(connection, lambda: client.on_subscribe(client, None, mid, [GRANTED] * len(topics), None))
+        self._send_to_client(
+            connection, lambda: client.on_subscribe(client, None, mid, [SUBACK_OK] * len(topics), None)
+        )
         for topic, payload in self.retained.items():
-            if any(matches(topic, wanted) for wanted in topics):
-                self._hand_on(connection, topic, payload, retain=True)
+            if any(matches(topic, topic_filter) for topic_filter in topics):
+                self._forward(connection, topic, payload, retain=True)
 
-    def _hand_on(self, connection: Connection, topic: str, payload: bytes, *, retain: bool) -> None:
+    def _forward(self, connection: Connection, topic: str, payload: bytes, *, retain: bool) -> None:
         message = SimpleNamespace(topic=topic, payload=payload, qos=0, retain=retain, mid=0)
         client = connection.client
         self._send_to_client(connection, lambda: client.on_message(client, None, message))
 
-    def _end(self, connection: Connection, *, says_will: bool) -> None:
+    def _end(self, connection: Connection, *, publishes_will: bool) -> None:
         """End a connection at the broker."""
         if not connection.broker_open:
             return
         connection.broker_open = False
         self.connections.remove(connection)
         will = connection.client.will
-        if says_will and connection.accepted and will is not None and self.up:
-            self._take(will, None)
+        if publishes_will and connection.accepted and will is not None and self.up:
+            self._receive(will, None)
 
     def _hang_up(self, connection: Connection) -> None:
         """End a connection at the client."""
-        self._send_to_client(connection, lambda: connection.client.lost(LOST))
+        self._send_to_client(connection, lambda: connection.client.lost(CONNECTION_LOST))
 
-    def _look(self, connection: Connection) -> None:
+    def _check_keepalive(self, connection: Connection) -> None:
         """Check the keepalive of both sides."""
         now_s, keepalive_s = self._timeline.now_s, connection.client.keepalive_s
         if (
             connection.broker_open
-            and connection.heard_by_broker_s < now_s - 1.5 * keepalive_s
+            and connection.received_by_broker_s < now_s - KEEPALIVE_TOLERANCE * keepalive_s
             and (now_s >= self.frozen_until_s)
         ):
-            self._end(connection, says_will=True)
+            self._end(connection, publishes_will=True)
             self._hang_up(connection)
         if connection.client_open and connection.loop.alive and now_s >= connection.loop.frozen_until_s:
             if connection.pinged_s is not None and now_s - connection.pinged_s >= keepalive_s:
-                connection.loop.call_soon(connection.client.lost, SILENT)
+                connection.loop.call_soon(connection.client.lost, KEEPALIVE_TIMEOUT)
             elif connection.pinged_s is None and (
-                min(connection.heard_by_client_s, connection.said_by_client_s) <= now_s - keepalive_s
+                min(connection.received_by_client_s, connection.sent_by_client_s) <= now_s - keepalive_s
             ):
                 connection.pinged_s = now_s
                 self._send_to_broker(connection, lambda: self._send_to_client(connection, lambda: None))
         if connection.broker_open or (connection.client_open and connection.loop.alive):
-            self._timeline.after(KEEPALIVE_CHECK_S, lambda: self._look(connection))
+            self._timeline.after(KEEPALIVE_CHECK_S, lambda: self._check_keepalive(connection))
 
     def _send_to_broker(self, connection: Connection, packet: Callable[[], None]) -> None:
-        connection.said_by_client_s = now_s = self._timeline.now_s
-        connection.to_broker_s = max(connection.to_broker_s, now_s) + self._dice.uniform(0.0005, LATE_S)
-        self._timeline.at(connection.to_broker_s, lambda: self._arrive(connection, packet))
+        connection.sent_by_client_s = now_s = self._timeline.now_s
+        connection.arrival_at_broker_s = max(connection.arrival_at_broker_s, now_s) + self._dice.uniform(
+            0.0005, MAX_DELAY_S
+        )
+        self._timeline.at(connection.arrival_at_broker_s, lambda: self._arrive(connection, packet))
 
     def _arrive(self, connection: Connection, packet: Callable[[], None]) -> None:
         """Deliver a packet to the broker."""
         if connection.half_open or not connection.broker_open:
             return
         if self._timeline.now_s < self.frozen_until_s:
-            connection.to_broker_s = max(connection.to_broker_s, self.frozen_until_s) + 1e-6
-            self._timeline.at(connection.to_broker_s, lambda: self._arrive(connection, packet))
+            connection.arrival_at_broker_s = max(connection.arrival_at_broker_s, self.frozen_until_s) + 1e-6
+            self._timeline.at(connection.arrival_at_broker_s, lambda: self._arrive(connection, packet))
             return
-        connection.heard_by_broker_s = self._timeline.now_s
+        connection.received_by_broker_s = self._timeline.now_s
         packet()
 
     def _send_to_client(self, connection: Connection, packet: Callable[[], None]) -> None:
-        connection.to_client_s = max(connection.to_client_s, self._timeline.now_s) + self._dice.uniform(0.0005, LATE_S)
+        connection.arrival_at_client_s = max(connection.arrival_at_client_s, self._timeline.now_s) + self._dice.uniform(
+            0.0005, MAX_DELAY_S
+        )
 
         def arrive() -> None:
             if connection.half_open or not connection.client_open or not connection.loop.alive:
                 return
-            connection.heard_by_client_s, connection.pinged_s = self._timeline.now_s, None
+            connection.received_by_client_s, connection.pinged_s = self._timeline.now_s, None
             connection.loop.call_soon(packet)
 
-        self._timeline.at(connection.to_client_s, arrive)
+        self._timeline.at(connection.arrival_at_client_s, arrive)
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
         """Replace paho in aiomqtt, so that any address leads to this broker."""
-        kept = paho.Client
+        original = paho.Client
         paho.Client = partial(VirtualPaho, self)
         try:
             yield
         finally:
-            paho.Client = kept
+            paho.Client = original
 
 
 class VirtualPaho:
-    """Paho's client as far as aiomqtt uses it."""
+    """Replacement of paho's client, with the functions that aiomqtt uses."""
 
     def __init__(self, broker: Broker, **arguments: Any) -> None:
         self._broker = broker
@@ -341,11 +363,11 @@ class VirtualPaho:
         if self._connection is not None and self._connection.client_open:
             self._connection.client_open = False
             connection = self._connection
-            self._broker._send_to_broker(connection, lambda: self._broker._end(connection, says_will=True))
+            self._broker._send_to_broker(connection, lambda: self._broker._end(connection, publishes_will=True))
             self.on_disconnect(self, None, NO_FLAGS, code, None)
 
     def socket(self) -> Any:
-        return SimpleNamespace(shutdown=lambda _: self.lost(LOST))
+        return SimpleNamespace(shutdown=lambda _: self.lost(CONNECTION_LOST))
 
     def publish(self, topic: str, payload: bytes, qos: int, retain: bool, *_: Any) -> Any:
         self._mid += 1
@@ -354,8 +376,8 @@ class VirtualPaho:
         if connection is None or not connection.usable:
             return SimpleNamespace(rc=paho.MQTT_ERR_NO_CONN, mid=mid, is_published=lambda: False)
         self._broker.publish(connection, Packet(topic, payload, qos, retain, mid))
-        if not qos:  # the operating system has buffered it
-            connection.loop.call_soon(self.on_publish, self, None, mid, TAKEN, None)
+        if not qos:  # paho reports a QoS 0 message as published when the operating system has buffered it
+            connection.loop.call_soon(self.on_publish, self, None, mid, PUBACK_OK, None)
         return SimpleNamespace(rc=paho.MQTT_ERR_SUCCESS, mid=mid, is_published=lambda: False)
 
     def subscribe(self, topics: Any, *_: Any) -> tuple[int, int | None]:
@@ -370,7 +392,7 @@ class VirtualPaho:
         if connection is None or not connection.usable:
             return int(paho.MQTT_ERR_NO_CONN)
         self._broker.disconnect(connection)
-        connection.loop.call_soon(self.on_disconnect, self, None, NO_FLAGS, PARTED, None)
+        connection.loop.call_soon(self.on_disconnect, self, None, NO_FLAGS, NORMAL_DISCONNECT, None)
         return int(paho.MQTT_ERR_SUCCESS)
 
 
@@ -378,9 +400,9 @@ def _ignored(*_: Any, **__: Any) -> None:
     pass
 
 
-def matches(topic: str, wanted: str) -> bool:
-    """Return True if a topic matches a filter without #."""
-    if "+" not in wanted:
-        return topic == wanted
-    left, right = topic.split("/"), wanted.split("/")
+def matches(topic: str, topic_filter: str) -> bool:
+    """Return True if a topic matches a filter, which may contain + but not #."""
+    if "+" not in topic_filter:
+        return topic == topic_filter
+    left, right = topic.split("/"), topic_filter.split("/")
     return len(left) == len(right) and all(b in ("+", a) for a, b in zip(left, right, strict=True))

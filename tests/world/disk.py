@@ -1,7 +1,8 @@
-"""The disk: a folder in memory, with what a power cut leaves of it, and a disk that is full, broken or hung.
+"""Disk that loses unsynced data at a power cut, and that can be full, broken or hung.
 
-The service works on real files of a real folder. Beside it stands what has reached the platter: the bytes of a file with
-its fsync, a name with the fsync of its folder. All else is lost or torn by a power cut, as the worst file system may.
+The service uses real files in a real folder. In addition, this module stores the synced data: the bytes of a file at
+its last fsync, and the names in the folder at the folder's last fsync. A power cut loses or truncates all other data,
+as the least reliable file systems do.
 """
 
 import errno
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SYNC_S = 31.0
+MAX_SYNC_DELAY_S = 31.0
 """Time after which a committed transaction is synced [s], by the next transaction of ``store.database`` or by the operating system."""
 
 
@@ -26,28 +27,28 @@ class PowerCutError(BaseException):
 
 
 @dataclass
-class Arm:
+class ArmedFault:
     """Armed fault of the disk."""
 
-    after: int
+    operations_left: int
     """Number of operations until it occurs."""
-    end: type[BaseException]
+    error: type[BaseException]
     """Exception that ends the process."""
 
 
 class Disk:
-    """One folder.
+    """Folder on a simulated disk.
 
     Args:
-        folder: Where its files are; made anew.
-        dice: What a power cut leaves.
+        folder: Path of the folder, which is emptied.
+        dice: Random generator that selects the unsynced data that survive a power cut.
 
     Attributes:
-        full: Nothing new can be written.
-        broken: Writing fails, the disk says.
-        hung: Calls for it do not return.
-        arm: How it ends the process before long; None: it does not.
-        operations: So many have changed it.
+        full: True if writes fail with ENOSPC.
+        broken: True if writes fail with EIO.
+        hung: True if calls of the disk do not return.
+        armed_fault: Fault that will end the process at one of the next operations; None: no fault.
+        operations: Number of operations that changed the disk.
     """
 
     def __init__(self, folder: Path, dice: random.Random) -> None:
@@ -56,7 +57,7 @@ class Disk:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         self.full = self.broken = self.hung = False
-        self.arm: Arm | None = None
+        self.armed_fault: ArmedFault | None = None
         self.operations = 0
         self._synced: dict[int, bytes] = {}
         """Synced bytes by inode."""
@@ -68,42 +69,43 @@ class Disk:
         self.connections: list[sqlite3.Connection] = []
         """Database connections of the present process."""
         self._logs: dict[str, deque[tuple[float, int]]] = {}
+        """Times and sizes of each write-ahead log."""
 
     @property
-    def bad(self) -> bool:
+    def is_faulty(self) -> bool:
         """True if the disk is full, broken or hung."""
         return self.full or self.broken or self.hung
 
     @contextmanager
     def installed(self) -> Iterator[None]:
         """Replace the file functions of this process."""
-        kept = {name: getattr(os, name) for name in ("open", "fsync", "replace", "rename", "unlink", "remove")}
+        originals = {name: getattr(os, name) for name in ("open", "fsync", "replace", "rename", "unlink", "remove")}
         try:
-            os.open, os.fsync = self._open(kept["open"]), self._fsync(kept["fsync"])
-            os.replace = os.rename = self._replace(kept["replace"])
-            os.unlink = os.remove = self._unlink(kept["unlink"])
+            os.open, os.fsync = self._open(originals["open"]), self._fsync(originals["fsync"])
+            os.replace = os.rename = self._replace(originals["replace"])
+            os.unlink = os.remove = self._unlink(originals["unlink"])
             yield
         finally:
-            for name, function in kept.items():
+            for name, function in originals.items():
                 setattr(os, name, function)
 
     def end_process(self) -> None:
         """Drop the database connections of an ended process without closing them."""
-        found = {path: path.read_bytes() for path in self._databases()}
+        contents = {path: path.read_bytes() for path in self._databases()}
         for connection in self.connections:
             connection.close()
         self.connections.clear()
         for path in self._databases():
             path.unlink()
-        for path, content in found.items():
+        for path, content in contents.items():
             if not path.name.endswith("-shm"):
                 path.write_bytes(content)
 
     def transaction(self, call: Callable[[], Any], now_s: float) -> Any:
-        """A call for a database, which SQLite refuses on a disk at fault.
+        """Run a call that uses a database.
 
         Raises:
-            OperationalError: It does.
+            OperationalError: The disk is full or broken.
         """
         if self.full or self.broken:
             raise sqlite3.OperationalError("database or disk is full" if self.full else "disk I/O error")
@@ -112,7 +114,7 @@ class Disk:
         return value
 
     def _note_databases(self, now_s: float) -> None:
-        """Record the sizes of the databases' logs: parts older than ``SYNC_S`` are synced."""
+        """Record the sizes of the databases' logs: parts older than ``MAX_SYNC_DELAY_S`` are synced."""
         for path in self._databases():
             if path.name.endswith("-wal"):
                 sizes = self._logs.setdefault(path.name, deque())
@@ -124,19 +126,18 @@ class Disk:
     def _databases(self) -> list[Path]:
         return [self.folder / name for name in sorted(os.listdir(self.folder)) if ".sqlite" in name]  # noqa: PTH208 - quicker
 
-    def cut(self, now_s: float) -> None:
-        """Cut the power: keep synced data, and a random part of the rest."""
-        self.arm = None  # an armed fault needs a next write
+    def cut_power(self, now_s: float) -> None:
+        """Cut the power: synced data and a random part of the other data survive."""
+        self.armed_fault = None  # no process runs that could reach it
         databases = {path: path.read_bytes() for path in self._databases()}
         self._cut_files()
         for path, content in databases.items():
             if path.name.endswith("-wal"):
                 sizes = self._logs.get(path.name, deque())
-                least = max((size for at_s, size in sizes if at_s < now_s - SYNC_S), default=0)
-                least = min(least, len(content))
-                left = self._dice.randint(least, len(content))
-                path.write_bytes(content[:left])
-                self._logs[path.name] = deque([(-math.inf, left)])  # all surviving bytes are synced
+                synced = max((size for at_s, size in sizes if at_s < now_s - MAX_SYNC_DELAY_S), default=0)
+                surviving = self._dice.randint(min(synced, len(content)), len(content))
+                path.write_bytes(content[:surviving])
+                self._logs[path.name] = deque([(-math.inf, surviving)])  # all surviving bytes are synced
             else:
                 path.write_bytes(content)
 
@@ -145,8 +146,8 @@ class Disk:
         inodes = {name: (self.folder / name).stat().st_ino for name in content}
         volatile = {inodes[name]: content[name] for name in content}
         names = dict(self._names)
-        kept = self._pending[: self._dice.randint(0, len(self._pending))]
-        for operation, name, inode in kept:  # the journal replays changes in order
+        survivors = self._pending[: self._dice.randint(0, len(self._pending))]
+        for operation, name, inode in survivors:  # the journal replays changes in order
             if operation == "unlink":
                 names.pop(name, None)
             else:
@@ -155,22 +156,21 @@ class Disk:
                 names[name] = inode
         for path in list(self.folder.iterdir()):
             path.unlink()
-        self._synced = {inode: self._left(inode, volatile.get(inode, b"")) for inode in names.values()}
-        left, self._names, self._pending = self._synced, {}, []
-        self._synced = {}
+        surviving = {inode: self._surviving_bytes(inode, volatile.get(inode, b"")) for inode in names.values()}
+        self._synced, self._names, self._pending = {}, {}, []
         for name, inode in names.items():
             path = self.folder / name
-            path.write_bytes(left[inode])
+            path.write_bytes(surviving[inode])
             number = path.stat().st_ino
-            self._names[name], self._synced[number] = number, left[inode]
+            self._names[name], self._synced[number] = number, surviving[inode]
 
     def connect(self, *arguments: Any, **named: Any) -> sqlite3.Connection:
         """Replacement of ``sqlite3.connect``."""
         self.connections.append(sqlite3.connect(*arguments, **named))
         return self.connections[-1]
 
-    def _left(self, inode: int, volatile: bytes) -> bytes:
-        """Return the bytes of a file that survive a power cut."""
+    def _surviving_bytes(self, inode: int, volatile: bytes) -> bytes:
+        """Return the bytes of a file that survive a power cut: all, none, the beginning, or zeros, if they are not synced."""
         synced = self._synced.get(inode)
         if synced is not None and (not volatile or volatile == synced):
             return synced
@@ -184,7 +184,7 @@ class Disk:
             case _:
                 return bytes(len(volatile))
 
-    def _ours(self, path: Any) -> str | None:
+    def _name_on_disk(self, path: Any) -> str | None:
         """Return the name of a file on this disk; None for another file."""
         text = os.fspath(path) if not isinstance(path, int) else ""
         return (
@@ -196,21 +196,21 @@ class Disk:
     def _operation(self) -> None:
         """Count an operation, and raise an armed fault."""
         self.operations += 1
-        if self.arm is not None:
-            self.arm.after -= 1
-            if self.arm.after < 0:
-                end, self.arm = self.arm.end, None
-                raise end
+        if self.armed_fault is not None:
+            self.armed_fault.operations_left -= 1
+            if self.armed_fault.operations_left < 0:
+                error, self.armed_fault = self.armed_fault.error, None
+                raise error
 
-    def _refuse(self) -> None:
+    def _raise_if_faulty(self) -> None:
         if self.full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if self.broken:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     def _open(self, real: Callable[..., int]) -> Callable[..., int]:
-        def opened(path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
-            name = self._ours(path)
+        def open_file(path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
+            name = self._name_on_disk(path)
             if name is None or dir_fd is not None:
                 if path == self.folder or path == str(self.folder):
                     descriptor = real(path, flags, mode)
@@ -221,33 +221,32 @@ class Disk:
             is_new = writes and not os.path.lexists(path)
             if writes and not name.endswith(".lock"):
                 self._operation()
-                self._refuse()
+                self._raise_if_faulty()
             descriptor = real(path, flags, mode)
             if is_new:
                 self._pending.append(("create", name, os.fstat(descriptor).st_ino))
             return descriptor
 
-        return opened
+        return open_file
 
     def _fsync(self, real: Callable[[int], None]) -> Callable[[int], None]:
-        def synced(descriptor: int) -> None:
+        def sync_file(descriptor: int) -> None:
             if descriptor in self._folders:
                 self._folders.discard(descriptor)
                 self._operation()
                 self._flush_names()
                 return
             path = os.readlink(f"/proc/self/fd/{descriptor}")  # noqa: PTH115 - it is no file
-            if self._ours(path) is None:
+            if self._name_on_disk(path) is None:
                 real(descriptor)
                 return
             self._operation()
             if self.full or self.broken:  # the data written so far are torn
                 os.truncate(path, self._dice.randint(0, os.fstat(descriptor).st_size))
-                self._refuse()
-            found = os.fstat(descriptor)
-            self._synced[found.st_ino] = Path(path).read_bytes()
+                self._raise_if_faulty()
+            self._synced[os.fstat(descriptor).st_ino] = Path(path).read_bytes()
 
-        return synced
+        return sync_file
 
     def _flush_names(self) -> None:
         for operation, name, inode in self._pending:
@@ -260,22 +259,22 @@ class Disk:
         self._pending = []
 
     def _replace(self, real: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
-        def replaced(source: Any, target: Any, **_: Any) -> None:
-            name = self._ours(target)
+        def replace_file(source: Any, target: Any, **_: Any) -> None:
+            name = self._name_on_disk(target)
             if name is None:
                 real(source, target)
                 return
             self._operation()
-            self._refuse()
+            self._raise_if_faulty()
             inode = Path(source).stat().st_ino
             real(source, target)
             self._pending.append(("replace", name, inode))
 
-        return replaced
+        return replace_file
 
     def _unlink(self, real: Callable[[Any], None]) -> Callable[..., None]:
-        def unlinked(path: Any, *, dir_fd: int | None = None) -> None:
-            name = self._ours(path)
+        def unlink_file(path: Any, *, dir_fd: int | None = None) -> None:
+            name = self._name_on_disk(path)
             if name is None or dir_fd is not None:
                 real(path, dir_fd=dir_fd)
                 return
@@ -284,4 +283,4 @@ class Disk:
                 self._pending.append(("unlink", name, 0))
             real(path)
 
-        return unlinked
+        return unlink_file

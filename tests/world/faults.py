@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bms_estimator.protocols.firmware.messages import MODULUS
-from tests.world.disk import Arm, PowerCutError
+from tests.world.disk import ArmedFault, PowerCutError
 from tests.world.line import Noise
 from tests.world.loop import KilledError
 
@@ -15,11 +15,23 @@ if TYPE_CHECKING:
     from tests.world.world import World
 
 MIN_PAUSE_S, MAX_PAUSE_S = 5.0, 300.0
-FIRST_S = 20.0
+"""Range of the pause between the begins of two faults [s]."""
+MEAN_PAUSE_S = 90.0
+"""Mean of the random part of the pause [s]."""
+MIN_DURATION_S, MAX_DURATION_S = 0.1, 400.0
+"""Range of the duration of a fault [s]."""
+MEAN_DURATION_S = 40.0
+"""Mean of the random part of the duration [s]."""
+MAX_FIRST_S = 20.0
+"""Maximum time before the first pause [s]."""
+MAX_FREEZE_S = 120.0
+"""Maximum duration for which a process is frozen [s]."""
+MAX_HOSTILE_S = 60.0
+"""Maximum time over which hostile requests are spread [s]."""
+SYNC_CHANGE_S = 60.0
+"""Minimum duration of a wall-clock fault that also changes whether the clock is synchronized [s]."""
 STOP_S = 90.0
 """Stop timeout after which systemd kills the service [s]."""
-
-
 MIN_JUMP_S, MAX_JUMP_S = 3.0, 3600.0
 """Range of steps of the board's clock [s]: the service accepts a sample that is less than 2 s early."""
 MAX_RANDOM_S = 5.0
@@ -28,56 +40,68 @@ MAX_RANDOM_S = 5.0
 
 @dataclass(frozen=True)
 class Fault:
-    """Fault of the world at a time."""
+    """Fault of the world.
 
-    at_s: float
+    Attributes:
+        begin_s: Time since the start of the world [s].
+        kind: Key of ``KINDS``.
+    """
+
+    begin_s: float
     kind: str
-    seconds: float
+    duration_s: float
     """Duration, or time until the service is started again [s]."""
-    share: float
-    """Severity, 0..1."""
+    severity: float
+    """Random number of 0..1 that selects strength, direction or variant of the fault."""
 
     def apply(self, world: "World") -> None:
         """Apply the fault to a world."""
         KINDS[self.kind](world, self)
 
     def __str__(self) -> str:
-        return f"{self.kind} for {self.seconds:.1f} s, share {self.share:.3f}"
+        return f"{self.kind} for {self.duration_s:.1f} s, severity {self.severity:.3f}"
 
 
-def usual(*, auto: bool, text: bool) -> list[str]:
-    """Return the kinds of faults that may occur in a world."""
+def ordinary_kinds(*, auto: bool, text: bool) -> list[str]:
+    """Return the kinds of faults that may occur in a world, without those of the board's clock.
+
+    Args:
+        auto: True if the service searches for its port, so that it finds a renamed one.
+        text: True if the board prints text, which has no serial number.
+    """
     return [
         kind
         for kind in KINDS
-        if kind not in CLOCK and not (kind == "boards swapped" and text) and not (kind == "port renamed" and not auto)
+        if kind not in CLOCK_FAULTS
+        and not (kind == "boards swapped" and text)
+        and not (kind == "port renamed" and not auto)
     ]
 
 
 def schedule(dice: random.Random, until_s: float, kinds: Sequence[str]) -> list[Fault]:
-    """Draw faults of some kinds, with their times."""
-    likely = dice.sample(kinds, k=dice.randint(2, len(kinds)))
+    """Draw faults with their times. Each world has a random subset of ``kinds``."""
+    drawn_kinds = dice.sample(kinds, k=dice.randint(2, len(kinds)))
     faults = []
-    at_s = FIRST_S * dice.random()
+    begin_s = MAX_FIRST_S * dice.random()
     while True:
-        at_s += min(dice.expovariate(1.0 / 90.0) + MIN_PAUSE_S, MAX_PAUSE_S)
-        if at_s >= until_s:
+        begin_s += min(dice.expovariate(1.0 / MEAN_PAUSE_S) + MIN_PAUSE_S, MAX_PAUSE_S)
+        if begin_s >= until_s:
             return faults
-        seconds = min(dice.expovariate(1.0 / 40.0) + 0.1, 400.0, until_s - at_s)
-        faults.append(Fault(at_s, dice.choice(likely), seconds, dice.random()))
+        duration_s = min(dice.expovariate(1.0 / MEAN_DURATION_S) + MIN_DURATION_S, MAX_DURATION_S, until_s - begin_s)
+        faults.append(Fault(begin_s, dice.choice(drawn_kinds), duration_s, dice.random()))
 
 
-def _noisy(noise: Callable[[float], Noise]) -> Callable[["World", Fault], None]:
+def _with_noise(noise: Callable[[float], Noise]) -> Callable[["World", Fault], None]:
     def apply(world: "World", fault: Fault) -> None:
-        world.cable.noise = noise(fault.share)
-        world.timeline.after(fault.seconds, lambda: setattr(world.cable, "noise", Noise()))
+        world.cable.noise = noise(fault.severity)
+        world.timeline.after(fault.duration_s, lambda: setattr(world.cable, "noise", Noise()))
 
     return apply
 
 
 def _unplug(world: "World", fault: Fault) -> None:
     if world.cable.unplug() is not None:
-        world.timeline.after(fault.seconds, lambda: _plug(world, world.port_name))
+        world.timeline.after(fault.duration_s, lambda: _plug(world, world.port_name))
 
 
 def _plug(world: "World", name: str) -> None:
@@ -86,23 +110,23 @@ def _plug(world: "World", name: str) -> None:
         world.cable.plug(world.board, name)
 
 
-def _rename(world: "World", fault: Fault) -> None:
+def _rename_port(world: "World", fault: Fault) -> None:
     if world.cable.unplug() is not None:
-        world.timeline.after(fault.seconds, lambda: _plug(world, f"ttyACM{int(100 * fault.share)}"))
+        world.timeline.after(fault.duration_s, lambda: _plug(world, f"ttyACM{int(100 * fault.severity)}"))
 
 
-def _swap(world: "World", fault: Fault) -> None:
+def _swap_boards(world: "World", fault: Fault) -> None:
     if world.cable.unplug() is None:
         return
-    world.foreigner.reset()
-    world.cable.plug(world.foreigner, world.port_name)
+    world.foreign_board.reset()
+    world.cable.plug(world.foreign_board, world.port_name)
 
-    def back() -> None:
-        if world.cable.board is world.foreigner:
+    def plug_own_board() -> None:
+        if world.cable.board is world.foreign_board:
             world.cable.unplug()
             _plug(world, world.port_name)
 
-    world.timeline.after(fault.seconds, back)
+    world.timeline.after(fault.duration_s, plug_own_board)
 
 
 def _reset_board(world: "World", fault: Fault) -> None:
@@ -111,84 +135,84 @@ def _reset_board(world: "World", fault: Fault) -> None:
 
 
 def _jump_s(fault: Fault) -> float:
-    """Return a clock step of seconds to an hour, ahead or back [s]."""
-    size = abs(2.0 * fault.share - 1.0)
-    return math.copysign(MIN_JUMP_S * (MAX_JUMP_S / MIN_JUMP_S) ** size, fault.share - 0.5)
+    """Return a clock step, ahead or back, whose size is between ``MIN_JUMP_S`` and ``MAX_JUMP_S`` [s]."""
+    size = abs(2.0 * fault.severity - 1.0)
+    return math.copysign(MIN_JUMP_S * (MAX_JUMP_S / MIN_JUMP_S) ** size, fault.severity - 0.5)
 
 
-def _clock_stepped(world: "World", fault: Fault) -> None:
+def _step_board_clock(world: "World", fault: Fault) -> None:
     world.board.step_clock(_jump_s(fault))
 
 
-def _stamp_wrong(world: "World", fault: Fault) -> None:
-    world.board.stamps_off_us.append(round(_jump_s(fault) * 1e6))
+def _change_stamp(world: "World", fault: Fault) -> None:
+    world.board.stamp_errors_us.append(round(_jump_s(fault) * 1e6))
 
 
-def _clock_at_random(world: "World", fault: Fault) -> None:
+def _randomize_stamps(world: "World", fault: Fault) -> None:
     board, dice = world.board, world.dice["faults"]
-    samples = math.ceil(min(fault.seconds, MAX_RANDOM_S) / board.period_s)
-    board.stamps_off_us.extend(dice.randrange(MODULUS) for _ in range(samples))
+    samples = math.ceil(min(fault.duration_s, MAX_RANDOM_S) / board.period_s)
+    board.stamp_errors_us.extend(dice.randrange(MODULUS) for _ in range(samples))
 
 
-def _broker_down(world: "World", fault: Fault) -> None:
+def _stop_broker(world: "World", fault: Fault) -> None:
     if world.broker.up:
         world.will_certain &= (
             world.process is not None or not world.broker.connections
         )  # the broker loses the will when it stops
-        world.broker.stop(forgets=fault.share < 0.3)
-        world.timeline.after(fault.seconds, world.broker.start)
+        world.broker.stop(loses_retained=fault.severity < 0.3)
+        world.timeline.after(fault.duration_s, world.broker.start)
 
 
-def _broker_drops(world: "World", fault: Fault) -> None:
+def _cut_connections(world: "World", fault: Fault) -> None:
     world.broker.drop()
 
 
-def _half_open(world: "World", fault: Fault) -> None:
+def _half_open_connections(world: "World", fault: Fault) -> None:
     world.broker.half_open()
 
 
-def _unreachable(world: "World", fault: Fault) -> None:
+def _block_broker(world: "World", fault: Fault) -> None:
     world.broker.half_open()
     world.broker.reachable = False
-    world.timeline.after(fault.seconds, lambda: setattr(world.broker, "reachable", True))
+    world.timeline.after(fault.duration_s, lambda: setattr(world.broker, "reachable", True))
 
 
-def _frozen_broker(world: "World", fault: Fault) -> None:
-    world.broker.frozen_until_s = world.timeline.now_s + fault.seconds
+def _freeze_broker(world: "World", fault: Fault) -> None:
+    world.broker.frozen_until_s = world.timeline.now_s + fault.duration_s
 
 
-def _wall_step(world: "World", fault: Fault) -> None:
-    world.clocks.wall_offset_s += (fault.share - 0.5) * 10.0 ** (6.0 * world.dice["faults"].random())
-    if fault.seconds > 60.0:
+def _step_wall_clock(world: "World", fault: Fault) -> None:
+    world.clocks.wall_offset_s += (fault.severity - 0.5) * 10.0 ** (6.0 * world.dice["faults"].random())
+    if fault.duration_s > SYNC_CHANGE_S:
         world.clocks.synchronised = not world.clocks.synchronised
 
 
-def _disk(attribute: str) -> Callable[["World", Fault], None]:
+def _disk_fault(attribute: str) -> Callable[["World", Fault], None]:
     def apply(world: "World", fault: Fault) -> None:
         setattr(world.disk, attribute, True)
-        world.timeline.after(fault.seconds, lambda: setattr(world.disk, attribute, False))
+        world.timeline.after(fault.duration_s, lambda: setattr(world.disk, attribute, False))
 
     return apply
 
 
-def _kill(world: "World", fault: Fault) -> None:
-    world.kill_after = int(200 * fault.share)
+def _kill_service(world: "World", fault: Fault) -> None:
+    world.kill_after = int(200 * fault.severity)
 
 
-def _kill_at_write(world: "World", fault: Fault) -> None:
-    world.disk.arm = Arm(int(8 * fault.share), KilledError)
+def _kill_service_at_write(world: "World", fault: Fault) -> None:
+    world.disk.armed_fault = ArmedFault(int(8 * fault.severity), KilledError)
 
 
-def _power_cut(world: "World", fault: Fault) -> None:
+def _cut_power(world: "World", fault: Fault) -> None:
     if world.powered:
-        world.cut_power(fault.seconds)
+        world.cut_power(fault.duration_s)
 
 
-def _power_cut_at_write(world: "World", fault: Fault) -> None:
-    world.disk.arm = Arm(int(8 * fault.share), PowerCutError)
+def _cut_power_at_write(world: "World", fault: Fault) -> None:
+    world.disk.armed_fault = ArmedFault(int(8 * fault.severity), PowerCutError)
 
 
-def _clean_stop(world: "World", fault: Fault) -> None:
+def _stop_service(world: "World", fault: Fault) -> None:
     process = world.process
     if process is None:
         return
@@ -202,68 +226,72 @@ def _clean_stop(world: "World", fault: Fault) -> None:
     world.timeline.after(STOP_S, kill)
 
 
-def _freeze(world: "World", fault: Fault) -> None:
+def _freeze_process(world: "World", fault: Fault) -> None:
     if world.process is not None:
-        world.process.loop.freeze(world.timeline.now_s + min(fault.seconds, 120.0))
+        world.process.loop.freeze(world.timeline.now_s + min(fault.duration_s, MAX_FREEZE_S))
 
 
-HOSTILE = (
+HOSTILE_PAYLOADS = (
     b"", b"{}", b"[]", b"null", b'{"soc":NaN}', b'{"soc":1e999}', b'{"soc":0.1}', b"\xff\xfe\x00", b"{" * 4000,
     b"[" * 100_000, b'{"transaction":[1]}', b'{"transaction":"x"}', b"0" * 20_000,
 )  # fmt: skip
-NAMES = ("state", "health", "parameters", "set_soc", "current_zero", "x" * 300, "../etc", "\0", "")
+REQUEST_NAMES = ("state", "health", "parameters", "set_soc", "current_zero", "x" * 300, "../etc", "\0", "")
 
 
-def _hostile(world: "World", fault: Fault) -> None:
+def _send_hostile_requests(world: "World", fault: Fault) -> None:
     dice = world.dice["faults"]
-    for _ in range(int(1 + 300 * fault.share**3)):
-        topic = f"bms/pack/request/{dice.choice(NAMES)}"
-        payload, retain = dice.choice(HOSTILE), dice.random() < 0.1
+    for _ in range(int(1 + 300 * fault.severity**3)):  # mostly few requests
+        topic = f"bms/pack/request/{dice.choice(REQUEST_NAMES)}"
+        payload, retain = dice.choice(HOSTILE_PAYLOADS), dice.random() < 0.1
         world.timeline.after(
-            dice.uniform(0.0, min(fault.seconds, 60.0)),
-            lambda topic=topic, payload=payload, retain=retain: world.broker.say(topic, payload, retain=retain),
+            dice.uniform(0.0, min(fault.duration_s, MAX_HOSTILE_S)),
+            lambda topic=topic, payload=payload, retain=retain: world.broker.publish_as_other(
+                topic, payload, retain=retain
+            ),
         )
 
 
-def _forged(world: "World", fault: Fault) -> None:
-    topic = "availability" if fault.share < 0.5 else "sensor/availability"
-    world.broker.say(f"bms/pack/{topic}", b"offline" if fault.share % 0.2 < 0.1 else b"nonsense", retain=True)
+def _forge_availability(world: "World", fault: Fault) -> None:
+    topic = "availability" if fault.severity < 0.5 else "sensor/availability"
+    world.broker.publish_as_other(
+        f"bms/pack/{topic}", b"offline" if fault.severity % 0.2 < 0.1 else b"nonsense", retain=True
+    )
     world.will_certain &= world.process is not None
 
 
-def _birth(world: "World", fault: Fault) -> None:
-    world.broker.say("homeassistant/status", b"online")
+def _send_birth_message(world: "World", fault: Fault) -> None:
+    world.broker.publish_as_other("homeassistant/status", b"online")
 
 
 KINDS: dict[str, Callable[["World", Fault], None]] = {
-    "bytes flipped": _noisy(lambda share: Noise(flip=10.0 ** (-4.0 + 3.0 * share))),
-    "bytes lost": _noisy(lambda share: Noise(lose=10.0 ** (-4.0 + 3.0 * share))),
-    "line mute": _noisy(lambda _: Noise(mute=True)),
+    "bytes flipped": _with_noise(lambda severity: Noise(flip=10.0 ** (-4.0 + 3.0 * severity))),
+    "bytes lost": _with_noise(lambda severity: Noise(lose=10.0 ** (-4.0 + 3.0 * severity))),
+    "line mute": _with_noise(lambda _: Noise(mute=True)),
     "port gone": _unplug,
-    "port renamed": _rename,
+    "port renamed": _rename_port,
     "board reset": _reset_board,
-    "boards swapped": _swap,
-    "broker down": _broker_down,
-    "connections cut": _broker_drops,
-    "connections half open": _half_open,
-    "broker unreachable": _unreachable,
-    "broker frozen": _frozen_broker,
-    "wall clock stepped": _wall_step,
-    "disk full": _disk("full"),
-    "disk broken": _disk("broken"),
-    "disk hung": _disk("hung"),
-    "killed": _kill,
-    "killed at a write": _kill_at_write,
-    "power cut": _power_cut,
-    "power cut at a write": _power_cut_at_write,
-    "stopped": _clean_stop,
-    "process frozen": _freeze,
-    "hostile requests": _hostile,
-    "availability forged": _forged,
-    "birth message": _birth,
-    "board's clock stepped": _clock_stepped,
-    "one stamp wrong": _stamp_wrong,
-    "board's clock at random": _clock_at_random,
+    "boards swapped": _swap_boards,
+    "broker down": _stop_broker,
+    "connections cut": _cut_connections,
+    "connections half open": _half_open_connections,
+    "broker unreachable": _block_broker,
+    "broker frozen": _freeze_broker,
+    "wall clock stepped": _step_wall_clock,
+    "disk full": _disk_fault("full"),
+    "disk broken": _disk_fault("broken"),
+    "disk hung": _disk_fault("hung"),
+    "killed": _kill_service,
+    "killed at a write": _kill_service_at_write,
+    "power cut": _cut_power,
+    "power cut at a write": _cut_power_at_write,
+    "stopped": _stop_service,
+    "process frozen": _freeze_process,
+    "hostile requests": _send_hostile_requests,
+    "availability forged": _forge_availability,
+    "birth message": _send_birth_message,
+    "board's clock stepped": _step_board_clock,
+    "one stamp wrong": _change_stamp,
+    "board's clock at random": _randomize_stamps,
 }
-CLOCK = ("board's clock stepped", "one stamp wrong", "board's clock at random")
+CLOCK_FAULTS = ("board's clock stepped", "one stamp wrong", "board's clock at random")
 """Faults of the board's clock, only with the binary protocol. They are drawn separately, so that older seeds keep their other faults."""

@@ -1,6 +1,6 @@
-"""Boards, the ports they are plugged into, and what the cable does to their bytes.
+"""Simulated boards, their serial ports, and cables that corrupt and delay bytes.
 
-The service opens a port with pyserial, which here gives one end of a pair of sockets; all behind that is its own code.
+The service opens a port with pyserial. Here pyserial returns one end of a pair of sockets; the service's other code is unchanged.
 """
 
 import contextlib
@@ -40,22 +40,30 @@ from bms_estimator.simulation.virtual_board import FIRMWARE
 from tests.world.loop import Timeline
 
 BANDGAP_READINGS = 256
+"""Number of bandgap readings whose sum the hello reports."""
 NOISE_STEPS = 0.5
 """Noise of one conversion [steps]. A window has thousands, so that their mean is more accurate."""
-LATE_S = 0.004
-"""Maximum delay of a read on USB [s]."""
-ARDUINO = 0x2341, 0x0043
+MIN_DELAY_S = 0.001
+"""Minimum delay of a write on USB [s]."""
+MAX_DELAY_S = 0.004
+"""Maximum delay of a read or a write on USB [s]."""
+BOOTLOADER_S = 0.2
+"""Time from a reset by opening the port to the board's first message [s]."""
+SPLIT_PROBABILITY = 0.2
+"""Probability that bytes arrive in two reads."""
+ARDUINO_USB_ID = 0x2341, 0x0043
+"""Vendor and product id of an Arduino Uno."""
 
 
 class Board:
-    """A board that samples what it is shown, in the firmware's protocol or in lines of text.
+    """Board that sends samples in the firmware's protocol or as lines of text.
 
     Args:
-        serial_number: Its own.
-        parts: As built.
-        text: Prints lines.
-        first_rate_hz: After a reset.
-        dice: Of its noise.
+        serial_number: Serial number of the board.
+        parts: True values of its parts.
+        dice: Generator of the noise.
+        text: True to print lines of text.
+        first_rate_hz: Sample rate after a reset [Hz].
     """
 
     def __init__(
@@ -63,17 +71,17 @@ class Board:
     ) -> None:
         self.serial_number, self._parts, self._dice, self.text = serial_number, parts, dice, text
         self._first_rate_hz = first_rate_hz
-        self._inbox = b""
-        self.stamps_off_us = deque[int]()
-        """Errors of the timestamps of the next samples [s]."""
+        self._buffer = b""
+        self.stamp_errors_us = deque[int]()
+        """Errors of the timestamps of the next samples [us]."""
         self._boot_id = dice.randrange(1 << 16)
         self.reset(ResetCause.POWER_ON)
 
     def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> bytes:
         """Reset the board; return its hello."""
         self._boot_id = (self._boot_id + 1) % (1 << 16)
-        self._cause, self._sequence, self._ns, self._ntc_next, self._inbox = cause, 0, 0, False, b""
-        self.stamps_off_us.clear()
+        self._cause, self._sequence, self._ns, self._ntc_next, self._buffer = cause, 0, 0, False, b""
+        self.stamp_errors_us.clear()
         self._window_ns = 0
         self._set_rate(self._first_rate_hz)
         return b"" if self.text else self._hello().encode()
@@ -109,24 +117,24 @@ class Board:
         aux = self._ntc(reading.temperature_c) if self._ntc_next else self._bandgap()
         status = BoardStatus.AUX_IS_NTC * self._ntc_next | (self._cause << 4)
         self._ntc_next = not self._ntc_next
-        n = self._aux_count
-        off_us = self.stamps_off_us.popleft() if self.stamps_off_us else 0
-        board_us = (self._ns // 1000 + off_us) % MODULUS
-        message = SampleMessage(self._sequence, board_us, voltage, current, count, self._sum(aux, n), n, int(status))
+        stamp_error_us = self.stamp_errors_us.popleft() if self.stamp_errors_us else 0
+        board_us = (self._ns // 1000 + stamp_error_us) % MODULUS
+        aux_sum, aux_count = self._sum(aux, self._aux_count), self._aux_count
+        message = SampleMessage(self._sequence, board_us, voltage, current, count, aux_sum, aux_count, int(status))
         self._sequence = (self._sequence + 1) % MODULUS
         return message.encode()
 
-    def hear(self, data: bytes) -> bytes:
+    def receive(self, data: bytes) -> bytes:
         """Process bytes of the host; return the response."""
-        *frames, self._inbox = (self._inbox + data).split(DELIMITER)
-        answers = b""
+        *frames, self._buffer = (self._buffer + data).split(DELIMITER)
+        responses = b""
         for frame in frames:
             with contextlib.suppress(ProtocolError):
                 if frame and not self.text:
-                    answers += self._obey(unseal(frame))
-        return answers
+                    responses += self._execute(unseal(frame))
+        return responses
 
-    def _obey(self, packet: bytes) -> bytes:
+    def _execute(self, packet: bytes) -> bytes:
         kind, body = packet[1], packet[2:]
         if packet[0] != PROTOCOL_VERSION:
             return Ack(kind, AckResult.OTHER_VERSION, PROTOCOL_VERSION).encode()
@@ -147,9 +155,9 @@ class Board:
         self._count, self._period_ns = compute_window(rate_hz)
         self._aux_count = compute_aux_count(rate_hz)
 
-    def _sum(self, part: float, count: int) -> int:
+    def _sum(self, fraction: float, count: int) -> int:
         """Return the sum of ``count`` conversions of a fraction of the reference."""
-        steps = part * FULL_SCALE * count + self._dice.gauss(0.0, NOISE_STEPS * math.sqrt(count))
+        steps = fraction * FULL_SCALE * count + self._dice.gauss(0.0, NOISE_STEPS * math.sqrt(count))
         return min(max(round(steps), 0), (FULL_SCALE - 1) * count)
 
     def _bandgap(self) -> float:
@@ -202,35 +210,38 @@ class Noise:
 
 
 @dataclass
-class Opening:
-    """Port opened by the service, and the delivered bytes."""
+class OpenPort:
+    """Port opened by the service: two connected sockets, and the arrival of the last bytes sent to the service [s]."""
 
-    near: socket.socket
-    far: socket.socket
-    late_until_s: float = 0.0
+    service_end: socket.socket
+    board_end: socket.socket
+    last_arrival_s: float = 0.0
 
 
 class Cable:
-    """The ports of the machine, and the board on one of them.
+    """Serial ports of the machine, and the board at one of them.
 
     Args:
-        folder: Where the ports are files.
-        timeline: The world's.
-        dice: Noise and delays.
-        readable: Told when a descriptor has bytes.
+        folder: Folder with a file for each port.
+        timeline: Timeline of the world.
+        dice: Generator of noise and delays.
+        on_readable: Called with a descriptor that has bytes.
     """
 
-    def __init__(self, folder: Path, timeline: Timeline, dice: random.Random, readable: Callable[[int], None]) -> None:
-        self.folder, self._timeline, self._dice, self._readable = folder, timeline, dice, readable
+    def __init__(
+        self, folder: Path, timeline: Timeline, dice: random.Random, on_readable: Callable[[int], None]
+    ) -> None:
+        self.folder, self._timeline, self._dice, self._on_readable = folder, timeline, dice, on_readable
         folder.mkdir(parents=True)
         self.noise = Noise()
         self.board: Board | None = None
         self.port: Path | None = None
-        self.opening: Opening | None = None
-        self.openings: list[Opening] = []
-        """Open port of the present process."""
+        self.open_port: OpenPort | None = None
+        """Open port of the running process."""
+        self.opened_ports: list[OpenPort] = []
+        """All ports that the running process has opened, including closed ones."""
         self.resets_when_opened = True
-        self.delivered: Callable[[bytes], None] = lambda _: None
+        self.on_delivered: Callable[[bytes], None] = lambda _: None
         """Called with the bytes delivered to the service."""
 
     def plug(self, board: Board, name: str) -> None:
@@ -249,121 +260,123 @@ class Cable:
 
     def hang_up(self) -> None:
         """Close the port at its device end."""
-        if self.opening is not None:
-            opening, self.opening = self.opening, None
-            opening.far.close()
-            self._readable_soon(opening.near)
+        if self.open_port is not None:
+            open_port, self.open_port = self.open_port, None
+            open_port.board_end.close()
+            self._notify_reader(open_port.service_end)
 
-    def forget(self) -> None:
+    def close_all(self) -> None:
         """Drop the port of an ended process."""
-        for opening in self.openings:
-            opening.near.close()
-            opening.far.close()
-        self.openings, self.opening = [], None
+        for open_port in self.opened_ports:
+            open_port.service_end.close()
+            open_port.board_end.close()
+        self.opened_ports, self.open_port = [], None
 
     def send(self, data: bytes) -> None:
         """Send bytes of the board; they arrive a little later, with the cable's noise."""
-        opening = self.opening
-        if opening is None or not data or self.noise.mute:
+        open_port = self.open_port
+        if open_port is None or not data or self.noise.mute:
             return
-        data = self._marred(data)
+        data = self._with_noise(data)
         parts = [data]
-        if self._dice.random() < 0.2:
+        if self._dice.random() < SPLIT_PROBABILITY:
             cut = self._dice.randint(0, len(data))
             parts = [data[:cut], data[cut:]]
         for part in parts:
-            opening.late_until_s = max(opening.late_until_s, self._timeline.now_s) + self._dice.uniform(0.0, LATE_S)
-            self._timeline.at(opening.late_until_s, lambda part=part: self._deliver(opening, part))
+            open_port.last_arrival_s = max(open_port.last_arrival_s, self._timeline.now_s) + self._dice.uniform(
+                0.0, MAX_DELAY_S
+            )
+            self._timeline.at(open_port.last_arrival_s, lambda part=part: self._deliver(open_port, part))
 
     def open(self, path: str, *_: Any, **__: Any) -> "VirtualPort":
-        """As pyserial's ``Serial``.
+        """Replacement of pyserial's ``Serial``.
 
         Raises:
-            SerialException: The port is not there, or is open.
+            SerialException: The port does not exist or is open.
         """
         if self.port is None or str(self.port) != os.path.realpath(path):
             raise serial.SerialException(2, f"could not open port {path}")
-        if self.opening is not None:
+        if self.open_port is not None:
             raise serial.SerialException(11, f"could not lock port {path}")
-        near, far = socket.socketpair()
-        near.setblocking(False)
-        far.setblocking(False)
-        self.opening = Opening(near, far)
-        self.openings.append(self.opening)
+        service_end, board_end = socket.socketpair()
+        service_end.setblocking(False)
+        board_end.setblocking(False)
+        self.open_port = OpenPort(service_end, board_end)
+        self.opened_ports.append(self.open_port)
         if self.board is not None and self.resets_when_opened:
             board = self.board
             hello = board.reset()
-            self._timeline.after(0.2, lambda: self.send(hello))
-        return VirtualPort(self, self.opening)
+            self._timeline.after(BOOTLOADER_S, lambda: self.send(hello))
+        return VirtualPort(self, self.open_port)
 
     def ports(self, *_: Any) -> list[ListPortInfo]:
         """Replacement of pyserial's ``comports``."""
         if self.port is None:
             return []
         info = ListPortInfo(str(self.port), skip_link_detection=True)
-        info.vid, info.pid = ARDUINO
+        info.vid, info.pid = ARDUINO_USB_ID
         info.serial_number = f"usb{self.board.serial_number:x}" if self.board else None
         return [info]
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
         """Replace pyserial's ports."""
-        kept = serial.Serial, list_ports.comports
+        original = serial.Serial, list_ports.comports
         serial.Serial, list_ports.comports = self.open, self.ports
         try:
             yield
         finally:
-            serial.Serial, list_ports.comports = kept
+            serial.Serial, list_ports.comports = original
 
-    def hear_soon(self, opening: Opening) -> None:
+    def receive_soon(self, open_port: OpenPort) -> None:
         """Schedule reading the bytes that the service sends."""
-        self._timeline.after(self._dice.uniform(0.001, LATE_S), lambda: self._hear(opening))
+        self._timeline.after(self._dice.uniform(MIN_DELAY_S, MAX_DELAY_S), lambda: self._receive(open_port))
 
-    def close(self, opening: Opening) -> None:
+    def close(self, open_port: OpenPort) -> None:
         """Close the port at the service's end."""
-        opening.near.close()
-        if self.opening is opening:
-            opening.far.close()
-            self.opening = None
+        open_port.service_end.close()
+        if self.open_port is open_port:
+            open_port.board_end.close()
+            self.open_port = None
 
-    def _hear(self, opening: Opening) -> None:
-        if self.opening is not opening or self.board is None:
+    def _receive(self, open_port: OpenPort) -> None:
+        if self.open_port is not open_port or self.board is None:
             return
         with contextlib.suppress(BlockingIOError, OSError):
-            data = opening.far.recv(4096)
+            data = open_port.board_end.recv(4096)
             if not self.noise.mute:
-                self.send(self.board.hear(self._marred(data)))
+                self.send(self.board.receive(self._with_noise(data)))
 
-    def _deliver(self, opening: Opening, data: bytes) -> None:
-        if self.opening is not opening or not data:
+    def _deliver(self, open_port: OpenPort, data: bytes) -> None:
+        if self.open_port is not open_port or not data:
             return
-        with contextlib.suppress(BlockingIOError, OSError):  # a process that does not read
-            sent = opening.far.send(data)
-            self.delivered(data[:sent])
-            self._readable_soon(opening.near)
+        with contextlib.suppress(BlockingIOError, OSError):  # the process does not read
+            sent = open_port.board_end.send(data)
+            self.on_delivered(data[:sent])
+            self._notify_reader(open_port.service_end)
 
-    def _readable_soon(self, near: socket.socket) -> None:
-        if near.fileno() >= 0:
-            self._readable(near.fileno())
+    def _notify_reader(self, service_end: socket.socket) -> None:
+        if service_end.fileno() >= 0:
+            self._on_readable(service_end.fileno())
 
-    def _marred(self, data: bytes) -> bytes:
+    def _with_noise(self, data: bytes) -> bytes:
         flip, lose = self.noise.flip, self.noise.lose
         if not flip and not lose:
             return data
         random_ = self._dice.random
-        kept = (byte ^ (1 << self._dice.randrange(8)) if random_() < flip else byte for byte in data)
-        return bytes(byte for byte in kept if random_() >= lose)
+        original = (byte ^ (1 << self._dice.randrange(8)) if random_() < flip else byte for byte in data)
+        return bytes(byte for byte in original if random_() >= lose)
 
 
 class VirtualPort:
     """Open port as pyserial presents it to the service."""
 
-    def __init__(self, cable: Cable, opening: Opening) -> None:
-        self._cable, self._opening = cable, opening
+    def __init__(self, cable: Cable, open_port: OpenPort) -> None:
+        self._cable, self._opening = cable, open_port
 
     def fileno(self) -> int:
-        self._cable.hear_soon(self._opening)  # called before each write
-        return self._opening.near.fileno()
+        self._cable.receive_soon(self._opening)  # called before each write
+        return self._opening.service_end.fileno()
 
     def close(self) -> None:
         self._cable.close(self._opening)

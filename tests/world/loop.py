@@ -1,6 +1,6 @@
-"""Virtual time: one heap of events for the whole world, and an asyncio loop for each process that lives in it.
+"""Virtual time: one heap of events for the whole world, and an asyncio loop for each process.
 
-Nothing runs at the same time as anything else, and nothing waits: when nobody has anything to do, it is later.
+Events run one after another. When no handle is ready, the time advances to the next event without waiting.
 """
 
 import asyncio
@@ -16,17 +16,19 @@ from typing import Any
 
 MAX_CLOSINGS = 20
 """Maximum number of awaits of a coroutine that is being closed."""
+CLEAN_UP_TASKS = 64
+"""Number of new tasks after which finished ones are removed from the list of tasks."""
 
 
 class KilledError(BaseException):
-    """End of the calling process."""
+    """End of the calling process by a kill."""
 
 
 class Timeline:
-    """What happens when: events of the world and timers of the processes in it, in order of time.
+    """Events of the world and timers of its processes, in order of time.
 
     Args:
-        dice: Decides which of those that fall due together comes first.
+        dice: Random generator that decides the order of simultaneous events.
     """
 
     def __init__(self, dice: random.Random) -> None:
@@ -53,12 +55,12 @@ class Timeline:
 
 
 class Handle(asyncio.TimerHandle):
-    """A call that is to come, as asyncio's own handles are, which ask three times whether somebody debugs.
+    """Scheduled call. It replaces asyncio's own handle, which checks the debug mode three times and is slower.
 
     Args:
-        callback: What is called.
-        args: With what.
-        context: In which; None: a copy of the present one.
+        callback: Function to call.
+        args: Arguments of the call.
+        context: Context of the call; None: a copy of the present one.
     """
 
     __slots__ = ()
@@ -73,10 +75,10 @@ class Handle(asyncio.TimerHandle):
 
 
 class ProcessLoop(asyncio.AbstractEventLoop):
-    """The event loop of one process. It ends as a process does: at any handle, and nothing of it runs any more.
+    """Event loop of one process. A kill ends it between two handles; none of its code runs afterwards.
 
     Args:
-        timeline: The world's.
+        timeline: Timeline of the world.
     """
 
     def __init__(self, timeline: Timeline) -> None:
@@ -84,7 +86,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         self._ready: deque[Handle] = deque()
         self._readers: dict[int, Handle] = {}
         self._tasks: list[asyncio.Task[Any]] = []
-        self._made = 0
+        self._task_count = 0
         self.alive = True
         self.frozen_until_s = self._frozen_s = 0.0
         self.handles = 0
@@ -110,7 +112,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
     def call_at(self, when: float, callback: Any, *args: Any, context: Any = None) -> Handle:
         handle = Handle(callback, args, context)
         if self.alive:
-            self._timeline.at(max(when, self.frozen_until_s), lambda: self._fall_due(handle))
+            self._timeline.at(max(when, self.frozen_until_s), lambda: self._make_ready(handle))
         return handle
 
     def call_later(self, delay: float, callback: Any, *args: Any, context: Any = None) -> Handle:
@@ -125,9 +127,11 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         if not self.alive:
             coro.close()
             raise KilledError
-        self._made += 1
-        task = asyncio.Task(coro, loop=self, name=name or f"task {self._made}", context=context)
-        self._tasks = [task for task in self._tasks if not task.done()] if self._made % 64 == 0 else self._tasks
+        self._task_count += 1
+        task = asyncio.Task(coro, loop=self, name=name or f"task {self._task_count}", context=context)
+        self._tasks = (
+            [task for task in self._tasks if not task.done()] if self._task_count % CLEAN_UP_TASKS == 0 else self._tasks
+        )
         self._tasks.append(task)
         return task
 
@@ -218,7 +222,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         self.alive = False
         self._ready.clear()
         self._readers.clear()
-        kept, sys.unraisablehook = sys.unraisablehook, lambda _: None
+        original_hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
         try:
             with self._running():
                 for task in self._tasks:
@@ -228,14 +232,14 @@ class ProcessLoop(asyncio.AbstractEventLoop):
                 self._tasks.clear()
                 self._ready.clear()
         finally:
-            sys.unraisablehook = kept
+            sys.unraisablehook = original_hook
 
     def start(self, main: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         """Start the main task."""
         with self._running():
             return self.create_task(main, name="main")
 
-    def _fall_due(self, handle: Handle) -> None:
+    def _make_ready(self, handle: Handle) -> None:
         if self.alive and not handle._cancelled:
             self._ready.append(handle)
 

@@ -26,14 +26,14 @@ def no_rewind() -> Iterator[None]:
 @contextlib.contextmanager
 def no_fsync() -> Iterator[None]:
     """Rename a checkpoint before its bytes are synced."""
-    written = CheckpointFile._write
+    original = CheckpointFile._write
 
     def write(self: CheckpointFile, *arguments: Any) -> None:
-        kept, os.fsync = os.fsync, lambda _: None
+        original_fsync, os.fsync = os.fsync, lambda _: None
         try:
-            written(self, *arguments)
+            original(self, *arguments)
         finally:
-            os.fsync = kept
+            os.fsync = original_fsync
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(CheckpointFile, "_write", write)
@@ -43,10 +43,10 @@ def no_fsync() -> Iterator[None]:
 @contextlib.contextmanager
 def no_sensor_availability() -> Iterator[None]:
     """Do not publish that the sensor is silent."""
-    said = MessageBuilder._sensor
+    original = MessageBuilder._sensor
 
     def sensor(self: MessageBuilder, health: Any) -> Any:
-        return said(self, health.model_copy(update={"sensor_online": True}))
+        return original(self, health.model_copy(update={"sensor_online": True}))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MessageBuilder, "_sensor", sensor)
@@ -54,27 +54,27 @@ def no_sensor_availability() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def no_second_try() -> Iterator[None]:
+def no_retry_after_disk_full() -> Iterator[None]:
     """Do not retry saving the board after a disk error."""
-    asked = BoardCheck._store_board
+    original = BoardCheck._store_board
 
-    def remember(self: BoardCheck, now_s: float) -> None:
+    def store_board(self: BoardCheck, now_s: float) -> None:
         if not self._store_failed:
-            asked(self, now_s)
+            original(self, now_s)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(BoardCheck, "_store_board", remember)
+        patch.setattr(BoardCheck, "_store_board", store_board)
         yield
 
 
 @contextlib.contextmanager
-def board_clock_believed() -> Iterator[None]:
+def no_check_of_board_clock() -> Iterator[None]:
     """Accept a board's clock that runs ahead of the arrivals."""
-    decoded = FrameDecoder._decode
+    original = FrameDecoder._decode
 
     def decode(self: FrameDecoder, *arguments: Any) -> Any:
         self._state["least_late_s"], self._state["period_us"] = -math.inf, 1e12  # no sample counts as early
-        return decoded(self, *arguments)
+        return original(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(FrameDecoder, "_decode", decode)

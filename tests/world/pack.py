@@ -9,6 +9,7 @@ from bms_estimator.simulation.simulated_pack import SimulatedPack
 CELL = load_cell("chen_mora")
 CAPACITY_AH = CELL.cell.capacity_ah
 MIN_S, MAX_S = 20, 400
+"""Range of the duration of a load step [s]."""
 RATES_C = (0.0, 0.0, 0.2, 0.5, 1.0, 2.0, 3.0, -0.3, -1.0)
 """Load levels [C-rate], to be multiplied by the world's factor."""
 LOAD_FACTORS = (0.1, 0.1, 0.2, 1.0)
@@ -16,12 +17,12 @@ LOAD_FACTORS = (0.1, 0.1, 0.2, 1.0)
 
 
 def steps(dice: random.Random) -> Iterator[tuple[float, float]]:
-    """Yield duration [s] and current [A], positive on discharge. Durations are whole seconds, as a board's windows."""
-    greatest = dice.choice(LOAD_FACTORS)
+    """Yield duration [s] and current [A], positive on discharge. Durations are whole seconds, as those of a board's windows."""
+    factor = dice.choice(LOAD_FACTORS)
     while True:
-        yield float(dice.randint(MIN_S, MAX_S)), CAPACITY_AH * greatest * dice.choice(RATES_C)
+        yield float(dice.randint(MIN_S, MAX_S)), CAPACITY_AH * factor * dice.choice(RATES_C)
 
 
 def new_pack(dice: random.Random) -> SimulatedPack:
-    """Return a pack at rest with a random SOC above a fifth."""
+    """Return a pack at rest with a random SOC of 0.2 to 0.95."""
     return SimulatedPack(CELL, steps(dice), soc=dice.uniform(0.2, 0.95))

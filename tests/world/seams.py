@@ -19,7 +19,7 @@ from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 from bms_estimator.model import clock
-from bms_estimator.process import boot_clock as moment
+from bms_estimator.process import boot_clock
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.telemetry import health
 from tests.world.disk import Disk
@@ -29,31 +29,39 @@ PACKAGE = "bms_estimator"
 
 
 class Clocks:
-    """Clocks of the world: a wall clock that may be stepped, two steady clocks, and the boot id."""
+    """Clocks of the world: a wall clock that may be stepped, two steady clocks, and the boot id.
+
+    Attributes:
+        wall_offset_s: Wall clock minus time of the world [s].
+        synchronised: True if the wall clock counts as synchronized.
+        boot: Boot id.
+        boot_s: Time of the world at the last boot [s].
+        suspended_s: Time since the boot that the monotonic clock does not count [s].
+    """
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
         self.wall_offset_s = 1.7e9
         self.synchronised = True
         self.boot = "first"
-        self.booted_s = 0.0
-        self.asleep_s = 0.0
+        self.boot_s = 0.0
+        self.suspended_s = 0.0
 
     def wall(self) -> float:
         return self._now() + self.wall_offset_s
 
     def since_boot(self) -> float:
-        return self._now() - self.booted_s
+        return self._now() - self.boot_s
 
     def monotonic(self) -> float:
-        return self.since_boot() - self.asleep_s
+        return self.since_boot() - self.suspended_s
 
-    def moment(self) -> moment.BootTimestamp:
-        return moment.BootTimestamp(self.wall(), self.synchronised, self.since_boot(), self.boot)
+    def boot_timestamp(self) -> boot_clock.BootTimestamp:
+        return boot_clock.BootTimestamp(self.wall(), self.synchronised, self.since_boot(), self.boot)
 
 
 class _PatchedModule:
-    """Module with some replaced functions."""
+    """Module of the standard library with some replaced functions."""
 
     def __init__(self, module: ModuleType, **functions: Any) -> None:
         self._module = module
@@ -77,12 +85,12 @@ def _cached(function: Callable[..., Any]) -> Callable[..., Any]:
 @contextlib.contextmanager
 def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], disk: Disk) -> Iterator[None]:
     """Replace clocks, random numbers, threads and disk of the package."""
-    instead: dict[int, Any] = {
+    replacements: dict[int, Any] = {
         id(time.time): clocks.wall,
         id(time.monotonic): clocks.monotonic,
         id(time.perf_counter): clocks.monotonic,
         id(clock.since_boot): clocks.since_boot,
-        id(moment.boot_timestamp): clocks.moment,
+        id(boot_clock.boot_timestamp): clocks.boot_timestamp,
         id(random.uniform): dice.uniform,
         id(random.random): dice.random,
         id(ThreadPoolExecutor): lambda *args, **named: threads().executor(*args, **named),
@@ -99,12 +107,12 @@ def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], d
     }  # fmt: skip
     undo: list[Callable[[], None]] = []
     for module in [module for name, module in sys.modules.items() if name.split(".")[0] == PACKAGE]:
-        for name, bound in list(vars(module).items()):
-            if id(bound) in instead:
-                undo.append(lambda module=module, name=name, bound=bound: setattr(module, name, bound))
-                setattr(module, name, instead[id(bound)])
-            for function in _functions(bound, module.__name__):
-                _bind_defaults(function, instead, undo)
+        for name, value in list(vars(module).items()):
+            if id(value) in replacements:
+                undo.append(lambda module=module, name=name, value=value: setattr(module, name, value))
+                setattr(module, name, replacements[id(value)])
+            for function in _functions(value, module.__name__):
+                _bind_defaults(function, replacements, undo)
     for name, constant, seconds in LONGER_INTERVALS:
         module = sys.modules[f"{PACKAGE}.{name}"]
         undo.append(functools.partial(setattr, module, constant, getattr(module, constant)))
@@ -124,22 +132,22 @@ def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], d
             step()
 
 
-def _functions(bound: Any, module: str) -> Iterator[FunctionType]:
-    """Yield the functions of an object of a module."""
-    if isinstance(bound, FunctionType) and bound.__module__ == module:
-        yield bound
-    elif isinstance(bound, type) and bound.__module__ == module:
-        for part in list(vars(bound).values()):
+def _functions(value: Any, module: str) -> Iterator[FunctionType]:
+    """Yield a function, or the functions of a class, defined in ``module``."""
+    if isinstance(value, FunctionType) and value.__module__ == module:
+        yield value
+    elif isinstance(value, type) and value.__module__ == module:
+        for part in list(vars(value).values()):
             if isinstance(part, FunctionType):
                 yield part
 
 
-def _bind_defaults(function: FunctionType, instead: dict[int, Any], undo: list[Callable[[], None]]) -> None:
+def _bind_defaults(function: FunctionType, replacements: dict[int, Any], undo: list[Callable[[], None]]) -> None:
     """Replace default arguments of a function."""
     defaults, named = function.__defaults__, function.__kwdefaults__
-    if defaults and any(id(value) in instead for value in defaults):
+    if defaults and any(id(value) in replacements for value in defaults):
         undo.append(lambda: setattr(function, "__defaults__", defaults))
-        function.__defaults__ = tuple(instead.get(id(value), value) for value in defaults)
-    if named and any(id(value) in instead for value in named.values()):
+        function.__defaults__ = tuple(replacements.get(id(value), value) for value in defaults)
+    if named and any(id(value) in replacements for value in named.values()):
         undo.append(lambda: setattr(function, "__kwdefaults__", named))
-        function.__kwdefaults__ = {name: instead.get(id(value), value) for name, value in named.items()}
+        function.__kwdefaults__ = {name: replacements.get(id(value), value) for name, value in named.items()}

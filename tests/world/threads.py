@@ -1,4 +1,4 @@
-"""Simulated threads: a call runs at once, after a random delay."""
+"""Simulated threads: each call runs as one event after a random delay."""
 
 import random
 from collections import deque
@@ -10,21 +10,21 @@ from tests.world.broker import LateError
 from tests.world.disk import Disk, PowerCutError
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 
-MIN_S, MAX_S = 0.0005, 0.05
+MIN_CALL_S, MAX_CALL_S = 0.0005, 0.05
 """Range of the duration of a call [s]."""
 POLL_S = 1.0
 """Poll interval for a hung disk [s]."""
 
 
 class Threads:
-    """The threads of one process.
+    """Threads of one process.
 
     Args:
         timeline: Timeline of the world.
-        dice: Random durations of calls.
+        dice: Generator of the random delays of calls.
         loop: Loop of the process.
-        disk: Disk that the process's own executors and threads use, and hang with.
-        ended: Called with the exception class if a call has ended the process.
+        disk: Disk that the process's own executors and threads use. They hang while the disk hangs.
+        on_end: Called with the exception class if a call has ended the process.
     """
 
     def __init__(
@@ -33,49 +33,56 @@ class Threads:
         dice: random.Random,
         loop: ProcessLoop,
         disk: Disk,
-        ended: Callable[[type[BaseException]], None],
+        on_end: Callable[[type[BaseException]], None],
     ) -> None:
-        self._timeline, self._dice, self.loop, self._disk, self._ended = timeline, dice, loop, disk, ended
+        self._timeline, self._dice, self.loop, self._disk, self._on_end = timeline, dice, loop, disk, on_end
         loop.threads = _Pool(self)
 
     def executor(self, *_: Any, thread_name_prefix: str = "", **__: Any) -> Executor:
         """Replacement of ``ThreadPoolExecutor`` with one thread."""
-        return _Single(self, thread_name_prefix)
+        return _SingleThread(self, thread_name_prefix)
 
     def thread(self, *, target: Callable[..., Any], args: tuple[Any, ...] = (), **_: Any) -> Any:
         """Replacement of ``Thread``."""
-        single = _Single(self, "")
-        single.start = lambda: single.submit(target, *args)  # type: ignore[attr-defined]
-        return single
+        thread = _SingleThread(self, "")
+        thread.start = lambda: thread.submit(target, *args)  # type: ignore[attr-defined]
+        return thread
 
-    def later(
-        self, call: Callable[[], Any], future: Future[Any], then: Callable[[], None], database: bool | None
+    def schedule(
+        self, call: Callable[[], Any], future: Future[Any], on_done: Callable[[], None], uses_database: bool | None
     ) -> None:
-        """Schedule a call; ``database``: whether it uses a database, None: it does not use the disk."""
-        delay_s = self._dice.uniform(MIN_S, MAX_S)
-        self._timeline.after(delay_s, lambda: self._work(call, future, then, database))
+        """Schedule a call.
 
-    def _work(
-        self, call: Callable[[], Any], future: Future[Any], then: Callable[[], None], database: bool | None
+        Args:
+            call: Function to call.
+            future: Future of its result.
+            on_done: Called after the call.
+            uses_database: True for a call that uses a database, False for another use of the disk, None for no use of it.
+        """
+        delay_s = self._dice.uniform(MIN_CALL_S, MAX_CALL_S)
+        self._timeline.after(delay_s, lambda: self._run(call, future, on_done, uses_database))
+
+    def _run(
+        self, call: Callable[[], Any], future: Future[Any], on_done: Callable[[], None], uses_database: bool | None
     ) -> None:
         if not self.loop.alive:
             return
-        if database is not None and self._disk.hung:
-            self._timeline.after(POLL_S, lambda: self._work(call, future, then, database))
+        if uses_database is not None and self._disk.hung:
+            self._timeline.after(POLL_S, lambda: self._run(call, future, on_done, uses_database))
             return
         try:
-            value = self._disk.transaction(call, self._timeline.now_s) if database else call()
+            value = self._disk.transaction(call, self._timeline.now_s) if uses_database else call()
         except LateError as late:
             error = late.error
             self._timeline.after(late.seconds, lambda: self.loop.alive and _end(future, None, error))
         except (KilledError, PowerCutError) as end:
-            self._ended(type(end))
+            self._on_end(type(end))
             return
         except Exception as error:  # noqa: BLE001 - passed to the caller
             _end(future, None, error)
         else:
             _end(future, value, None)
-        then()
+        on_done()
 
 
 class _Pool(Executor):
@@ -86,37 +93,37 @@ class _Pool(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
         future: Future[Any] = Future()
-        self._threads.later(lambda: fn(*args, **named), future, lambda: None, None)
+        self._threads.schedule(lambda: fn(*args, **named), future, lambda: None, None)
         return future
 
 
-class _Single(Executor):
+class _SingleThread(Executor):
     """Single thread for the disk."""
 
     def __init__(self, threads: Threads, name: str) -> None:
         self._threads, self._is_database = threads, name == "database"
         self._waiting: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
-        self._works = False
+        self._is_busy = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
         if not self._threads.loop.alive:
             raise KilledError
         future: Future[Any] = Future()
         self._waiting.append((lambda: fn(*args, **named), future))
-        if not self._works:
-            self._next()
+        if not self._is_busy:
+            self._start_next()
         return future
 
     def shutdown(self, *_: Any, **__: Any) -> None:
         pass
 
-    def _next(self) -> None:
-        self._works = False
+    def _start_next(self) -> None:
+        self._is_busy = False
         while self._waiting:
             call, future = self._waiting.popleft()
             if future.set_running_or_notify_cancel():
-                self._works = True
-                self._threads.later(call, future, self._next, self._is_database)
+                self._is_busy = True
+                self._threads.schedule(call, future, self._start_next, self._is_database)
                 return
 
 

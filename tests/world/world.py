@@ -29,8 +29,15 @@ from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from tests.world import invariants
 from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError
-from tests.world.faults import CLOCK, Fault, schedule, usual
-from tests.world.invariants import Band, Flowed, InvariantError, PublishedStates, Reference, Truth
+from tests.world.faults import CLOCK_FAULTS, Fault, ordinary_kinds, schedule
+from tests.world.invariants import (
+    AvailabilityCheck,
+    ChargeTotals,
+    InvariantError,
+    PublishedStates,
+    Reference,
+    SocErrors,
+)
 from tests.world.line import Board, Cable
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 from tests.world.pack import CELL, new_pack
@@ -40,19 +47,27 @@ from tests.world.threads import Threads
 NAME = "pack"
 ROOT = f"bms/{NAME}"
 PUBLISH_HZ = 0.1
+"""Publish rate of the service [Hz]."""
 RESOLUTION_V, NOISE_V = 5.0 / 1024, 0.001
 """Resolution and noise of a board that measures the cell without a divider [V]."""
 FAULT_FREE_S = 420.0
 """Duration at the end without faults, after which all invariants must hold [s]."""
 KNOWN_SOC_FRACTION, KNOWN_SOC_STD = 0.5, (0.005, 0.02)
-"""Fraction of worlds with a known initial SOC, and range of its standard deviation. Their SOC intervals are narrow."""
+"""Fraction of worlds with a known initial SOC, and range of its standard deviation. Their SOC intervals are narrow, so that an error is detected."""
 CLOCK_FAULT_FRACTION = 0.5
 """Fraction of worlds with the binary protocol in which the board's clock has faults."""
-SHARED = Path("/dev/shm")
-LAST_LINES = 60
-FORGOTTEN_BY_AIOMQTT = "Future exception was never retrieved: MqttCodeError('Unexpected disconnection')"
-"""Reported by the loop if a connection was made and lost while the process was frozen: aiomqtt drops the exception unread."""
+SHARED_MEMORY = Path("/dev/shm")
+"""File system in memory for the folders of the worlds, if it exists."""
+MAX_LOG_LINES = 60
+"""Number of last lines in the log of a world."""
+UNREAD_BY_AIOMQTT = "Future exception was never retrieved: MqttCodeError('Unexpected disconnection')"
+"""Exception that aiomqtt never reads if a connection is opened and lost while the process is frozen."""
 BOOT_S = 5.0
+"""Time from the return of the power until the service starts [s]."""
+STALE_S = 2.0
+"""Time without a sample after which the sensor counts as silent [s]."""
+DECODE_S = 0.05
+"""Time for the service to decode delivered bytes [s]."""
 EXPENSIVE_CHECK_S = 5.0
 """Interval of the expensive checks [s]."""
 
@@ -63,11 +78,12 @@ class Result:
 
     seed: int
     seconds: float
-    wrong: str = ""
+    violation: str = ""
+    """First violation of an invariant, with its time; empty: none."""
     digest: str = ""
     """Digest of all published messages and their times."""
     log: list[str] = field(default_factory=list)
-    band: Band = field(default_factory=Band)
+    soc_errors: SocErrors = field(default_factory=SocErrors)
     figures: dict[str, float] = field(default_factory=dict)
 
 
@@ -89,6 +105,7 @@ class Process:
     """One run of the service."""
 
     number: int
+    """Number of the run, from 1."""
     loop: ProcessLoop
     stop: asyncio.Event
     main: asyncio.Task[Any] | None = None
@@ -96,16 +113,18 @@ class Process:
     snapshot: Snapshot | None = None
     reference: Reference = field(default_factory=Reference)
     delivered_s: float = 0.0
+    """Time of the last delivery of bytes from the board [s]."""
     delivered_bytes: int = 0
-    heard_s: float = 0.0
+    last_sample_s: float = 0.0
     """Time at which the last delivered valid sample was sent [s]."""
     withheld: int = 0
+    """Number of samples that waited for a hello at the last check."""
     first_ahead_s: float | None = None
     """First lead of the samples' clock over the true time since ``thawed_s`` [s]; None: not measured yet."""
     thawed_s: float = 0.0
     """End of the last freeze [s]. Data that arrived meanwhile are late."""
-    foreign: bool = False
-    """True if it has received bytes of another board."""
+    foreign_bytes: bool = False
+    """True if it may have received bytes of another board, so that its samples are not counted."""
     disk_failed: bool = False
     """True if its published charge and energy may not be on disk."""
 
@@ -130,49 +149,49 @@ class World:
         self.clocks = Clocks(lambda: self.timeline.now_s)
         self.pack = new_pack(self.dice["pack"])
         self.settings = self._draw_settings(dice)
-        self.folder = Path(tempfile.mkdtemp(prefix="bms-world-", dir=SHARED if SHARED.is_dir() else None))
+        self.folder = Path(tempfile.mkdtemp(prefix="bms-world-", dir=SHARED_MEMORY if SHARED_MEMORY.is_dir() else None))
         self._path = str(self.folder).encode()
         self.disk = Disk(self.folder / "state", self.dice["disk"])
-        self.cable = Cable(self.folder / "dev", self.timeline, self.dice["cable"], self._readable)
-        self.cable.delivered = self._delivered
-        self.broker = Broker(self.timeline, self.dice["broker"], self._received)
-        self.broker.knows_five = dice.random() < 0.8
+        self.cable = Cable(self.folder / "dev", self.timeline, self.dice["cable"], self._on_readable)
+        self.cable.on_delivered = self._on_delivered
+        self.broker = Broker(self.timeline, self.dice["broker"], self._on_received)
+        self.broker.supports_mqtt5 = dice.random() < 0.8
         text = self.settings.sensor.protocol == "text"
         first_rate_hz = dice.choice((1, 10, 100))
         self.board = Board(
             dice.randrange(1, 1 << 32), BoardParts(divider=1.0), self.dice["board"], text=text,
             first_rate_hz=1 if text else first_rate_hz,
         )  # fmt: skip
-        self.foreigner = Board(
+        self.foreign_board = Board(
             dice.randrange(1, 1 << 32), BoardParts(divider=1.08), self.dice["board"], text=text, first_rate_hz=1
         )
         self.cable.resets_when_opened = dice.random() < 0.7
         self.port_name = "ttyACM0"
         self.cable.plug(self.board, self.port_name)
-        self.seen_soc = self.pack.soc
+        self.sampled_soc = self.pack.soc
         self.sampled_s = 0.0
         self.powered = True
         self.process: Process | None = None
         self.runs = 0
         self.kill_after: int | None = None
         self.threads: Threads | None = None
-        self.disk_good_s = 0.0
-        self.said, self.band, self.flowed = PublishedStates(), Band(), Flowed()
-        self.online = Truth(ONLINE_S)
-        self.sensor_online = Truth(SENSOR_ONLINE_S)
+        self.disk_usable_s = 0.0
+        self.published, self.soc_errors, self.charge_totals = PublishedStates(), SocErrors(), ChargeTotals()
+        self.online = AvailabilityCheck(MAX_ONLINE_DELAY_S)
+        self.sensor_online = AvailabilityCheck(MAX_SENSOR_ONLINE_DELAY_S)
         self.will_certain = True
         self._digest = hashlib.sha256()
-        self.log: deque[str] = deque(maxlen=LAST_LINES)
+        self.log: deque[str] = deque(maxlen=MAX_LOG_LINES)
         self.figures: dict[str, float] = {"handles": 0, "runs": 0, "states": 0}
         self.faults = self._draw_faults(seconds - FAULT_FREE_S, text=text) if faults is None else faults
-        self.say_lines = False
+        self.log_messages = False
 
     def _draw_faults(self, until_s: float, *, text: bool) -> list[Fault]:
         """Draw the faults of the world, in some worlds also of the board's clock."""
-        drawn = schedule(self.dice["drawn"], until_s, usual(auto=self.auto, text=text))
+        faults = schedule(self.dice["drawn"], until_s, ordinary_kinds(auto=self.auto, text=text))
         clock = random.Random(f"{self.seed} clock")
-        wrong = not text and clock.random() < CLOCK_FAULT_FRACTION
-        return drawn + schedule(clock, until_s, CLOCK) if wrong else drawn
+        has_clock_faults = not text and clock.random() < CLOCK_FAULT_FRACTION
+        return faults + schedule(clock, until_s, CLOCK_FAULTS) if has_clock_faults else faults
 
     def _draw_settings(self, dice: random.Random) -> Settings:
         text = dice.random() < 0.2
@@ -182,8 +201,8 @@ class World:
         known = random.Random(f"{self.seed} known")
         if known.random() < KNOWN_SOC_FRACTION:
             std = known.uniform(*KNOWN_SOC_STD)
-            told = min(max(known.gauss(self.pack.soc, std), 0.0), 1.0)
-            pack, identifier = pack.model_copy(update={"initial_soc": told}), IdentifierSettings(soc_std=std)
+            initial_soc = min(max(known.gauss(self.pack.soc, std), 0.0), 1.0)
+            pack, identifier = pack.model_copy(update={"initial_soc": initial_soc}), IdentifierSettings(soc_std=std)
         return Settings(
             pack=pack,
             identifier=identifier,
@@ -204,44 +223,44 @@ class World:
             port = str(self.cable.folder / self.port_name)
             sensor = self.settings.sensor.model_copy(update={"port": port})
             self.settings = self.settings.model_copy(update={"sensor": sensor})
-        wrong = ""
+        violation = ""
         with contextlib.ExitStack() as stack:
             stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
             stack.enter_context(seams(self.clocks, self.dice["service"], self._present_threads, self.disk))
             stack.enter_context(self.disk.installed())
             stack.enter_context(self.cable.installed())
             stack.enter_context(self.broker.installed())
-            stack.enter_context(self._log_kept())
-            stack.enter_context(self._board_seen())
-            stack.enter_context(self._checkpoint_seen())
+            stack.enter_context(self._record_log())
+            stack.enter_context(self._track_board())
+            stack.enter_context(self._check_checkpoints())
             stack.callback(self.end_process, silently=False)
             try:
-                self._live()
+                self._run_events()
             except InvariantError as error:
-                wrong = f"at {self.timeline.now_s:.3f} s: {error}"
+                violation = f"at {self.timeline.now_s:.3f} s: {error}"
             except (Exception, KilledError, PowerCutError) as error:  # noqa: BLE001 - any error is a result of the seed
-                wrong = f"at {self.timeline.now_s:.3f} s: the simulation: {error!r}"
-        return self._result(wrong)
+                violation = f"at {self.timeline.now_s:.3f} s: the simulation: {error!r}"
+        return self._result(violation)
 
-    def _result(self, wrong: str) -> Result:
+    def _result(self, violation: str) -> Result:
         self.figures |= {
-            "online_s": self.online.longest_s,
-            "sensor_online_s": self.sensor_online.longest_s,
-            "doubled": self.said.doubled,
-            "forgotten": self.said.forgotten,
+            "online_s": self.online.max_delay_s,
+            "sensor_online_s": self.sensor_online.max_delay_s,
+            "doubled": self.published.doubled,
+            "forgotten": self.published.lost_at_kill,
             "faults": len(self.faults),
             "runs": self.runs,
         }
         digest = self._digest.hexdigest()[:16]
-        return Result(self.seed, self.timeline.now_s, wrong, digest, list(self.log), self.band, self.figures)
+        return Result(self.seed, self.timeline.now_s, violation, digest, list(self.log), self.soc_errors, self.figures)
 
-    def _live(self) -> None:
-        self._tick_board()
-        self._look()
+    def _run_events(self) -> None:
+        self._sample_board()
+        self._check_invariants()
         self.start_process()
         for fault in self.faults:
-            self.timeline.at(fault.at_s, lambda fault=fault: self._apply_fault(fault))
-        self.timeline.at(self.seconds - FAULT_FREE_S, self._calm)
+            self.timeline.at(fault.begin_s, lambda fault=fault: self._apply_fault(fault))
+        self.timeline.at(self.seconds - FAULT_FREE_S, self._disarm_faults)
         while self.timeline.now_s < self.seconds:
             process = self.process
             if process is not None and process.loop.busy:
@@ -250,9 +269,9 @@ class World:
                 self.timeline.step()
         self._check_end()
 
-    def _calm(self) -> None:
+    def _disarm_faults(self) -> None:
         """Disarm faults that wait for the next write or handle."""
-        self.disk.arm = self.kill_after = None
+        self.disk.armed_fault = self.kill_after = None
 
     def _step(self, process: Process) -> None:
         """Run one handle of the service, or kill it if that is due."""
@@ -264,12 +283,12 @@ class World:
                 self.end_process(silently=False)
                 return
         process.loop.step()
-        if process.loop.faults and (faults := [one for one in process.loop.faults if one != FORGOTTEN_BY_AIOMQTT]):
+        if process.loop.faults and (faults := [text for text in process.loop.faults if text != UNREAD_BY_AIOMQTT]):
             self.fail(f"uncaught exception: {faults[0]}")
         if process.main is not None and process.main.done():
-            self._ended(process)
+            self._on_process_end(process)
 
-    def _ended(self, process: Process) -> None:
+    def _on_process_end(self, process: Process) -> None:
         """Handle the end of the service: fail if it ended with an error."""
         error = None if process.main is None or process.main.cancelled() else process.main.exception()
         if isinstance(error, InvariantError):
@@ -279,13 +298,13 @@ class World:
         self.note("ended in good order")
         self.end_process(silently=False)
 
-    def _forgotten_s(self, *, clean: bool, silently: bool) -> float:
+    def _survival_age_s(self, *, clean: bool, silently: bool) -> float:
         """Return the age beyond which sent and received messages survive the end of the process [s]."""
-        if self.disk.bad or self.timeline.now_s < self.disk_good_s + (POWER_S if silently else 0.0):
+        if self.disk.is_faulty or self.timeline.now_s < self.disk_usable_s + (POWER_LOSS_S if silently else 0.0):
             return math.inf
-        return POWER_S if silently else 0.0 if clean else KILL_S
+        return POWER_LOSS_S if silently else 0.0 if clean else KILL_LOSS_S
 
-    def _ended_in_thread(self, how: type[BaseException]) -> None:
+    def _on_end_in_thread(self, how: type[BaseException]) -> None:
         """Handle a kill or a power cut during a write."""
         self.note(f"{how.__name__} at a write")
         if how is PowerCutError:
@@ -305,7 +324,7 @@ class World:
         self.runs += 1
         loop = ProcessLoop(self.timeline)
         process = Process(self.runs, loop, asyncio.Event())
-        self.threads = Threads(self.timeline, self.dice["threads"], loop, self.disk, self._ended_in_thread)
+        self.threads = Threads(self.timeline, self.dice["threads"], loop, self.disk, self._on_end_in_thread)
         self.process = process
         self.broker.loop = loop
         self.note(f"start {self.runs}")
@@ -313,7 +332,7 @@ class World:
             service.run_pack_service(
                 self.settings,
                 CELL,
-                sinks=[Probe(lambda snapshot: self._published(process, snapshot))],
+                sinks=[Probe(lambda snapshot: self._on_published(process, snapshot))],
                 stop=process.stop,
                 folder=self.disk.folder,
             )
@@ -325,16 +344,18 @@ class World:
         if process is None:
             return
         clean = process.main is not None and process.main.done()
-        self.said.end(process.number, process.loop.ran_until_s, self._forgotten_s(clean=clean, silently=silently))
+        self.published.end(
+            process.number, process.loop.ran_until_s, self._survival_age_s(clean=clean, silently=silently)
+        )
         self.figures["handles"] += process.loop.handles
         self.kill_after = None
-        self.disk.arm = None
+        self.disk.armed_fault = None
         self.broker.loop = None
         known = any(c.loop is process.loop and c.broker_open and c.accepted for c in self.broker.connections)
         self.will_certain = known or self.broker.retained.get(f"{ROOT}/availability") in (None, b"offline")
         process.loop.kill()
         self.disk.end_process()
-        self.cable.forget()
+        self.cable.close_all()
         self.broker.process_ended(process.loop, silently=silently)
         self.timeline.after(min(self.dice["faults"].expovariate(1.0 / 20.0) + 0.2, 300.0), self.start_process)
 
@@ -343,90 +364,90 @@ class World:
         self.note("power cut")
         self.powered = False
         self.end_process(silently=True)
-        self.disk.cut(self.timeline.now_s)
+        self.disk.cut_power(self.timeline.now_s)
 
-        def back() -> None:
+        def restore_power() -> None:
             self.powered = True
             self.clocks.boot = f"boot {self.timeline.now_s}"
-            self.clocks.booted_s = self.timeline.now_s
+            self.clocks.boot_s = self.timeline.now_s
             self.board.reset()
             self.note("power back")
             self.timeline.after(BOOT_S, self.start_process)
 
-        self.timeline.after(off_s, back)
+        self.timeline.after(off_s, restore_power)
 
     # the board
 
-    def _tick_board(self) -> None:
+    def _sample_board(self) -> None:
         """Let the board measure and send a sample, and schedule the next one."""
         board = self.cable.board or self.board
         now_s = self.timeline.now_s
         reading = self.pack(now_s)
         if self.powered and board.has_measured:
             sent = board.sample(reading)
-            if self.cable.board is not None and self.cable.opening is not None and not self.cable.noise.mute:
+            if self.cable.board is not None and self.cable.open_port is not None and not self.cable.noise.mute:
                 if board is self.board:
-                    self.seen_soc, self.sampled_s = self.pack.soc, now_s
+                    self.sampled_soc, self.sampled_s = self.pack.soc, now_s
                 self.cable.send(sent)
         board.begin_window()
-        self.timeline.after(board.period_s, self._tick_board)
+        self.timeline.after(board.period_s, self._sample_board)
 
-    def _readable(self, descriptor: int) -> None:
+    def _on_readable(self, descriptor: int) -> None:
         if self.process is not None:
             self.process.loop.readable(descriptor)
 
-    def _delivered(self, data: bytes) -> None:
+    def _on_delivered(self, data: bytes) -> None:
         if self.process is not None:
             board = self.process.board
             no_room = (
                 board is not None and len(board._board_check._pending) == MAX_PENDING_READS
             )  # samples beyond this limit are not counted
-            self.process.foreign |= no_room or self.cable.board is self.foreigner
+            self.process.foreign_bytes |= no_room or self.cable.board is self.foreign_board
             if not self.board.text and self.process.reference.feed(data):
-                self.process.heard_s = self.sampled_s
+                self.process.last_sample_s = self.sampled_s
             self.process.delivered_s = self.timeline.now_s
             self.process.delivered_bytes += len(data)
 
     # messages of the service
 
-    def _published(self, process: Process, snapshot: Snapshot) -> None:
+    def _on_published(self, process: Process, snapshot: Snapshot) -> None:
         """Check a snapshot of the service."""
         process.snapshot = snapshot
         if snapshot.estimate is None:
             return
-        said = snapshot.estimate.model_dump_json().encode()
-        self.said.say(said, process.number, self.timeline.now_s, disk_failed=self._disk_fails)
+        payload = snapshot.estimate.model_dump_json().encode()
+        self.published.record(payload, process.number, self.timeline.now_s, disk_failed=self._disk_fails)
         self.figures["states"] += 1
         process.disk_failed |= self._disk_fails
-        if wrong := self.flowed.take(snapshot.estimate, kept=not process.disk_failed):
-            self.fail(wrong)
-        behind = self._reads(process) > 0  # after a freeze the state is older than the waiting samples
-        if not behind and (wrong := self.band.take(snapshot, self.seen_soc)):
-            self.fail(wrong)
+        if violation := self.charge_totals.check(snapshot.estimate, saved=not process.disk_failed):
+            self.fail(violation)
+        behind = self._waiting_reads(process) > 0  # after a freeze the state is older than the waiting samples
+        if not behind and (violation := self.soc_errors.check(snapshot, self.sampled_soc)):
+            self.fail(violation)
         self._check_time(process, snapshot.estimate.board_time_s)
 
-    def _received(self, packet: Packet, connection: Connection | None) -> None:
+    def _on_received(self, packet: Packet, connection: Connection | None) -> None:
         """Check a message that reached the broker."""
         self._digest.update(f"{self.timeline.now_s:.9f} {packet.topic}".encode())
         self._digest.update(packet.payload.replace(self._path, b"."))
-        if self.say_lines:
+        if self.log_messages:
             self.note(f"broker: {packet.topic} {packet.payload[:60]!r}")
         if connection is not None and packet.payload[:1] == b"{" and not invariants.is_json(packet.payload):
             self.fail(f"{packet.topic} is no strict JSON: {packet.payload[:200]!r}")
-        if packet.topic == f"{ROOT}/state" and (wrong := self._take_state(packet, connection)):
-            self.fail(wrong)
+        if packet.topic == f"{ROOT}/state" and (violation := self._check_state(packet, connection)):
+            self.fail(violation)
 
-    def _take_state(self, packet: Packet, connection: Connection | None) -> str:
-        return self.said.take(packet, connection, in_order=not self._disk_fails)
+    def _check_state(self, packet: Packet, connection: Connection | None) -> str:
+        return self.published.check_received(packet, connection, in_order=not self._disk_fails)
 
     @property
     def _disk_fails(self) -> bool:
         """True if the disk is faulty, or was until recently."""
-        return self.disk.bad or self.timeline.now_s < self.disk_good_s
+        return self.disk.is_faulty or self.timeline.now_s < self.disk_usable_s
 
     # invariants
 
-    def _look(self) -> None:
+    def _check_invariants(self) -> None:
         """Check the invariants; called once a second."""
         now_s = self.timeline.now_s
         process = self.process
@@ -436,57 +457,61 @@ class World:
             self._check_memory(process)
             self._check_board(process)
         self._check_availability(now_s)
-        if self.disk.bad:
-            self.disk_good_s = now_s + RETRY_S
-        self.timeline.after(1.0, self._look)
+        if self.disk.is_faulty:
+            self.disk_usable_s = now_s + DISK_RETRY_S
+        self.timeline.after(1.0, self._check_invariants)
 
     def _check_counts(self, process: Process) -> None:
         """Check that each byte was decoded or counted, and each valid sample used, or dropped and counted."""
         if process.board is None:
             return
-        door, counters = process.board._board_check, process.board.counters
-        held = door.pending_protocol is not None
-        if self.timeline.now_s - process.delivered_s <= 0.05 or self._reads(process):
+        board_check, counters = process.board._board_check, process.board.counters
+        pending = board_check.pending_protocol is not None
+        if self.timeline.now_s - process.delivered_s <= DECODE_S or self._waiting_reads(process):
             return
-        given = counters["bytes_received"] + counters["rejected_bytes"] + sum(len(data) for _, data in door._pending)
-        if given != process.delivered_bytes:
-            self.fail(f"{process.delivered_bytes} bytes came, {given} are counted: {counters}")
-        if self.settings.sensor.protocol == "binary" and not process.foreign:
-            taken = sum(counters[name] for name in ("frames_received", "duplicates", "out_of_order", "before_hello"))
-            if taken != process.reference.samples and not held:
-                self.fail(f"{process.reference.samples} samples came, {taken} are counted: {counters}")
+        counted = (
+            counters["bytes_received"]
+            + counters["unadmitted_bytes"]
+            + sum(len(data) for _, data in board_check._pending)
+        )
+        if counted != process.delivered_bytes:
+            self.fail(f"{process.delivered_bytes} bytes came, {counted} are counted: {counters}")
+        if self.settings.sensor.protocol == "binary" and not process.foreign_bytes:
+            counted = sum(counters[name] for name in ("frames_received", "duplicates", "out_of_order", "before_hello"))
+            if counted != process.reference.samples and not pending:
+                self.fail(f"{process.reference.samples} samples came, {counted} are counted: {counters}")
 
-    def _reopened(self, process: Process, door: BoardCheck, opened: Callable[[], None]) -> None:
+    def _discount_samples(self, process: Process, board_check: BoardCheck, opened: Callable[[], None]) -> None:
         """Discount the samples of a port that was lost before its board was identified."""
-        if door.pending_protocol is not None:
-            nobodys = Reference()
-            nobodys.feed(b"".join(data for _, data in door._pending))
-            process.reference.samples -= nobodys.samples
+        if board_check.pending_protocol is not None:
+            unidentified = Reference()
+            unidentified.feed(b"".join(data for _, data in board_check._pending))
+            process.reference.samples -= unidentified.samples
         opened()
 
     def _check_board(self, process: Process) -> None:
         """Check that the used samples are from the pack's own board."""
         if process.board is None:
             return
-        taken = process.board.board.get("serial")
-        if taken == f"{self.foreigner.serial_number:08x}":
-            self.fail(f"board {taken} is taken for the pack's")
+        serial = process.board.board.get("serial")
+        if serial == f"{self.foreign_board.serial_number:08x}":
+            self.fail(f"board {serial} is used as the pack's")
 
     def _check_time(self, process: Process, time_s: float) -> None:
         """Check that the samples' clock does not run ahead. Skipped while samples are withheld, because the state is then older."""
         before, process.withheld = process.withheld, process.board.counters.get("before_hello", 0)
         if process.withheld != before:
             return
-        ahead_s = time_s - (self.sampled_s if self.board.text else process.heard_s)
+        ahead_s = time_s - (self.sampled_s if self.board.text else process.last_sample_s)
         thawed_s = process.loop.frozen_until_s
         if self.timeline.now_s - thawed_s <= THAW_S:
             return
         if process.first_ahead_s is None or process.thawed_s != thawed_s:
             process.first_ahead_s, process.thawed_s = ahead_s, thawed_s
-        if ahead_s > process.first_ahead_s + AHEAD_S:
+        if ahead_s > process.first_ahead_s + MAX_LEAD_S:
             self.fail(f"{ahead_s - process.first_ahead_s:.1f} s too much are counted")
 
-    def _reads(self, process: Process) -> int:
+    def _waiting_reads(self, process: Process) -> int:
         return int(process.board._port._chunks.qsize())
 
     def _check_memory(self, process: Process) -> None:
@@ -496,30 +521,35 @@ class World:
             self.fail(f"{tasks} tasks")
         if process.loop.waiting > invariants.MAX_READY:
             self.fail(f"{process.loop.waiting} handles wait")
-        if process.board is not None and self._reads(process) > invariants.MAX_READS:
-            self.fail(f"{self._reads(process)} reads wait")
+        if process.board is not None and self._waiting_reads(process) > invariants.MAX_READS:
+            self.fail(f"{self._waiting_reads(process)} reads wait")
 
     def _check_availability(self, now_s: float) -> None:
         """Check the retained availability messages."""
         broker, process = self.broker, self.process
-        can_tell = broker.up and broker.reachable and now_s >= broker.frozen_until_s
+        broker_responds = broker.up and broker.reachable and now_s >= broker.frozen_until_s
         truth = None
-        if can_tell and process is not None and now_s >= process.loop.frozen_until_s and not process.stop.is_set():
+        if (
+            broker_responds
+            and process is not None
+            and now_s >= process.loop.frozen_until_s
+            and not process.stop.is_set()
+        ):
             truth = "online"
-        elif can_tell and process is None and self.will_certain:
+        elif broker_responds and process is None and self.will_certain:
             truth = "offline"
         retained = broker.retained.get
-        if wrong := self.online.check(truth, invariants.text(retained(f"{ROOT}/availability")), now_s):
-            self.fail(f"availability: {wrong}")
+        if violation := self.online.check(truth, invariants.decode_text(retained(f"{ROOT}/availability")), now_s):
+            self.fail(f"availability: {violation}")
         if truth == "online":
             silent_s = now_s - self.sampled_s
-            truth = "online" if silent_s < 2.0 else "offline"
+            truth = "online" if silent_s < STALE_S else "offline"
         else:
             truth = None
-        noisy = self.cable.noise.flip or self.cable.noise.lose or (process is not None and process.foreign)
-        told = invariants.text(retained(f"{ROOT}/sensor/availability"))
-        if wrong := self.sensor_online.check(None if noisy else truth, told, now_s):
-            self.fail(f"sensor availability: {wrong}")
+        noisy = self.cable.noise.flip or self.cable.noise.lose or (process is not None and process.foreign_bytes)
+        sensor_availability = invariants.decode_text(retained(f"{ROOT}/sensor/availability"))
+        if violation := self.sensor_online.check(None if noisy else truth, sensor_availability, now_s):
+            self.fail(f"sensor availability: {violation}")
 
     def _check_end(self) -> None:
         """Check the end state after the time without faults."""
@@ -527,19 +557,19 @@ class World:
         if process is None:
             self.fail("the service does not run")
         if process is not None and process.board is not None and (serial := process.board.board.get("serial")):
-            remembered = KnownBoardFile(self.disk.folder, NAME).load().get("serial")
-            if remembered != serial:
-                self.fail(f"board {serial} is not remembered, but {remembered}")
-        if lost := self.said.lost(self.timeline.now_s):
+            stored_serial = KnownBoardFile(self.disk.folder, NAME).load().get("serial")
+            if stored_serial != serial:
+                self.fail(f"board {serial} is not remembered, but {stored_serial}")
+        if lost := self.published.lost(self.timeline.now_s):
             self.fail(f"the broker never got the states {lost}")
 
-    def fail(self, wrong: str) -> None:
+    def fail(self, violation: str) -> None:
         """Report a violated invariant.
 
         Raises:
             InvariantError: Always. If the service catches it, it is raised again when the service has ended.
         """
-        raise InvariantError(wrong)
+        raise InvariantError(violation)
 
     # faults
 
@@ -547,78 +577,78 @@ class World:
         self.note(f"fault: {fault}")
         fault.apply(self)
 
-    # the rest
+    # log and access to the service
 
     def note(self, line: str) -> None:
         """Add a line to the log of the world."""
         self.log.append(f"{self.timeline.now_s:10.3f} {line}")
 
     @contextlib.contextmanager
-    def _log_kept(self) -> Iterator[None]:
+    def _record_log(self) -> Iterator[None]:
         """Add the service's log lines to the log of the world."""
-        kept = structlog.get_config()
+        original = structlog.get_config()
 
-        def keep(_: Any, level: str, event: dict[str, Any]) -> str:
+        def record(_: Any, level: str, event: dict[str, Any]) -> str:
             text = " ".join(f"{name}={value}" for name, value in event.items() if name != "event")
             self.note(f"  {level}: {event.get('event')} {text}"[:300])
             raise structlog.DropEvent
 
-        structlog.configure(processors=[keep])
+        structlog.configure(processors=[record])
         try:
             yield
         finally:
-            structlog.configure(**kept)
+            structlog.configure(**original)
 
     @contextlib.contextmanager
-    def _checkpoint_seen(self) -> Iterator[None]:
+    def _check_checkpoints(self) -> Iterator[None]:
         """Check that no checkpoint is rejected at a start."""
         load = CheckpointFile.load
 
-        def loaded(file: CheckpointFile) -> CheckpointContent:
-            found = load(file)
-            if found.reason.startswith(REJECTED):
-                self.fail(f"the checkpoint is {found.reason}")
-            return found
+        def load_and_check(file: CheckpointFile) -> CheckpointContent:
+            content = load(file)
+            if content.reason.startswith(REJECTED):
+                self.fail(f"the checkpoint is {content.reason}")
+            return content
 
-        CheckpointFile.load = loaded
+        CheckpointFile.load = load_and_check
         try:
             yield
         finally:
             CheckpointFile.load = load
 
     @contextlib.contextmanager
-    def _board_seen(self) -> Iterator[None]:
-        """Give the world access to the service's source and its counters."""
-        made = service.SerialSource
+    def _track_board(self) -> Iterator[None]:
+        """Store the service's source in the process, so that the checks can read its counters."""
+        original = service.SerialSource
 
         def make(*arguments: Any, **named: Any) -> Any:
-            board = made(*arguments, **named)
+            source = original(*arguments, **named)
             if self.process is not None:
-                self.process.board = board
-                board._board_check.on_port_opened = partial(
-                    self._reopened, self.process, board._board_check, board._board_check.on_port_opened
+                self.process.board = source
+                source._board_check.on_port_opened = partial(
+                    self._discount_samples, self.process, source._board_check, source._board_check.on_port_opened
                 )
-            return board
+            return source
 
         service.SerialSource = make
         try:
             yield
         finally:
-            service.SerialSource = made
+            service.SerialSource = original
 
 
-KILL_S = 6.0
+KILL_LOSS_S = 6.0
 """Messages of this time before a kill may be lost or repeated [s]: the queue is written each second, but only after 3 s without an
 acknowledgment while the broker is connected."""
-POWER_S = 37.0
+POWER_LOSS_S = 37.0
 """Messages of this time before a power cut may be lost or repeated [s]: the database is synced within half a minute."""
-AHEAD_S = 3.0
+MAX_LEAD_S = 3.0
 """Maximum lead that the samples' clock may gain [s]: the service accepts a jump of the board's clock by less than 2 s."""
 THAW_S = 15.0
 """Time after a freeze in which states may be old [s]. A board reset during the freeze cannot be distinguished from an outage."""
-RETRY_S = 25.0
+DISK_RETRY_S = 25.0
 """Maximum time from the end of a disk fault until the disk is used again [s]: 10 s timeout of a hung call, 10 s until the next."""
-ONLINE_S = 45.0
+MAX_ONLINE_DELAY_S = 45.0
 """Maximum time until the retained availability is correct [s], once the broker can receive it."""
-SENSOR_ONLINE_S = 50.0
+MAX_SENSOR_ONLINE_DELAY_S = 50.0
 """Maximum time until the sensor's retained availability is correct [s]: samples count as missing after three publish periods of 10 s."""

@@ -104,7 +104,7 @@ class SerialSource:
         """Counters of the decoder, the board check and the tap, and the number of ``reconnects``."""
         counters = {
             **self._decoder.counters,
-            "rejected_bytes": self._board_check.rejected_bytes,
+            "unadmitted_bytes": self._board_check.rejected_bytes,
             "reconnects": max(self._port.openings - 1, 0),
         }
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}

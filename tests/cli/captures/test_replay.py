@@ -1,4 +1,4 @@
-"""``replay``: its summary, its table, and its errors for unusable files."""
+"""``replay``: summary, table of estimates, and errors of unusable files."""
 
 import csv
 import gzip
@@ -50,6 +50,7 @@ COLUMNS = [
     "tau_tl_s",
 ]
 SAMPLES = 600
+"""Number of samples of the capture, at 1 Hz."""
 
 
 @pytest.fixture
@@ -124,18 +125,18 @@ def test_csv_and_parquet_are_equal_bit_for_bit(capture, tmp_path, capsys):
 
 
 def test_replay_starts_at_the_given_soc(capture, capsys):
-    started = []
+    initial_socs = []
     for soc in ("0.3", "0.7"):
         code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", soc, "--json")
         assert code == 0
-        started.append(json.loads(out)["soc_initial"])
-    assert started == pytest.approx([0.3, 0.7], abs=0.15)  # the first voltage corrects the SOC
+        initial_socs.append(json.loads(out)["soc_initial"])
+    assert initial_socs == pytest.approx([0.3, 0.7], abs=0.15)  # the first voltage corrects the SOC
     code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", "1.5")
     assert code == 2
     assert "'--soc'" in err
 
 
-def test_table_shows_the_summary(capture, capsys):
+def test_summary_is_printed_as_a_table(capture, capsys):
     code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650")
     assert code == 0
     assert "small.csv" in out
@@ -152,7 +153,7 @@ def test_user_errors_end_with_code_2(capture, tmp_path, capsys):
     missing, other = tmp_path / "missing.csv", tmp_path / "other.csv"
     other.write_text("kept as it is\n")
     cell = ("--cell", "ncr18650")
-    for arguments, named in [
+    for arguments, texts in [
         ((missing, *cell), ["missing.csv: no such file"]),
         ((missing, *cell, "--out", other, "--force"), ["missing.csv: no such file"]),
         ((capture, *cell, "--out", other), ["other.csv: exists already; --force replaces it"]),
@@ -170,17 +171,17 @@ def test_user_errors_end_with_code_2(capture, tmp_path, capsys):
     ]:
         code, out, err = run(capsys, "replay", *arguments)
         assert (code, out) == (2, ""), arguments
-        assert [name for name in named if name not in err] == [], err
+        assert [name for name in texts if name not in err] == [], err
         assert "Traceback" not in err
     assert other.read_text() == "kept as it is\n"
 
 
-@pytest.mark.parametrize("given", ["option", "pack", "option over pack"])
-def test_generic_cell_has_the_given_capacity(given, capture, tmp_path, capsys):
+@pytest.mark.parametrize("capacity_from", ["option", "pack", "option over pack"])
+def test_generic_cell_has_the_given_capacity(capacity_from, capture, tmp_path, capsys):
     pack, out = tmp_path / "pack.toml", tmp_path / "out.csv"
-    in_file = {"pack": "capacity_ah = 3\n", "option over pack": "capacity_ah = 50\n"}.get(given, "")
+    in_file = {"pack": "capacity_ah = 3\n", "option over pack": "capacity_ah = 50\n"}.get(capacity_from, "")
     pack.write_text(f'[pack]\ncell = "nmc"\n{in_file}')
-    option = () if given == "pack" else ("--capacity-ah", "3")
+    option = () if capacity_from == "pack" else ("--capacity-ah", "3")
     assert run(capsys, "replay", capture, "--pack", pack, "--soc", "0.6", *option, "--out", out)[0] == 0
     drawn_ah = columns_of_csv(out)["soc_coulomb"][[0, -1]] @ [3.0, -3.0]
     assert drawn_ah == pytest.approx(SAMPLES / 2 / 3600, rel=0.02)  # 1 A for half of the time
@@ -197,14 +198,14 @@ def test_capture_is_never_overwritten(capture, tmp_path, capsys):
 
 
 def test_truncated_gzip_is_reported(capture, tmp_path, capsys):
-    whole, cut = tmp_path / "whole.csv.gz", tmp_path / "cut.csv.gz"
-    with gzip.open(whole, "wb") as packed, capture.open("rb") as plain:
+    complete, truncated = tmp_path / "complete.csv.gz", tmp_path / "truncated.csv.gz"
+    with gzip.open(complete, "wb") as packed, capture.open("rb") as plain:
         shutil.copyfileobj(plain, packed)
-    cut.write_bytes(whole.read_bytes()[:-20])
-    assert run(capsys, "replay", whole, "--cell", "ncr18650", "--json")[0] == 0
-    code, _, err = run(capsys, "replay", cut, "--cell", "ncr18650", "--json")
+    truncated.write_bytes(complete.read_bytes()[:-20])
+    assert run(capsys, "replay", complete, "--cell", "ncr18650", "--json")[0] == 0
+    code, _, err = run(capsys, "replay", truncated, "--cell", "ncr18650", "--json")
     assert code == 2
-    assert "cut.csv.gz: gzip data damaged or cut short" in err
+    assert "truncated.csv.gz: gzip data damaged or cut short" in err
 
 
 def test_unreadable_capture_does_not_replace_old_estimates(capture, tmp_path, capsys):
@@ -269,16 +270,16 @@ def test_folder_is_rejected_as_capture(tmp_path, capsys):
 def test_replay_equals_estimate_bit_for_bit(data, tmp_path, capsys):
     capture, out = data / "leaf" / "cc_1c.csv.gz", tmp_path / "out.csv"
     assert run(capsys, "replay", capture, "--cell", "leaf", "--soc", 0.2, "--out", out)[0] == 0
-    found = estimate(load_capture(capture), load_cell("leaf"), initial_soc=0.2)
+    trace = estimate(load_capture(capture), load_cell("leaf"), initial_soc=0.2)
     for name, values in columns_of_csv(out).items():
-        assert np.array_equal(values, found[name], equal_nan=True), name
+        assert np.array_equal(values, trace[name], equal_nan=True), name
 
 
-def packed(path):
+def as_gzip(path):
     return gzip.compress(path.read_bytes())
 
 
-def raw(path):
+def as_raw(path):
     """Convert samples to the recording of a board that prints text lines."""
     recorded = path.with_name("small.bms")
     with CaptureWriter(recorded, CaptureHeader(mode="text")) as writer:
@@ -311,7 +312,7 @@ def replay_stdin(monkeypatch, capsys, data, *arguments):
 
 @pytest.mark.parametrize(
     "form",
-    [Path.read_bytes, packed, as_parquet, raw, lambda path: gzip.compress(raw(path))],
+    [Path.read_bytes, as_gzip, as_parquet, as_raw, lambda path: gzip.compress(as_raw(path))],
     ids=["CSV", "CSV.gz", "Parquet", "raw", "raw.gz"],
 )
 def test_capture_from_stdin_equals_that_from_a_file(form, capture, monkeypatch, capsys):
@@ -340,8 +341,8 @@ def test_error_on_stdin_shows_no_path(monkeypatch, capsys):
         assert err.startswith(f"error: {message}")
 
 
-def currents(capsys, out, *arguments):
-    """Return the current in the estimator, with the command line's arguments."""
+def replayed_currents(capsys, out, *arguments):
+    """Replay with these arguments and return the distinct currents in the estimator [A]."""
     code, _, err = run(capsys, "replay", *arguments, "--out", out, "--force")
     assert (code, err) == (0, "")
     return np.unique(columns_of_csv(out)["current_a"]).tolist()
@@ -351,10 +352,10 @@ def test_sign_of_a_table_is_that_of_the_pack_or_the_option(capture, tmp_path, ca
     out, pack = tmp_path / "out.csv", tmp_path / "pack.toml"
     pack.write_text('[sensor]\ncurrent_sign = "charge_positive"\n')
     charge, discharge = (("--current-sign", f"{sign}_positive") for sign in ("charge", "discharge"))
-    assert currents(capsys, out, capture, "--cell", "ncr18650") == [0.0, 1.0]
-    assert currents(capsys, out, capture, "--cell", "ncr18650", *charge) == [-1.0, 0.0]
-    assert currents(capsys, out, capture, "--pack", pack) == [-1.0, 0.0]
-    assert currents(capsys, out, capture, "--pack", pack, *discharge) == [0.0, 1.0]
+    assert replayed_currents(capsys, out, capture, "--cell", "ncr18650") == [0.0, 1.0]
+    assert replayed_currents(capsys, out, capture, "--cell", "ncr18650", *charge) == [-1.0, 0.0]
+    assert replayed_currents(capsys, out, capture, "--pack", pack) == [-1.0, 0.0]
+    assert replayed_currents(capsys, out, capture, "--pack", pack, *discharge) == [0.0, 1.0]
 
 
 def test_battery_data_format_has_its_own_sign(capture, tmp_path, capsys):
@@ -362,8 +363,8 @@ def test_battery_data_format_has_its_own_sign(capture, tmp_path, capsys):
     bdf.write_text(capture.read_text().replace("time_s,current_a,voltage_v", "Test Time / s,Current / A,Voltage / V"))
     for sign in ("charge_positive", "discharge_positive"):
         pack.write_text(f'[sensor]\ncurrent_sign = "{sign}"\n')
-        assert currents(capsys, out, bdf, "--pack", pack) == [-1.0, 0.0]
-    assert currents(capsys, out, bdf, "--pack", pack, "--current-sign", "discharge_positive") == [0.0, 1.0]
+        assert replayed_currents(capsys, out, bdf, "--pack", pack) == [-1.0, 0.0]
+    assert replayed_currents(capsys, out, bdf, "--pack", pack, "--current-sign", "discharge_positive") == [0.0, 1.0]
 
 
 def test_recording_of_another_protocol_is_rejected(tmp_path, capsys):

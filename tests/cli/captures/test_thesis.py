@@ -1,3 +1,5 @@
+"""``thesis``: tables and figures of the report, with their verdicts, and errors of the command."""
+
 import re
 from collections import Counter
 from html.parser import HTMLParser
@@ -12,7 +14,7 @@ from tests.command_line import run
 
 TABLES = [str(n) for n in range(2, 14)]
 FIGURES = [str(n) for n in (*range(3, 9), 10, *range(13, 18), *range(19, 24), *range(26, 40), 41, 42)]
-"""Figure 9 is a block diagram."""
+"""Numbers of the drawn figures. Figure 9 is a block diagram."""
 RELAXATION, SLOW, FAST, STEPS = (
     "cell5_relaxation_c2.csv.gz",
     "cell1_discharge_c4.csv.gz",
@@ -22,27 +24,29 @@ RELAXATION, SLOW, FAST, STEPS = (
 NO_DATA, CONTRADICTED = "no data printed", "contradicted by the thesis's own numbers"
 
 
-class Page(HTMLParser):
+class ReportParser(HTMLParser):
     """Articles of the report: number, title, verdict, headings of the table, number of drawn shapes, reason; and what a
-    browser loads.
+    browser loaded_urls.
     """
 
     def __init__(self, text):
         super().__init__()
-        self.articles, self.loads, self.unclosed = {}, [], []
-        self._here, self._field = None, None
+        self.articles, self.loaded_urls, self.unclosed = {}, [], []
+        self._article, self._field = None, None
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
-        found = dict(attrs)
+        attributes = dict(attrs)
         if tag in ("script", "img", "iframe", "link", "object", "embed", "image", "use"):
-            self.loads += [found[key] for key in ("src", "href", "xlink:href", "data") if found.get(key)]
+            self.loaded_urls += [
+                attributes[key] for key in ("src", "href", "xlink:href", "data") if attributes.get(key)
+            ]
         if tag == "article":
             fields = {"number": "", "title": "", "verdict": "", "reason": "", "heads": [], "rows": 0, "shapes": 0}
-            self._here = self.articles.setdefault(found["id"], fields)
-            assert self._here is fields, f"{found['id']} stands twice"
-        elif self._here is not None:
-            words = (found.get("class") or "").split()
+            self._article = self.articles.setdefault(attributes["id"], fields)
+            assert self._article is fields, f"{attributes['id']} appears twice"
+        elif self._article is not None:
+            words = (attributes.get("class") or "").split()
             if "no" in words:
                 self._field = "number"
             elif "badge" in words:
@@ -50,29 +54,29 @@ class Page(HTMLParser):
             elif "reason" in words:
                 self._field = "reason"
             elif tag == "th":
-                self._here["heads"].append("")
+                self._article["heads"].append("")
                 self._field = "heads"
-            self._here["rows"] += tag == "tr"
-            self._here["shapes"] += tag == "path"
+            self._article["rows"] += tag == "tr"
+            self._article["shapes"] += tag == "path"
 
     def handle_endtag(self, tag):
         if tag == "article":
-            self._here = None
+            self._article = None
         if tag in ("span", "p", "th", "article"):
             self._field = "title" if self._field == "number" else None
 
     def handle_data(self, data):
-        if self._here is None or self._field is None:
+        if self._article is None or self._field is None:
             return
         if self._field == "heads":
-            self._here["heads"][-1] += data
+            self._article["heads"][-1] += data
         else:
-            self._here[self._field] += data
+            self._article[self._field] += data
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """Return the text of the whole report, computed once."""
+def report_text(tmp_path_factory):
+    """Return the HTML text of the report, which is computed once."""
     out = tmp_path_factory.mktemp("thesis")
     with pytest.raises(SystemExit) as ended:
         main(["thesis", "--out", str(out)])
@@ -82,8 +86,8 @@ def whole(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def page(whole):
-    return Page(whole)
+def page(report_text):
+    return ReportParser(report_text)
 
 
 @pytest.mark.thorough
@@ -124,26 +128,28 @@ def test_items_from_unpublished_recordings_are_not_called_reproduced(page):
 
 @pytest.mark.thorough
 def test_a_fit_gives_the_number_of_its_free_parameters(page):
-    fits = {key: found["verdict"] for key, found in page.articles.items() if found["verdict"].startswith("fitted")}
+    fits = {
+        key: article["verdict"] for key, article in page.articles.items() if article["verdict"].startswith("fitted")
+    }
     free = {"table-2": 2, "table-3": 2, "table-5": 8, "table-10": 7}
     assert fits == {key: f"fitted, {count} free parameters" for key, count in free.items()}
 
 
 @pytest.mark.thorough
 def test_items_without_data_are_not_contradicted(page):
-    contradicted = {key for key, found in page.articles.items() if found["verdict"] == CONTRADICTED}
+    contradicted = {key for key, article in page.articles.items() if article["verdict"] == CONTRADICTED}
     assert contradicted == {"table-4", "table-6", "table-7", "table-12", "figure-20"}
-    recordings = [found for found in page.articles.values() if "recordings are not published" in found["reason"]]
-    assert [found["verdict"] for found in recordings].count(NO_DATA) == 17
+    recordings = [article for article in page.articles.values() if "recordings are not published" in article["reason"]]
+    assert [article["verdict"] for article in recordings].count(NO_DATA) == 17
 
 
 @pytest.mark.thorough
-def test_the_report_says_that_only_the_text_was_available(whole):
-    assert "Only the text of the thesis with its numbers and tables was available" in whole
+def test_report_states_that_only_the_text_was_available(report_text):
+    assert "Only the text of the thesis with its numbers and tables was available" in report_text
 
 
 @pytest.mark.thorough
-def test_the_documentation_counts_the_verdicts(page):
+def test_numbers_of_verdicts_agree_with_the_documentation(page):
     text = (Path(__file__).parents[3] / "docs" / "theory" / "thesis.md").read_text(encoding="utf-8")
     verdicts = [item["verdict"].partition(",")[0] for item in page.articles.values() if item["verdict"] != "added"]
     for verdict, count in Counter(verdicts).items():
@@ -151,67 +157,69 @@ def test_the_documentation_counts_the_verdicts(page):
 
 
 @pytest.mark.thorough
-def test_page_loads_nothing(whole, page):
-    assert page.loads == [target for target in page.loads if target.startswith("#")]
-    assert not re.search(r"@import|url\(\s*[\"']?(?!#)", whole)
-    assert not re.search(r"(?:src|href)\s*=\s*[\"'](?:https?:)?//", whole)
+def test_report_loads_no_other_files(report_text, page):
+    assert page.loaded_urls == [target for target in page.loaded_urls if target.startswith("#")]
+    assert not re.search(r"@import|url\(\s*[\"']?(?!#)", report_text)
+    assert not re.search(r"(?:src|href)\s*=\s*[\"'](?:https?:)?//", report_text)
 
 
 @pytest.mark.thorough
-def test_closing_note_lists_every_item(whole, page):
-    note = whole.split('id="summary"', 1)[1]
+def test_closing_note_lists_every_item(report_text, page):
+    note = report_text.split('id="summary"', 1)[1]
     for key in page.articles:
         assert f'href="#{key}"' in note
 
 
-def cells(whole, key):
+def cells(report_text, key):
     """Return the rows of the table of one article."""
-    article = re.search(rf'<article id="{key}">.*?</article>', whole, re.DOTALL).group()
+    article = re.search(rf'<article id="{key}">.*?</article>', report_text, re.DOTALL).group()
     return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(<td.*?)</tr>", article)]
 
 
 @pytest.mark.thorough
-def test_errata_are_numbered(whole):
-    assert [row[0] for row in cells(whole, "table-errata")] == [f"E{n}" for n in range(1, 37)]
+def test_errata_are_numbered(report_text):
+    assert [row[0] for row in cells(report_text, "table-errata")] == [f"E{n}" for n in range(1, 37)]
 
 
 @pytest.mark.thorough
-def test_one_start_reproduces_tables_2_and_3(whole):
+def test_tables_2_and_3_are_reproduced_from_one_initial_state(report_text):
     """All printed digits (four to seven) agree; the small parameters of Table 3 keep their initial values."""
     for key in ("table-2", "table-3"):
-        rows = cells(whole, key)
+        rows = cells(report_text, key)
         assert len(rows) == 15
         for row in rows:
             assert float(row[4]) == pytest.approx(float(row[3]), rel=2e-5), (key, row)
 
 
 @pytest.mark.thorough
-def test_small_parameters_of_table_3_keep_the_error_of_the_start(whole):
-    off = {row[0]: float(row[8]) for row in cells(whole, "table-3")}
-    assert [off[f"a{i}"] for i in (1, 3, 6, 13, 15)] == pytest.approx([6.48, 14.3, 19.7, 36.0, 5.99], abs=0.05)
+def test_small_parameters_of_table_3_keep_the_error_of_the_start(report_text):
+    errors_percent = {row[0]: float(row[8]) for row in cells(report_text, "table-3")}
+    assert [errors_percent[f"a{i}"] for i in (1, 3, 6, 13, 15)] == pytest.approx(
+        [6.48, 14.3, 19.7, 36.0, 5.99], abs=0.05
+    )
 
 
 @pytest.mark.thorough
-def test_static_beats_dynamic_with_the_printed_parameters(whole):
-    dynamic, static = ([float(cell) for cell in row[2:]] for row in cells(whole, "table-12"))
+def test_static_beats_dynamic_with_the_printed_parameters(report_text):
+    dynamic, static = ([float(cell) for cell in row[2:]] for row in cells(report_text, "table-12"))
     assert (dynamic[0], static[0]) == pytest.approx((0.0826, 0.0812), abs=5e-5)
     assert dynamic[2] < 0.5 * static[2]  # with refitted a13 to a15
 
 
-def test_one_table(tmp_path, capsys):
+def test_option_table_selects_one_table(tmp_path, capsys):
     code, out, err = run(capsys, "thesis", "--table", "5", "--out", tmp_path)
     assert (code, err) == (0, "")
     assert "Table 5" in out
     assert "3666.67" in out  # a12, recomputed
-    page = Page((tmp_path / "index.html").read_text(encoding="utf-8"))
+    page = ReportParser((tmp_path / "index.html").read_text(encoding="utf-8"))
     assert list(page.articles) == ["table-5"]
 
 
-def test_one_figure(tmp_path, capsys):
+def test_option_figure_selects_one_figure(tmp_path, capsys):
     code, out, _ = run(capsys, "thesis", "--figure", "19", "--out", tmp_path)
     assert code == 0
     assert "Figure 19" in out
-    page = Page((tmp_path / "index.html").read_text(encoding="utf-8"))
+    page = ReportParser((tmp_path / "index.html").read_text(encoding="utf-8"))
     assert list(page.articles) == ["figure-19"]
     assert page.articles["figure-19"]["shapes"] > 5
 

@@ -1,4 +1,4 @@
-"""``adapt``: the thesis's steps 2 and 3 on captures."""
+"""``adapt``: steps 2 and 3 of the thesis's identification, on captures."""
 
 import json
 from pathlib import Path
@@ -27,14 +27,14 @@ def test_adapt_writes_a_cell_with_the_series_resistance_of_the_capture(table, tm
     out = tmp_path / "mine.toml"
     code, text, err = run(capsys, "adapt", table, "--cell", "ncr18650", "--out", out, "--json")
     assert (code, err) == (0, "")
-    found, cell = json.loads(text), load_cell(out)
-    assert set(found["a"]) == {f"a{i}" for i in range(1, 16)}
-    assert found["a"]["a1"]["std"] is None
-    assert found["a"]["a15"]["std"] > 0.0
-    assert found["score_after_percent"] <= 1.05 * found["score_before_percent"]
-    assert [cell.a[i] for i in range(1, 16)] == pytest.approx([found["a"][f"a{i}"]["value"] for i in range(1, 16)])
+    result, cell = json.loads(text), load_cell(out)
+    assert set(result["a"]) == {f"a{i}" for i in range(1, 16)}
+    assert result["a"]["a1"]["std"] is None
+    assert result["a"]["a15"]["std"] > 0.0
+    assert result["score_after_percent"] <= 1.05 * result["score_before_percent"]
+    assert [cell.a[i] for i in range(1, 16)] == pytest.approx([result["a"][f"a{i}"]["value"] for i in range(1, 16)])
     assert cell.ladder is not None
-    assert cell.ladder.error_v == pytest.approx(1e-3 * found["error_mv"])
+    assert cell.ladder.error_v == pytest.approx(1e-3 * result["error_mv"])
     dc_ohm = r_s(0.5, cell.a)
     assert dc_ohm == pytest.approx(r_s(0.5, TRUTH.a), rel=0.3)
 

@@ -1,3 +1,5 @@
+"""``capacity``: capacity from the rests of a capture, and errors of unusable captures."""
+
 import json
 
 import numpy as np
@@ -21,17 +23,17 @@ def capture(tmp_path):
     return save(tmp_path / "rests.csv", relaxation())
 
 
-def test_the_capacity_of_a_capture_as_json(capsys, capture):
+def test_json_has_capacity_and_anchors(capsys, capture):
     code, text, err = run(capsys, "capacity", capture, "--cell", "ncr18650", "--capacity-ah", "2.5", "--json")
     assert (code, err) == (0, "")
-    found = json.loads(text)
-    assert found["declared_ah"] == 2.5
-    assert abs(found["capacity_ah"] - CAPACITY_AH) < 2.0 * found["capacity_std_ah"]
-    assert found["capacity_std_ah"] < 0.1 * CAPACITY_AH
-    assert len(found["anchors"]) >= 15
-    assert {one["capture"] for one in found["anchors"]} == {"rests.csv"}
-    off = np.array([[one["off"], one["soc_std"]] for one in found["anchors"]])
-    assert (np.abs(off[:, 0]) < 3.0 * off[:, 1]).all()
+    result = json.loads(text)
+    assert result["declared_ah"] == 2.5
+    assert abs(result["capacity_ah"] - CAPACITY_AH) < 2.0 * result["capacity_std_ah"]
+    assert result["capacity_std_ah"] < 0.1 * CAPACITY_AH
+    assert len(result["anchors"]) >= 15
+    assert {anchor["capture"] for anchor in result["anchors"]} == {"rests.csv"}
+    errors = np.array([[anchor["off"], anchor["soc_std"]] for anchor in result["anchors"]])
+    assert (np.abs(errors[:, 0]) < 3.0 * errors[:, 1]).all()
 
 
 def test_known_sensor_offset_reduces_the_error(capsys, capture):
@@ -63,9 +65,9 @@ def test_capacity_of_a_real_cell_agrees_with_a_slow_discharge(capsys, shared_dat
     """The discharge of cell 1 at C/20 gave 2.99 Ah."""
     capture = shared_data / "ncr18650" / "cell1_hppc.csv.gz"
     arguments = ("capacity", capture, "--cell", "ncr18650", "--current-offset-std-a", "0.002", "--json")
-    found = json.loads(run(capsys, *arguments)[1])
-    assert abs(found["capacity_ah"] - 2.99) < 2.0 * found["capacity_std_ah"]
-    assert found["capacity_std_ah"] < 0.15
+    result = json.loads(run(capsys, *arguments)[1])
+    assert abs(result["capacity_ah"] - 2.99) < 2.0 * result["capacity_std_ah"]
+    assert result["capacity_std_ah"] < 0.15
 
 
 def test_error_on_missing_rests_suggests_a_remedy(tmp_path, capsys):

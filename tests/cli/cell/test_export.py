@@ -19,12 +19,12 @@ SERIES = 6
 DECLARED_AH = 1.1 * OXIDE.capacity_ah
 
 
-def drive(seed: int, **changes: object):
+def simulate_discharge(seed: int, **changes: object):
     """Simulate a discharge of six equal cells from full."""
     case = Case("", seed=seed, soc=1.0, unseen_h=0.0, hours=1.6, **changes)
-    seen = capture(case)
-    seen.samples["voltage_v"] *= SERIES
-    return seen
+    simulated = capture(case)
+    simulated.samples["voltage_v"] *= SERIES
+    return simulated
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def pack(tmp_path_factory) -> Path:
     )
     settings, cell = load_pack(file)
     estimator = new_estimator(settings, cell)
-    estimator.run(drive(1).samples)
+    estimator.run(simulate_discharge(1).samples)
     (folder / "state").mkdir()
     CheckpointFile(folder / "state", settings, cell).save(estimator.record, RunCounters(0, new_totals(0.0)))
     return file
@@ -52,43 +52,43 @@ def exported(pack) -> Path:
 def test_file_contains_the_learned_values(capsys, pack, exported):
     code, text, err = run(capsys, "cell", "export", pack, "--out", exported, "--force", "--json")
     assert (code, err) == (0, "")
-    found = json.loads(text)
+    result = json.loads(text)
     cell, generic = load_cell(exported), load_cell("nmc", DECLARED_AH)
     assert cell.cell.name == "learned"
-    assert cell.cell.capacity_ah == pytest.approx(found["capacity_ah"], rel=1e-6)
-    assert abs(cell.cell.capacity_ah - OXIDE.capacity_ah) < 2.0 * found["capacity_std_ah"]
+    assert cell.cell.capacity_ah == pytest.approx(result["capacity_ah"], rel=1e-6)
+    assert abs(cell.cell.capacity_ah - OXIDE.capacity_ah) < 2.0 * result["capacity_std_ah"]
     assert cell.cell.capacity_std < 0.08
     assert cell.cell.series_count == generic.cell.series_count == 1
     assert isinstance(cell.ocv, TableOcv)
     assert isinstance(generic.ocv, TableOcv)
-    errors, before = np.array(cell.ocv.error_v), np.array(generic.ocv.error_v)
-    assert (errors < before + 1e-9).mean() > 0.9
+    errors, generic_errors = np.array(cell.ocv.error_v), np.array(generic.ocv.error_v)
+    assert (errors < generic_errors + 1e-9).mean() > 0.9
     true_v = np.interp(cell.ocv.soc, np.linspace(0.0, 1.0, OXIDE.ocv_v.size), OXIDE.ocv_v)
-    off, was = np.array(cell.ocv.ocv_v) - true_v, np.array(generic.ocv.ocv_v) - true_v
+    deviation_v, old = np.array(cell.ocv.ocv_v) - true_v, np.array(generic.ocv.ocv_v) - true_v
     inside = (np.array(cell.ocv.soc) > 0.3) & (np.array(cell.ocv.soc) < 0.95)
-    assert np.sqrt(np.mean(off[inside] ** 2)) < np.sqrt(np.mean(was[inside] ** 2))
-    assert (np.abs(off[inside]) < 2.5 * errors[inside]).all()
+    assert np.sqrt(np.mean(deviation_v[inside] ** 2)) < np.sqrt(np.mean(old[inside] ** 2))
+    assert (np.abs(deviation_v[inside]) < 2.5 * errors[inside]).all()
     assert cell.ladder.std < 0.5 * generic.ladder.std
-    assert cell.ladder.weak_ohm[0][0] / generic.ladder.weak_ohm[0][0] == pytest.approx(found["r_s_factor"], rel=1e-4)
+    assert cell.ladder.weak_ohm[0][0] / generic.ladder.weak_ohm[0][0] == pytest.approx(result["r_s_factor"], rel=1e-4)
 
 
 def test_service_that_starts_from_the_file_is_better(capsys, pack, exported):
-    """In another drive from an unknown SOC, the estimate is closer to the true SOC with a narrower valid band."""
+    """Check that in another discharge from an unknown SOC the error is smaller, and the interval narrower and valid."""
     run(capsys, "cell", "export", pack, "--out", exported, "--force")
-    seen = drive(2, load_c=0.4)
-    half = seen.samples[seen.samples.size // 4 :]
-    true = seen.soc[seen.samples.size // 4 :]
+    simulated = simulate_discharge(2, load_c=0.4)
+    samples = simulated.samples[simulated.samples.size // 4 :]
+    true_soc = simulated.soc[simulated.samples.size // 4 :]
     results = []
     for cell in (load_cell(exported), load_cell("nmc", DECLARED_AH)):
-        trace = Estimator(cell.pack(SERIES, 1), initial_soc=float(true[0]) - 0.15).run(half)[900:]
-        error = trace["soc"] - true[900:]
+        trace = Estimator(cell.pack(SERIES, 1), initial_soc=float(true_soc[0]) - 0.15).run(samples)[900:]
+        error = trace["soc"] - true_soc[900:]
         results.append(
             (np.sqrt(np.mean(error**2)), trace["soc_std"].mean(), np.mean(np.abs(error) < 2.0 * trace["soc_std"]))
         )
-    (rmse, std, cover), (rmse_generic, std_generic, _) = results
+    (rmse, std, coverage), (rmse_generic, std_generic, _) = results
     assert rmse < rmse_generic
-    assert std < 0.9 * std_generic  # it was 0.8 of it before the band of the generic cell narrowed by itself
-    assert cover > 0.95
+    assert std < 0.9 * std_generic
+    assert coverage > 0.95
 
 
 def test_missing_checkpoint_is_an_error(tmp_path, capsys, pack):
@@ -101,19 +101,19 @@ def test_missing_checkpoint_is_an_error(tmp_path, capsys, pack):
 
 
 @pytest.mark.parametrize(
-    ("was", "now", "why"),
+    ("old", "new", "message"),
     [
         ("series = 6", "series = 5", "it belongs to another pack or cell"),
         ("nmc", "nca", "it belongs to another pack or cell"),
     ],
 )
-def test_checkpoint_of_another_pack_is_rejected(tmp_path, capsys, pack, was, now, why):
+def test_checkpoint_of_another_pack_is_rejected(tmp_path, capsys, pack, old, new, message):
     other = tmp_path / "pack.toml"
-    other.write_text(pack.read_text().replace(was, now))
+    other.write_text(pack.read_text().replace(old, new))
     (saved,) = (pack.parent / "state").glob("*.npz")
     code, _, err = run(capsys, "cell", "export", other, "--out", tmp_path / "x.toml", "--checkpoint", saved)
     assert code == 2
-    assert why in err
+    assert message in err
     assert saved.exists()
 
 
@@ -141,8 +141,8 @@ def test_existing_file_is_replaced_only_with_force(tmp_path, capsys, pack):
 def test_input_is_never_overwritten(capsys, pack):
     checkpoint = next((pack.parent / "state").glob("*.npz"))
     for out in (pack, checkpoint):
-        before = out.read_bytes()
+        generic_errors = out.read_bytes()
         code, _, err = run(capsys, "cell", "export", pack, "--checkpoint", checkpoint, "--out", out, "--force")
         assert code == 2
         assert "is also an input" in err
-        assert out.read_bytes() == before
+        assert out.read_bytes() == generic_errors

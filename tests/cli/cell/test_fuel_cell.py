@@ -1,4 +1,4 @@
-"""A fuel cell on the command line: identified, replayed, checked; unsuitable commands report it in one line."""
+"""Commands with a fuel cell: ``identify``, ``replay`` and ``config``, and errors of commands for batteries only."""
 
 import csv
 import json
@@ -15,48 +15,48 @@ from tests import mann_stack
 from tests.command_line import run
 
 PEM = load_fuel_cell("pem_30w")
-GROWN = np.array([1.0, 1.3, *[1.0] * 14])
-"""Stack with a resistance 30 % above that of the file."""
+AGED = np.array([1.0, 1.3, *[1.0] * 14])
+"""Factors of the parameters of an aged stack, whose resistance is 30 % above that of the file."""
 
 
-def table(path: Path, **columns: np.ndarray) -> Path:
+def write_csv(path: Path, **columns: np.ndarray) -> Path:
     rows = np.column_stack(list(columns.values()))
     np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.6g")
     return path
 
 
-def negated(path: Path, folder: Path) -> Path:
+def with_negated_current(path: Path, folder: Path) -> Path:
     """Return a copy of the file with the opposite sign of the current."""
     rows = np.genfromtxt(path, delimiter=",", names=True)
     rows["current_a"] *= -1.0
-    return table(folder / f"negated_{path.name}", **{name: rows[name] for name in rows.dtype.names})
+    return write_csv(folder / f"negated_{path.name}", **{name: rows[name] for name in rows.dtype.names})
 
 
 @pytest.fixture(scope="module")
 def curve(tmp_path_factory: pytest.TempPathFactory) -> Path:
     current_a = np.array([0, 0.05, 0.2, 0.5, 1, 2, 3, 4, 5, 6, 7, 8, 8.5])
-    voltage_v, _ = polarisation(PEM.a * GROWN, np.zeros(8), current_a, np.full(current_a.size, np.nan))
-    return table(tmp_path_factory.mktemp("fuel") / "curve.csv", current_a=current_a, voltage_v=voltage_v)
+    voltage_v, _ = polarisation(PEM.a * AGED, np.zeros(8), current_a, np.full(current_a.size, np.nan))
+    return write_csv(tmp_path_factory.mktemp("fuel") / "curve.csv", current_a=current_a, voltage_v=voltage_v)
 
 
 @pytest.fixture(scope="module")
 def steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     time_s, current_a = mann_stack.random_steps(60.0, 200.0, seed=1)
-    voltage_v, _ = open_loop(PEM.a * GROWN, np.zeros(8), time_s, current_a, np.full(time_s.size, np.nan))
+    voltage_v, _ = open_loop(PEM.a * AGED, np.zeros(8), time_s, current_a, np.full(time_s.size, np.nan))
     voltage_v += np.random.default_rng(0).normal(0.0, 0.003, time_s.size)
     folder = tmp_path_factory.mktemp("fuel")
-    return table(folder / "steps.csv", time_s=time_s, current_a=current_a, voltage_v=voltage_v)
+    return write_csv(folder / "steps.csv", time_s=time_s, current_a=current_a, voltage_v=voltage_v)
 
 
 def test_identify_writes_a_file_that_replays_use(capsys, curve: Path, steps: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     code, printed, _ = run(capsys, "identify", curve, steps, "--cell", "pem_30w", "--out", out, "--json")
     assert code == 0
-    found = json.loads(printed)
-    assert set(found["parameters"]) == set(KEYS)
-    r_ohm = found["parameters"]["r_ohm"]
+    result = json.loads(printed)
+    assert set(result["parameters"]) == set(KEYS)
+    r_ohm = result["parameters"]["r_ohm"]
     assert abs(r_ohm["value"] - 1.3 * r_ohm["of_start"]) < 3.0 * r_ohm["std"] < 0.05 * r_ohm["of_start"]
-    assert found["steps_rms_mv"] == pytest.approx(3.0, rel=0.05)
+    assert result["steps_rms_mv"] == pytest.approx(3.0, rel=0.05)
     mine = load_fuel_cell(out)
     assert mine.cell.name == "mine"
     assert mine.std["r_ohm"] == pytest.approx(r_ohm["std"] / r_ohm["value"], rel=0.1)
@@ -74,9 +74,9 @@ def test_residual_is_reported_for_files_of_equal_names(capsys, steps: Path, tmp_
     later.write_text("".join(steps.read_text().splitlines(keepends=True)[:-20]))
     out = tmp_path / "mine.toml"
     _, printed, _ = run(capsys, "identify", steps, later, "--cell", "pem_30w", "--out", out, "--json")
-    found = json.loads(printed)
-    assert found[f"{steps}_rms_mv"] == pytest.approx(3.0, rel=0.05)
-    assert found[f"{later}_rms_mv"] == pytest.approx(3.0, rel=0.05)
+    result = json.loads(printed)
+    assert result[f"{steps}_rms_mv"] == pytest.approx(3.0, rel=0.05)
+    assert result[f"{later}_rms_mv"] == pytest.approx(3.0, rel=0.05)
 
 
 def test_identify_reports_undetermined_parameters(capsys, curve: Path, tmp_path: Path) -> None:
@@ -89,31 +89,29 @@ def test_identify_reports_undetermined_parameters(capsys, curve: Path, tmp_path:
 def test_charge_positive_current_is_negated(
     capsys, curve: Path, steps: Path, tmp_path: Path, *, as_curve: bool
 ) -> None:
-    turned = negated(curve if as_curve else steps, tmp_path)
-    command = "identify", turned, "--cell", "pem_30w", "--current-sign", "charge_positive"
+    negative = with_negated_current(curve if as_curve else steps, tmp_path)
+    command = "identify", negative, "--cell", "pem_30w", "--current-sign", "charge_positive"
     code, printed, _ = run(capsys, *command, "--out", tmp_path / "mine.toml", "--json")
     assert code == 0
-    assert json.loads(printed)["parameters"]["r_ohm"]["value"] == pytest.approx(
-        GROWN[1] * PEM.fuel_cell.r_ohm, rel=0.05
-    )
+    assert json.loads(printed)["parameters"]["r_ohm"]["value"] == pytest.approx(AGED[1] * PEM.fuel_cell.r_ohm, rel=0.05)
 
 
 @pytest.mark.parametrize("celsius", ["inf", "-273.15", "-127"])
 def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path: Path, celsius: str) -> None:
     lines = curve.read_text().splitlines()
-    told = tmp_path / curve.name
-    told.write_text("\n".join([f"{lines[0]},temperature_c", *(f"{line},{celsius}" for line in lines[1:])]))
-    found = []
-    for path in (curve, told):
+    with_temperature = tmp_path / curve.name
+    with_temperature.write_text("\n".join([f"{lines[0]},temperature_c", *(f"{line},{celsius}" for line in lines[1:])]))
+    cells = []
+    for path in (curve, with_temperature):
         out = tmp_path / "mine.toml"
         code, _, _ = run(capsys, "identify", path, "--cell", "pem_30w", "--out", out, "--force")
         assert code == 0
-        found.append(load_fuel_cell(out))
-    assert found[0] == found[1]
+        cells.append(load_fuel_cell(out))
+    assert cells[0] == cells[1]
 
 
 @pytest.mark.parametrize(
-    ("celsius", "why"),
+    ("celsius", "message"),
     [
         ("-300", "--temperature-c -300: must lie within -60 and 120 C"),
         ("121", "--temperature-c 121: must lie within -60 and 120 C"),
@@ -121,18 +119,18 @@ def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path
     ],
 )
 def test_option_with_an_implausible_temperature_is_rejected(
-    capsys, curve: Path, tmp_path: Path, celsius: str, why: str
+    capsys, curve: Path, tmp_path: Path, celsius: str, message: str
 ) -> None:
     command = "identify", curve, "--cell", "pem_30w", "--out", tmp_path / "mine.toml"
     code, _, err = run(capsys, *command, "--temperature-c", celsius)
     assert code == 2
-    assert why in err
+    assert message in err
 
 
 def test_replay_accepts_implausible_temperatures(capsys, tmp_path: Path) -> None:
     celsius = np.array([40.0, -273.15, 40.0, 40.0])
     columns = {"time_s": np.arange(4.0), "current_a": np.full(4, 3.0), "voltage_v": np.full(4, 9.4)}
-    path = table(tmp_path / "cold.csv", **columns, temperature_c=celsius)
+    path = write_csv(tmp_path / "cold.csv", **columns, temperature_c=celsius)
     code, printed, _ = run(capsys, "replay", path, "--cell", "pem_30w", "--json")
     assert code == 0
     assert json.loads(printed)["innovation_rms_v"] < 0.2
@@ -208,11 +206,15 @@ def test_parallel_stacks_beyond_the_tafel_range_are_rejected(capsys, tmp_path: P
 
 
 def test_help_mentions_fuel_cells_where_supported(capsys) -> None:
-    offered = {c for c in ("capacity", "identify", "replay", "simulate", "thesis", "validate") if _offers(capsys, c)}
-    assert offered == {"identify", "replay"}
+    commands = {
+        c
+        for c in ("capacity", "identify", "replay", "simulate", "thesis", "validate")
+        if help_mentions_fuel_cell(capsys, c)
+    }
+    assert commands == {"identify", "replay"}
 
 
-def _offers(capsys, command: str) -> bool:
+def help_mentions_fuel_cell(capsys, command: str) -> bool:
     code, printed, _ = run(capsys, command, "--help")
     assert code == 0
     return "pem_30w" in printed
@@ -237,8 +239,8 @@ def test_unsuitable_commands_reject_a_fuel_cell(capsys, arguments, steps: Path, 
     pack, soc = tmp_path / "pack.toml", tmp_path / "soc.toml"
     pack.write_text('[pack]\ncell = "pem_30w"\n')
     soc.write_text('[pack]\ncell = "pem_30w"\ninitial_soc = 0.5\n')
-    places = {"steps": steps, "pack": pack, "soc": soc, "out": tmp_path / "out.toml"}
-    code, out, err = run(capsys, *(argument.format(**places) for argument in arguments))
+    files = {"steps": steps, "pack": pack, "soc": soc, "out": tmp_path / "out.toml"}
+    code, out, err = run(capsys, *(argument.format(**files) for argument in arguments))
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
     assert "is a fuel cell" in err
@@ -249,8 +251,10 @@ def test_error_names_the_unusable_file(capsys, curve: Path, steps: Path, tmp_pat
     short.write_text("current_a,voltage_v\n1.0,10.0\n2.0,9.0\n")
     hole = tmp_path / "hole.csv"
     hole.write_text("current_a,voltage_v\n1.0,10.0\n2.0\n3.0,8.0\n")
-    one_cell = table(tmp_path / "one_cell.csv", current_a=np.arange(4.0), voltage_v=np.array([0.86, 0.7, 0.64, 0.57]))
-    reversed_curve, reversed_steps = (negated(path, tmp_path) for path in (curve, steps))
+    one_cell = write_csv(
+        tmp_path / "one_cell.csv", current_a=np.arange(4.0), voltage_v=np.array([0.86, 0.7, 0.64, 0.57])
+    )
+    reversed_curve, reversed_steps = (with_negated_current(path, tmp_path) for path in (curve, steps))
     for path, message in (
         (short, "2 usable points"),
         (hole, "a value is missing"),

@@ -1,3 +1,5 @@
+"""``ocv``: curves from rests, slow discharges and tables, and errors of unusable captures."""
+
 import json
 
 import numpy as np
@@ -8,7 +10,7 @@ from bms_estimator.model.cell import ChenMoraOcv, TableOcv, load_cell
 from tests.calibration.simulated_relaxation import BAD, relaxation
 from tests.command_line import run
 
-REAL = "cell5_relaxation_c2.csv.gz"
+RELAXATION_FILE = "cell5_relaxation_c2.csv.gz"
 
 
 def save(path, samples):
@@ -25,37 +27,37 @@ def captures(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("form", "limit_mv"), [("chen-mora", 10.0), ("table", 2.0)])
-def test_real_cell(tmp_path, capsys, shared_data, form, limit_mv):
+def test_curve_of_a_real_cell(tmp_path, capsys, shared_data, form, limit_mv):
     out = tmp_path / "cell5.toml"
-    capture = shared_data / "ncr18650" / REAL
+    capture = shared_data / "ncr18650" / RELAXATION_FILE
     code, text, err = run(capsys, "ocv", capture, "--capacity-ah", "3.0", "--form", form, "--out", out, "--json")
     assert (code, err) == (0, "")
-    found = json.loads(text)
-    assert found["form"] == form
-    assert found["points"] == len(found["soc"]) == len(found["ocv_v"]) == len(found["std_v"]) >= 18
-    assert found["soc"] == sorted(found["soc"])
-    assert found["soc"][0] < 0.1
-    assert found["soc"][-1] > 0.9
-    assert 0.0 <= found["rms_mv"] <= limit_mv
-    assert found["rms_mv"] <= found["max_mv"]
-    assert max(found["std_v"]) < 0.01
+    result = json.loads(text)
+    assert result["form"] == form
+    assert result["points"] == len(result["soc"]) == len(result["ocv_v"]) == len(result["std_v"]) >= 18
+    assert result["soc"] == sorted(result["soc"])
+    assert result["soc"][0] < 0.1
+    assert result["soc"][-1] > 0.9
+    assert 0.0 <= result["rms_mv"] <= limit_mv
+    assert result["rms_mv"] <= result["max_mv"]
+    assert max(result["std_v"]) < 0.01
 
     cell = load_cell(out)
     assert cell.cell.name == "cell5"
     assert cell.cell.capacity_ah == 3.0
     assert cell.cell.capacity_std is None
-    soc, ocv_v = np.array(found["soc"]), np.array(found["ocv_v"])
+    soc, ocv_v = np.array(result["soc"]), np.array(result["ocv_v"])
     if form == "chen-mora":
-        assert list(found["parameters"]) == ["a16", "a17", "a18", "a19", "a20", "a21"]
-        assert all(set(parameter) == {"value", "std"} for parameter in found["parameters"].values())
+        assert list(result["parameters"]) == ["a16", "a17", "a18", "a19", "a20", "a21"]
+        assert all(set(parameter) == {"value", "std"} for parameter in result["parameters"].values())
         assert isinstance(cell.ocv, ChenMoraOcv)
-        a16, a17, a18, a19, a20, a21 = (found["parameters"][f"a{i}"]["value"] for i in range(16, 22))
+        a16, a17, a18, a19, a20, a21 = (result["parameters"][f"a{i}"]["value"] for i in range(16, 22))
         assert cell.ocv.a == pytest.approx((a16, a17, a18, a19, a20, a21), rel=1e-6)
-        by_hand = -a16 * np.exp(-a17 * soc) + a18 + a19 * soc - a20 * soc**2 + a21 * soc**3  # (2.10)
-        assert 1e3 * np.sqrt(np.mean((ocv_v - by_hand) ** 2)) == pytest.approx(found["rms_mv"], rel=1e-6)
-        assert 1e3 * np.abs(ocv_v - by_hand).max() == pytest.approx(found["max_mv"], rel=1e-6)
+        expected_v = -a16 * np.exp(-a17 * soc) + a18 + a19 * soc - a20 * soc**2 + a21 * soc**3  # (2.10) of the thesis
+        assert 1e3 * np.sqrt(np.mean((ocv_v - expected_v) ** 2)) == pytest.approx(result["rms_mv"], rel=1e-6)
+        assert 1e3 * np.abs(ocv_v - expected_v).max() == pytest.approx(result["max_mv"], rel=1e-6)
     else:
-        assert found["parameters"] == {}
+        assert result["parameters"] == {}
         assert isinstance(cell.ocv, TableOcv)
         assert PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v)(soc) == pytest.approx(ocv_v, abs=3e-3)
         assert cell.ocv.error_v is not None
@@ -64,16 +66,16 @@ def test_real_cell(tmp_path, capsys, shared_data, form, limit_mv):
 
 
 def test_several_captures_are_fitted_jointly(captures, tmp_path, capsys):
-    out = tmp_path / "both.toml"
+    out = tmp_path / "paired.toml"
     code, text, _ = run(capsys, "ocv", *captures, "--capacity-ah", "3", "--form", "table", "--out", out, "--json")
     assert code == 0
-    found = json.loads(text)
-    assert found["points"] == 40
-    assert {name: one["rests"] for name, one in found["captures"].items()} == {"run0.csv": 20, "run1.csv": 20}
+    result = json.loads(text)
+    assert result["points"] == 40
+    assert {name: source["rests"] for name, source in result["captures"].items()} == {"run0.csv": 20, "run1.csv": 20}
     cell = load_cell(out)
     assert cell.cell.series_count == 1
     assert "OCV: 20 rests of run0.csv, 20 rests of run1.csv" in out.read_text()
-    # elements: a first idea from the rests, 0.0861 ohm and some 20 mohm in the middle of the true cell
+    # circuit elements are estimated roughly from the rests; at SOC 0.5 the true cell has 0.0861 ohm and about 20 mohm
     assert cell.r_s.offset_ohm == pytest.approx(0.0861, rel=0.15)
     assert 0.01 < cell.r_tl.offset_ohm < 0.05
 
@@ -193,9 +195,9 @@ def test_kind_of_each_source_is_recognized(tmp_path, capsys, data):
     arguments = ("ocv", folder / "rate_0p1c_25c.csv.gz", folder / "ocv_25c.csv", "--out", out)
     code, text, _ = run(capsys, *arguments, "--json")
     assert code == 0
-    found = json.loads(text)
-    assert [source["kind"] for source in found["sources"]] == ["C/10 discharge, 4.945 Ah", "given curve, 101 points"]
-    assert found["capacity_ah"] == found["capacity_measured_ah"] == pytest.approx(4.945, abs=1e-3)
+    result = json.loads(text)
+    assert [source["kind"] for source in result["sources"]] == ["C/10 discharge, 4.945 Ah", "given curve, 101 points"]
+    assert result["capacity_ah"] == result["capacity_measured_ah"] == pytest.approx(4.945, abs=1e-3)
     cell = load_cell(out)
     assert cell.cell.capacity_std == 0.03
     ocv = cell.ocv
@@ -214,18 +216,18 @@ def test_kind_of_each_source_is_recognized(tmp_path, capsys, data):
         assert words in text + out.read_text()
 
 
-@pytest.mark.parametrize("way", ["dis", "chg"])
-def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, capsys, shared_data, way):
+@pytest.mark.parametrize("direction", ["dis", "chg"])
+def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, capsys, shared_data, direction):
     """On a plateau, hysteresis corresponds to a tenth of the charge or more; that of the generic cell is used."""
     folder, out, pair = shared_data / "a123", tmp_path / "lone.toml", tmp_path / "pair.toml"
     files = {name: folder / f"c30_{name}_p25.csv.gz" for name in ("dis", "chg")}
-    for captures, to in (([files[way]], out), (list(files.values()), pair)):
+    for captures, to in (([files[direction]], out), (list(files.values()), pair)):
         assert run(capsys, "ocv", *captures, "--capacity-ah", "2.05", "--out", to)[0] == 0
-    lone, both = load_cell(out).ocv, load_cell(pair).ocv
-    inside = (np.array(both.soc) > 0.15) & (np.array(both.soc) < 0.95)
-    off_v = np.abs(np.array(lone.ocv_v) - np.array(both.ocv_v))[inside]
-    assert (off_v < 2.0 * np.array(lone.error_v)[inside]).mean() > 0.95
-    assert lone.hysteresis_v == pytest.approx(np.full(len(lone.soc), 0.01))
+    unpaired, paired = load_cell(out).ocv, load_cell(pair).ocv
+    inside = (np.array(paired.soc) > 0.15) & (np.array(paired.soc) < 0.95)
+    deviation_v = np.abs(np.array(unpaired.ocv_v) - np.array(paired.ocv_v))[inside]
+    assert (deviation_v < 2.0 * np.array(unpaired.error_v)[inside]).mean() > 0.95
+    assert unpaired.hysteresis_v == pytest.approx(np.full(len(unpaired.soc), 0.01))
     assert "Hysteresis: that of the generic lfp" in out.read_text()
     assert "Hysteresis" not in pair.read_text()
     assert "Elements: those of the generic lfp" in out.read_text()
@@ -237,15 +239,15 @@ def test_unpaired_slow_curve_of_a_layered_oxide_is_corrected(tmp_path, capsys, d
     code, text, _ = run(capsys, "ocv", folder / "rate_0p1c_25c.csv.gz", "--out", out)
     assert code == 0
     assert "subtracted for" in text
-    found = load_cell(out).ocv
-    assert found.hysteresis_v is None
+    ocv = load_cell(out).ocv
+    assert ocv.hysteresis_v is None
     published = np.genfromtxt(folder / "ocv_25c.csv", delimiter=",", names=True)
     soc = np.linspace(0.15, 0.95, 81)
-    off_v = np.interp(soc, found.soc, found.ocv_v) - np.interp(soc, published["soc"], published["ocv_v"])
-    assert abs(off_v.mean()) < 5e-3
-    assert np.sqrt(np.mean(off_v**2)) < 10e-3
-    found, usual = load_cell(out).ladder, load_cell("nca", 4.945).ladder
-    assert np.array(found.weak_ohm) == pytest.approx(np.array(usual.weak_ohm), rel=1e-3)
+    deviation_v = np.interp(soc, ocv.soc, ocv.ocv_v) - np.interp(soc, published["soc"], published["ocv_v"])
+    assert abs(deviation_v.mean()) < 5e-3
+    assert np.sqrt(np.mean(deviation_v**2)) < 10e-3
+    ladder, generic = load_cell(out).ladder, load_cell("nca", 4.945).ladder
+    assert np.array(ladder.weak_ohm) == pytest.approx(np.array(generic.weak_ohm), rel=1e-3)
 
 
 def test_curve_that_falls_to_0_v_is_rejected(tmp_path, capsys, shared_data):
@@ -257,15 +259,15 @@ def test_curve_that_falls_to_0_v_is_rejected(tmp_path, capsys, shared_data):
     assert not (tmp_path / "large.toml").exists()
 
 
-def test_rests_of_a_pouch_cell(tmp_path, capsys, data):
+def test_error_of_the_curve_of_a_pouch_cell_is_largest_near_empty(tmp_path, capsys, data):
     out = tmp_path / "leaf.toml"
     code, text, _ = run(
         capsys, "ocv", data / "leaf" / "hppc_25c_from_full.csv.gz", "--capacity-ah", "30.5", "--out", out, "--json"
     )
     assert code == 0
-    found = json.loads(text)
-    assert found["sources"][0]["kind"] == "10 rests"
-    assert found["error_mv"][0] > 3.0 * np.median(found["error_mv"])
+    result = json.loads(text)
+    assert result["sources"][0]["kind"] == "10 rests"
+    assert result["error_mv"][0] > 3.0 * np.median(result["error_mv"])
 
 
 def test_captures_of_equal_names_are_distinguished(captures, tmp_path, capsys):

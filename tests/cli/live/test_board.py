@@ -16,45 +16,45 @@ from tests.patience import LONG_S
 from tests.serial_line import usb_port
 
 
-def board(capsys, *arguments):
+def run_board(capsys, *arguments):
     """Run the command and return exit code, stdout and stderr."""
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as exit_info:
         main(["board", *arguments])
     out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
+    return exit_info.value.code or 0, out, err
 
 
 @contextlib.contextmanager
-def virtual(**options):
+def running_board(**options):
     """Run a board in a thread and yield its path."""
-    with VirtualBoard(lambda _: Reading(2.5, 22.2, 25.0), **options) as made:
+    with VirtualBoard(lambda _: Reading(2.5, 22.2, 25.0), **options) as virtual_board:
         loop = asyncio.new_event_loop()
-        task = loop.create_task(made.run())
+        task = loop.create_task(virtual_board.run())
         thread = threading.Thread(target=loop.run_until_complete, args=(asyncio.wait([task]),))
         thread.start()
-        yield made.path
+        yield virtual_board.path
         loop.call_soon_threadsafe(task.cancel)
         thread.join()
         loop.close()
 
 
 @pytest.fixture
-def patient(monkeypatch):
+def long_timeouts(monkeypatch):
     """Set long timeouts, for boards that respond."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(device_detection, "REFERENCE_TIMEOUT_S", LONG_S)
 
 
 @pytest.fixture
-def impatient(monkeypatch):
+def short_timeouts(monkeypatch):
     """Set short timeouts, for boards that do not respond."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.5)
 
 
-@pytest.mark.usefixtures("patient")
+@pytest.mark.usefixtures("long_timeouts")
 def test_shows_the_properties_of_the_board(capsys):
-    with virtual(rate_hz=50, serial=0xC0FFEE, parts=BoardParts(supply_v=4.8)) as path:
-        code, out, err = board(capsys, path)
+    with running_board(rate_hz=50, serial=0xC0FFEE, parts=BoardParts(supply_v=4.8)) as path:
+        code, out, err = run_board(capsys, path)
     assert (code, err) == (0, "")
     message = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert (message["firmware"], message["serial"], message["rate"]) == ("0.2.0", "00c0ffee", "50 Hz")
@@ -63,57 +63,57 @@ def test_shows_the_properties_of_the_board(capsys):
     assert float(message["reference"].split()[0]) == pytest.approx(4.8, rel=1e-3)
 
 
-@pytest.mark.usefixtures("patient")
+@pytest.mark.usefixtures("long_timeouts")
 def test_voltage_at_aref_sets_bandgap_and_reference(capsys):
-    with virtual(rate_hz=50) as path:
-        code, out, err = board(capsys, path, "--aref-v", "4.7", "--serial", "77")
+    with running_board(rate_hz=50) as path:
+        code, out, err = run_board(capsys, path, "--aref-v", "4.7", "--serial", "77")
         assert (code, err) == (0, "")
         bandgap, serial = out.splitlines()[-2:]
         assert bandgap.startswith("bandgap: was 1.1000 V, now ")
         assert float(bandgap.split()[-2]) == pytest.approx(1.1 * 4.7 / 5.0, rel=1e-3)
         assert serial == "serial: was 00000001, now 0000004d"
-        _, out, _ = board(capsys, path)
+        _, out, _ = run_board(capsys, path)
     message = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert message["serial"] == "0000004d"
     assert float(message["reference"].split()[0]) == pytest.approx(4.7, rel=1e-3)
 
 
-@pytest.mark.usefixtures("patient")
+@pytest.mark.usefixtures("long_timeouts")
 @pytest.mark.parametrize("aref_v", ["3.3", "6", "0", "-5"])
 def test_implausible_voltage_at_aref_is_rejected(capsys, monkeypatch, aref_v):
     monkeypatch.setattr(device_detection, "REFERENCE_SAMPLES", 10)
-    with virtual() as path:
-        code, _, err = board(capsys, path, "--aref-v", aref_v, "--serial", "7")
+    with running_board() as path:
+        code, _, err = run_board(capsys, path, "--aref-v", aref_v, "--serial", "7")
         assert code == 2
         assert err.startswith(f"error: --aref-v {aref_v}: ")
         assert "between 1.0 and 1.2 V" in err
-        _, out, _ = board(capsys, path)
+        _, out, _ = run_board(capsys, path)
     assert "bandgap    1.1000 V" in out
     assert "serial     00000001" in out
 
 
 @pytest.mark.parametrize("serial", ["0", "-1", "4294967296", "x"])
 def test_serial_number_out_of_range_is_rejected(capsys, serial):
-    code, out, err = board(capsys, "/dev/none", "--serial", serial)
+    code, out, err = run_board(capsys, "/dev/none", "--serial", serial)
     assert (code, out) == (2, "")
     assert "--serial" in err
 
 
-@pytest.mark.usefixtures("patient")
+@pytest.mark.usefixtures("long_timeouts")
 def test_text_board_rejects_commands(capsys):
-    with virtual(mode="text") as path:
-        code, out, err = board(capsys, path, "--serial", "7")
+    with running_board(mode="text") as path:
+        code, out, err = run_board(capsys, path, "--serial", "7")
     assert (code, out) == (2, "")
     assert err.startswith(f"error: {path}: the board prints text, not frames")
     assert err.endswith("it takes no commands\n")
 
 
-@pytest.mark.usefixtures("impatient")
+@pytest.mark.usefixtures("short_timeouts")
 def test_port_without_a_board_is_reported(capsys):
     master, slave = os.openpty()
     path = os.ttyname(slave)
     try:
-        assert board(capsys, path) == (2, "", f"error: {path}: silent\n")
+        assert run_board(capsys, path) == (2, "", f"error: {path}: silent\n")
     finally:
         os.close(slave)
         os.close(master)
@@ -121,16 +121,16 @@ def test_port_without_a_board_is_reported(capsys):
 
 def test_missing_port_is_reported(capsys, tmp_path, monkeypatch):
     path = tmp_path / "none"
-    assert board(capsys, str(path)) == (2, "", f"error: {path}: it does not exist\n")
+    assert run_board(capsys, str(path)) == (2, "", f"error: {path}: it does not exist\n")
     monkeypatch.setattr(list_ports, "comports", list)
-    assert board(capsys) == (2, "", "error: auto: no USB serial port is connected\n")
+    assert run_board(capsys) == (2, "", "error: auto: no USB serial port is connected\n")
     monkeypatch.setattr(list_ports, "comports", lambda: [usb_port("/dev/a"), usb_port("/dev/b")])
-    assert board(capsys) == (2, "", "error: auto: 2 serial ports are connected; choose one: /dev/a, /dev/b\n")
+    assert run_board(capsys) == (2, "", "error: auto: 2 serial ports are connected; choose one: /dev/a, /dev/b\n")
 
 
 def test_file_that_is_no_port_is_reported(capsys, tmp_path):
     path = tmp_path / "file"
     path.write_text("")
-    code, out, err = board(capsys, str(path))
+    code, out, err = run_board(capsys, str(path))
     assert (code, out) == (2, "")
     assert err.startswith(f"error: {path}: cannot be opened: ")

@@ -30,7 +30,7 @@ async def demo(*arguments):
         await process.wait()
 
 
-async def listening(port):
+async def connect_listener(port):
     """Return a listener after the broker has started."""
     async with asyncio.timeout(LONG_S):
         while True:
@@ -42,14 +42,14 @@ async def listening(port):
 
 async def test_client_receives_states_from_start_to_offline():
     port, page = free_port(), free_port()
-    where = ("--port", port, "--page-port", page)
-    async with demo("--seconds", 4, *where) as process:
-        listener = await listening(port)
+    ports = ("--port", port, "--page-port", page)
+    async with demo("--seconds", 4, *ports) as process:
+        listener = await connect_listener(port)
         try:
             assert await listener.wait("bms/demo/availability") == b"online"
             state = await listener.wait_json("bms/demo/state", lambda s: s["frames_received"] > 100)
             async with aiohttp.ClientSession(f"http://127.0.0.1:{page}") as browser, browser.get("/events") as events:
-                first = [await events.content.readline() for _ in range(3)]
+                first_lines = [await events.content.readline() for _ in range(3)]
             parameters = await listener.wait_json("bms/demo/parameters")
             info = await listener.wait_json("bms/demo/info", lambda i: i.get("board"))
             assert await listener.wait("bms/demo/sensor/availability", lambda p: p == b"online")
@@ -67,7 +67,7 @@ async def test_client_receives_states_from_start_to_offline():
     assert set(parameters["a"]) == {f"a{i}" for i in range(1, 22)}
     assert (info["device"], info["cell"], info["board"]["sample_rate_hz"]) == ("demo", "chen_mora", "100")
     assert health["line"]
-    assert {"demo/state", "demo/health", "demo/info"} <= json.loads(first[-1].removeprefix(b"data: ")).keys()
+    assert {"demo/state", "demo/health", "demo/info"} <= json.loads(first_lines[-1].removeprefix(b"data: ")).keys()
     assert f"live page: http://127.0.0.1:{page}/" in out
     assert f"mosquitto_sub -p {port} -t 'bms/#' -v" in out
     assert re.search(r" soc \d+\.\d\d ± \d+\.\d\d %  true \d+\.\d\d %  ", out)
@@ -83,16 +83,16 @@ async def test_client_receives_states_from_start_to_offline():
 async def test_estimate_follows_a_board_with_a_faster_clock():
     port = free_port()
     async with demo("--speed", 5, "--port", port):
-        listener = await listening(port)
+        listener = await connect_listener(port)
         try:
             info = await listener.wait_json("bms/demo/info")
             started = datetime.fromisoformat(info["started"])
 
-            def faster(state):
+            def is_ahead_of_wall_clock(state):
                 since_s = (datetime.fromisoformat(state["publish_time"]) - started).total_seconds()
                 return state["board_time_s"] > 2.0 * since_s
 
-            state = await listener.wait_json("bms/demo/state", faster)
+            state = await listener.wait_json("bms/demo/state", is_ahead_of_wall_clock)
         finally:
             await listener.__aexit__(None, None, None)
     assert state["sample_rate_hz"] == pytest.approx(100.0, rel=0.01)

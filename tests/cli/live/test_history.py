@@ -18,14 +18,14 @@ async def pack(tmp_path):
     return tmp_path / "pack.toml"
 
 
-def table(text):
+def read_csv(text):
     return list(csv.DictReader(io.StringIO(text)))
 
 
 def test_minutes_are_printed_with_their_units_and_times(pack, capsys):
     code, out, err = run(capsys, "history", pack)
     assert (code, err) == (0, "")
-    first, *others = table(out)
+    first, *others = read_csv(out)
     assert (first["time"], first["current_a"], first["publications"]) == ("2023-11-14T22:14:00.000Z", "2", "2")
     assert len(others) == 4
 
@@ -34,7 +34,7 @@ def test_longer_steps_are_written_to_a_file_that_is_not_overwritten(pack, capsys
     out_file = pack.with_name("out.csv")
     arguments = ["history", pack, "--since", "2023-11-14T22:15", "--until", "2023-11-14T22:17:00", "--out", out_file]
     assert run(capsys, *arguments, "--step", 3600) == (0, "", "")
-    [row] = table(out_file.read_text())
+    [row] = read_csv(out_file.read_text())
     assert (row["time"], row["publications"]) == ("2023-11-14T22:00:00.000Z", "4")
     code, _, err = run(capsys, *arguments)
     assert (code, "exists already" in err) == (2, True)
@@ -42,7 +42,7 @@ def test_longer_steps_are_written_to_a_file_that_is_not_overwritten(pack, capsys
 
 def test_events_are_printed(pack, capsys):
     _, out, _ = run(capsys, "history", pack, "--events")
-    assert [row["name"] for row in table(out)] == ["start", "sensor_online"]
+    assert [row["name"] for row in read_csv(out)] == ["start", "sensor_online"]
 
 
 async def test_history_is_read_while_the_service_runs(pack, capsys):
@@ -50,7 +50,7 @@ async def test_history_is_read_while_the_service_runs(pack, capsys):
         history.publish(at(600.0))
         await history._write()
         code, out, _ = run(capsys, "history", pack)
-    assert (code, len(table(out))) == (0, 5)
+    assert (code, len(read_csv(out))) == (0, 5)
 
 
 @pytest.mark.parametrize(

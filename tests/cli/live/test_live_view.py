@@ -16,7 +16,7 @@ from tests.serial_line import Line
 
 SIZES = [(40, 15), (80, 24)]
 TEN_SCREENS = 300
-"""Samples at 100 Hz while ten screens are drawn; a pseudo-terminal that is not read takes one or two screens."""
+"""Number of samples at 100 Hz while ten screens are drawn. A pseudo-terminal that is not read buffers one or two screens."""
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def demo() -> Iterator[PseudoTerminal]:
 
 
 def shows_soc(terminal: PseudoTerminal) -> bool:
-    """Return whether the screen has the SOC with its band and the true SOC."""
+    """Return True if the screen shows the SOC with its interval and the true SOC."""
     return re.search(r"demo +\d+\.\d\d ± \d+\.\d\d +\d+\.\d\d +live", "\n".join(terminal.screen())) is not None
 
 
@@ -45,14 +45,14 @@ def test_interrupted_demo_prints_a_summary_and_restores_the_terminal() -> None:
         terminal.until(lambda: "lock\r\n" in terminal.output)
         assert terminal.process.returncode == 0
         assert terminal.is_as_before()
-    last = terminal.output.split(ALTERNATE)[-1]
-    assert BACK in last
-    assert CURSOR in last
-    assert re.search(r"SOC error -20\.00% at the start, ", last.replace("\r\n", " "))
+    after_view = terminal.output.split(ALTERNATE)[-1]
+    assert BACK in after_view
+    assert CURSOR in after_view
+    assert re.search(r"SOC error -20\.00% at the start, ", after_view.replace("\r\n", " "))
     assert "Traceback" not in terminal.output
 
 
-async def test_a_service_whose_terminal_is_not_read_publishes_and_ends_on_sigterm(
+async def test_service_with_a_blocked_terminal_publishes_and_ends_on_sigterm(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
     line.plug()

@@ -14,12 +14,12 @@ from tests.patience import LONG_S
 
 
 @pytest.fixture(autouse=True)
-def wide(monkeypatch):
+def wide_terminal(monkeypatch):
     """Set a wide terminal, so that table cells are not wrapped."""
     monkeypatch.setenv("COLUMNS", "240")
 
 
-def ports(capsys, *arguments):
+def run_ports(capsys, *arguments):
     """Run the command and return exit code and stdout."""
     with pytest.raises(SystemExit) as ended:
         main(["ports", *arguments])
@@ -38,31 +38,31 @@ def simulated(*arguments):
             process.kill()
 
 
-def test_lists_existing_ports(capsys):
-    there = [port.device for port in list_ports.comports()]
-    code, out = ports(capsys)
+def test_existing_ports_are_listed(capsys):
+    devices = [port.device for port in list_ports.comports()]
+    code, out = run_ports(capsys)
     assert code == 0
-    if there:
-        assert len(re.findall(r"^ *(/dev/\S+)", out, re.MULTILINE)) == len(there)
+    if devices:
+        assert len(re.findall(r"^ *(/dev/\S+)", out, re.MULTILINE)) == len(devices)
         assert "board" not in out.splitlines()[1]
     else:
         assert out == "there is no serial port; is the board plugged in?\n"
 
 
 @pytest.mark.parametrize(
-    ("options", "answer"),
+    ("options", "description"),
     [
         (("--rate-hz", "50"), r"board, firmware 0\.2\.0, serial 0*1, 50 Hz"),
         (("--text", "--load", "constant", "--current-a", "0"), r"prints text, [34]\S* V, \S+ A"),
     ],
 )
-def test_probe_identifies_a_board_without_disturbing_it(capsys, monkeypatch, options, answer):
+def test_probe_identifies_a_board_without_disturbing_it(capsys, monkeypatch, options, description):
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", LONG_S)
     with simulated(*options) as (path, process):
         for _ in range(2):
-            code, out = ports(capsys, "--probe", path)
+            code, out = run_ports(capsys, "--probe", path)
             assert code == 0
-            assert re.search(rf"^ *{path} .* {answer} *$", out, re.MULTILINE)
+            assert re.search(rf"^ *{path} .* {description} *$", out, re.MULTILINE)
             assert f"(pid {process.pid})" in out
         assert process.poll() is None
 
@@ -74,7 +74,7 @@ def test_other_devices_are_not_identified_as_boards(capsys, tmp_path, monkeypatc
     master, slave = os.openpty()
     try:
         silent = os.ttyname(slave)
-        code, out = ports(capsys, "--probe", silent, str(tmp_path / "none"))
+        code, out = run_ports(capsys, "--probe", silent, str(tmp_path / "none"))
     finally:
         os.close(master)
         os.close(slave)
@@ -87,7 +87,7 @@ def test_other_devices_are_not_identified_as_boards(capsys, tmp_path, monkeypatc
 
 
 def test_ports_are_opened_only_with_probe(capsys, tmp_path):
-    code, out = ports(capsys, str(tmp_path / "none"))
+    code, out = run_ports(capsys, str(tmp_path / "none"))
     assert code == 0
     assert "cannot be opened" not in out
     assert str(tmp_path / "none") in out

@@ -1,4 +1,4 @@
-"""Process of command ``record``: all received bytes are in the file for any kind of end."""
+"""Process of command ``record``: the file has all received bytes, whatever ended the process."""
 
 import contextlib
 import json
@@ -18,10 +18,11 @@ from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
-LENGTH_AT = 8
-DATA_AT = 12
-"""Position in a record, after time and length [bytes]."""
-TEXT = b"3.900,1.000,25.0\r\n"
+LENGTH_OFFSET = 8
+"""Offset of the length in a record, after the time [bytes]."""
+DATA_OFFSET = 12
+"""Offset of the data in a record, after time and length [bytes]."""
+TEXT_LINE = b"3.900,1.000,25.0\r\n"
 
 
 @contextlib.contextmanager
@@ -41,14 +42,14 @@ def board():
         yield process.stdout.readline().strip()
 
 
-def until(condition, what):
+def until(condition, awaited):
     end_s = time.monotonic() + LONG_S
     while not condition():
-        assert time.monotonic() < end_s, f"{what} did not come"
+        assert time.monotonic() < end_s, f"{awaited} did not arrive"
         time.sleep(0.02)
 
 
-def size(path):
+def size_bytes(path):
     return path.stat().st_size if path.exists() else 0
 
 
@@ -57,17 +58,17 @@ def reads(path):
 
 
 def samples(path):
-    """Return the samples of a decoder that receives all complete reads."""
+    """Return the number of samples in all complete reads."""
     decoder = FrameDecoder()
     return sum(decoder.feed(arrival_s, data).size for arrival_s, data in reads(path))
 
 
-def long_enough(path):
+def has_a_second(path):
     """Return True if a growing capture holds samples of a second."""
-    return size(path) > 1_000 and samples(path) >= 100
+    return size_bytes(path) > 1_000 and samples(path) >= 100
 
 
-def replayed(capsys, path):
+def replay(capsys, path):
     """Replay a capture and return exit code, summary and stderr."""
     with pytest.raises(SystemExit) as ended:
         main(["replay", str(path), "--cell", "chen_mora", "--json"])
@@ -82,9 +83,9 @@ def test_all_bytes_are_recorded_until_ctrl_c(line: Line, tmp_path, capsys):
         while "port opened" not in (message := process.stderr.readline()):
             assert message, "the recorder has ended"
         sent = b""
-        for part in 10 * (TEXT[:7], TEXT[7:]):  # each line is split over two reads
-            line.write(part)
-            sent += part
+        for piece in 10 * (TEXT_LINE[:7], TEXT_LINE[7:]):  # each line is split over two reads
+            line.write(piece)
+            sent += piece
             until(lambda sent=sent: b"".join(data for _, data in reads(out)) == sent, f"byte {len(sent)}")
         process.send_signal(signal.SIGINT)
         message, err = process.communicate(timeout=LONG_S)
@@ -94,38 +95,38 @@ def test_all_bytes_are_recorded_until_ctrl_c(line: Line, tmp_path, capsys):
     assert (header.mode, header.port, header.baud) == ("text", str(line.path), 115200)
     arrivals_s = [arrival_s for arrival_s, _ in reads(out)]
     assert arrivals_s == sorted(arrivals_s)
-    code, result, err = replayed(capsys, out)
+    code, result, err = replay(capsys, out)
     assert (code, err) == (0, "")
     assert result["samples"] + sum(result["dropped"].values()) == 10
 
 
 def test_killed_recorder_leaves_complete_records(board, tmp_path, capsys):
-    out, cut = tmp_path / "killed.bms", tmp_path / "cut.bms"
+    out, truncated = tmp_path / "killed.bms", tmp_path / "truncated.bms"
     with program("record", out, "--port", board) as process:
-        until(lambda: long_enough(out), "a second")
+        until(lambda: has_a_second(out), "a second")
         process.kill()
         process.wait(LONG_S)
-    code, result, err = replayed(capsys, out)
+    code, result, err = replay(capsys, out)
     assert (code, err) == (0, "")
     assert result["samples"] == samples(out) >= 100
     assert result["gaps"] == 0
 
-    whole = reads(out)
-    for cut_bytes in (1, 3, len(whole[-1][1]) + 10):  # within the checksum, the data, and the record's header
-        cut.write_bytes(out.read_bytes()[:-cut_bytes])
-        assert reads(cut) == whole[:-1]
-        code, result, err = replayed(capsys, cut)
+    all_reads = reads(out)
+    for removed_bytes in (1, 3, len(all_reads[-1][1]) + 10):  # within the checksum, the data, and the record's header
+        truncated.write_bytes(out.read_bytes()[:-removed_bytes])
+        assert reads(truncated) == all_reads[:-1]
+        code, result, err = replay(capsys, truncated)
         assert code == 0
         assert err.endswith(" bytes are no complete record: truncated, or a length is damaged\n")
-        assert result["samples"] == samples(cut) > 50
+        assert result["samples"] == samples(truncated) > 50
 
 
 @pytest.fixture(scope="module")
-def recorded(board, tmp_path_factory):
+def capture(board, tmp_path_factory):
     """Record a capture of at least a second."""
     out = tmp_path_factory.mktemp("recorded") / "one.bms"
     with program("record", out, "--port", board) as process:
-        until(lambda: long_enough(out), "a second")
+        until(lambda: has_a_second(out), "a second")
         process.send_signal(signal.SIGINT)
         message, err = process.communicate(timeout=LONG_S)
     assert (process.returncode, message) == (0, "")
@@ -143,37 +144,37 @@ def test_recording_ends_after_the_duration(board, tmp_path):
     assert reads(tmp_path / "short.bms")
 
 
-def test_samples_are_those_sent_by_the_board(recorded, tmp_path, capsys):
+def test_replayed_samples_have_the_period_of_the_board(capture, tmp_path, capsys):
     table = tmp_path / "one.csv"
     with pytest.raises(SystemExit):
-        main(["replay", str(recorded), "--cell", "chen_mora", "--out", str(table)])
+        main(["replay", str(capture), "--cell", "chen_mora", "--out", str(table)])
     capsys.readouterr()
     times = np.loadtxt(table, delimiter=",", skiprows=1, usecols=0)
-    assert times.size == samples(recorded)
+    assert times.size == samples(capture)
     assert np.allclose(np.diff(times), 1 / 100, rtol=0.0, atol=1e-5)
 
 
-def test_damaged_record_is_reported_and_earlier_ones_are_read(recorded, tmp_path, capsys):
-    damaged, whole = tmp_path / "damaged.bms", reads(recorded)
-    middle = len(whole) // 2
-    data = bytearray(recorded.read_bytes())
-    data[-sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in whole[middle:]) + DATA_AT] ^= 0xFF
+def test_damaged_record_is_reported_and_earlier_ones_are_read(capture, tmp_path, capsys):
+    damaged, all_reads = tmp_path / "damaged.bms", reads(capture)
+    middle = len(all_reads) // 2
+    data = bytearray(capture.read_bytes())
+    data[-sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in all_reads[middle:]) + DATA_OFFSET] ^= 0xFF
     damaged.write_bytes(data)
-    assert reads(damaged) == whole[:middle]
-    code, result, err = replayed(capsys, damaged)
+    assert reads(damaged) == all_reads[:middle]
+    code, result, err = replay(capsys, damaged)
     assert code == 0
     assert f"warning: {damaged}: damaged after" in err
     assert result["samples"] == samples(damaged) > 10
 
 
-def test_damaged_length_is_reported(recorded, tmp_path, capsys):
-    damaged, whole = tmp_path / "damaged.bms", reads(recorded)
-    middle = len(whole) // 2
-    data = bytearray(recorded.read_bytes())
-    unread = sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in whole[middle:])
-    data[-unread + LENGTH_AT + 1] ^= 0xFF
+def test_damaged_length_is_reported(capture, tmp_path, capsys):
+    damaged, all_reads = tmp_path / "damaged.bms", reads(capture)
+    middle = len(all_reads) // 2
+    data = bytearray(capture.read_bytes())
+    unread = sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in all_reads[middle:])
+    data[-unread + LENGTH_OFFSET + 1] ^= 0xFF
     damaged.write_bytes(data)
-    code, _, err = replayed(capsys, damaged)
+    code, _, err = replay(capsys, damaged)
     assert code == 0
     assert f"the last {unread:,} bytes are no complete record" in err
 
@@ -196,12 +197,12 @@ def test_full_disk_ends_the_recording_and_the_file_is_readable(board, tmp_path, 
     assert ended.returncode == 2
     assert "error: recording ended: File too large\n" in ended.stderr
     assert "Traceback" not in ended.stderr
-    assert size(out) <= 4 * 1024
-    code, result, err = replayed(capsys, out)
+    assert size_bytes(out) <= 4 * 1024
+    code, result, err = replay(capsys, out)
     assert code == 0
     assert result["samples"] == samples(out) > 10
-    head = len(MAGIC) + 4 + int.from_bytes(out.read_bytes()[len(MAGIC) :][:4], "little") + 2
-    unread = size(out) - head - sum(RECORD_OVERHEAD_BYTES + len(data) for _, data in reads(out))
+    header_bytes = len(MAGIC) + 4 + int.from_bytes(out.read_bytes()[len(MAGIC) :][:4], "little") + 2
+    unread = size_bytes(out) - header_bytes - sum(RECORD_OVERHEAD_BYTES + len(data) for _, data in reads(out))
     message = f"warning: {out}: the last {unread:,} bytes are no complete record"
     assert (message in err) == (unread > 0)  # the limit may lie between two records
 

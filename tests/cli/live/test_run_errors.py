@@ -1,4 +1,4 @@
-"""Errors of ``run`` and the command line at start: one line for each, code 2, no traceback."""
+"""Errors of ``run`` and of the command line at the start: one line for each, code 2, no traceback."""
 
 import os
 import subprocess
@@ -19,27 +19,27 @@ OUTPUTS = [
     pytest.param(("--version",), "1", marks=pytest.mark.thorough),
     pytest.param(("ports", "/dev/null"), "1", marks=pytest.mark.thorough),
 ]
-"""Commands by the way in which they write, and PYTHONUNBUFFERED."""
+"""Commands that write in different ways, and values of PYTHONUNBUFFERED."""
 
 
 def program(*arguments):
-    """Run the program until it ends."""
+    """Run the program until it exits."""
     return subprocess.run([PROGRAM, *arguments], capture_output=True, text=True, timeout=LONG_S, check=False)
 
 
 def test_missing_pack_file_is_an_error(tmp_path):
-    ended = program("run", tmp_path / "none.toml")
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr == f"error: {tmp_path / 'none.toml'}: cannot be read: No such file or directory\n"
+    process = program("run", tmp_path / "none.toml")
+    assert (process.returncode, process.stdout) == (2, "")
+    assert process.stderr == f"error: {tmp_path / 'none.toml'}: cannot be read: No such file or directory\n"
 
 
 def test_existing_capture_is_not_overwritten(tmp_path):
     pack, capture = tmp_path / "pack.toml", tmp_path / "kept.bms"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
     capture.write_bytes(b"kept")
-    ended = program("run", pack, "--record", capture)
-    assert ended.returncode == 2
-    assert ended.stderr == f"error: {capture}: exists already; a capture is never overwritten\n"
+    process = program("run", pack, "--record", capture)
+    assert process.returncode == 2
+    assert process.stderr == f"error: {capture}: exists already; a capture is never overwritten\n"
     assert capture.read_bytes() == b"kept"
 
 
@@ -100,11 +100,11 @@ def test_every_command_can_be_imported_and_has_help(command, capsys):
 def test_unwritable_stdout_is_reported(arguments, unbuffered):
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     with Path("/dev/full").open("w") as full:
-        ended = subprocess.run(
+        process = subprocess.run(
             [PROGRAM, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False
         )
-    assert ended.stderr == "error: cannot write: No space left on device\n"
-    assert ended.returncode == 1
+    assert process.stderr == "error: cannot write: No space left on device\n"
+    assert process.returncode == 1
 
 
 @pytest.mark.parametrize(("arguments", "unbuffered"), OUTPUTS)
@@ -112,8 +112,8 @@ def test_closed_stdout_ends_quietly(arguments, unbuffered):
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     read, write = os.pipe()
     os.close(read)
-    ended = subprocess.run(
+    process = subprocess.run(
         [PROGRAM, *arguments], stdout=write, stderr=subprocess.PIPE, text=True, env=environment, check=False
     )
     os.close(write)
-    assert (ended.returncode, ended.stderr) == (1, "")
+    assert (process.returncode, process.stderr) == (1, "")

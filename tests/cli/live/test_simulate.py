@@ -19,6 +19,7 @@ from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
 RATE_HZ = 50
+"""Sample rate at the start; different from the rate that the test requests [Hz]."""
 
 
 @contextlib.contextmanager
@@ -33,7 +34,7 @@ def simulate(*arguments):
 
 
 @contextlib.contextmanager
-def opened(path):
+def open_line(path):
     descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
     try:
         yield descriptor
@@ -41,42 +42,42 @@ def opened(path):
         os.close(descriptor)
 
 
-def read(descriptor, enough, data=b""):
-    """Return ``data`` and all bytes after it, read by read, until ``enough`` of them returns True."""
+def read(descriptor, is_enough, data=b""):
+    """Read bytes and append them to ``data`` until ``is_enough(data)`` is True; return all."""
     end_s = time.monotonic() + LONG_S
-    while not enough(data):
-        assert time.monotonic() < end_s, f"{len(data)} bytes are all that came"
+    while not is_enough(data):
+        assert time.monotonic() < end_s, f"{len(data)} bytes arrived, which are not enough"
         if select.select([descriptor], [], [], 0.5)[0]:
             data += os.read(descriptor, 4096)
     return data
 
 
-def decoded(data):
+def decode(data):
     decoder = FrameDecoder()
     return decoder.feed(0.0, data), decoder
 
 
-def _step_s(data):
+def last_period_s(data):
     """Return the time between the last two samples [s]."""
-    return np.diff(decoded(data)[0]["time_s"])[-1]
+    return np.diff(decode(data)[0]["time_s"])[-1]
 
 
 def test_frames_of_the_configured_pack_until_ctrl_c():
     arguments = ("--series", "6", "--load", "constant", "--current-a", "0.5", "--rate-hz", str(RATE_HZ))
     with simulate(*arguments) as (process, path):
         assert Path(path).is_char_device()
-        with opened(path) as line:
-            data = read(line, lambda data: decoded(data)[0].size >= RATE_HZ)
+        with open_line(path) as line:
+            data = read(line, lambda data: decode(data)[0].size >= RATE_HZ)
             os.write(line, set_rate_command(100))
-            later = read(line, lambda data: _step_s(data) < 0.015, data)
-        block, decoder = decoded(data)
+            later = read(line, lambda data: last_period_s(data) < 0.015, data)
+        block, decoder = decode(data)
         assert decoder.board["sample_rate_hz"] == str(RATE_HZ)
         assert decoder.counters.crc_errors == 0
         assert decoder.counters.frames_lost == 0
         assert np.allclose(np.diff(block["time_s"]), 1.0 / RATE_HZ, rtol=0.0, atol=1e-5)
         assert block["current_a"].mean() == pytest.approx(0.5, abs=0.05)
         assert block["voltage_v"].mean() == pytest.approx(6 * 3.9, abs=1.0)
-        assert _step_s(later) == pytest.approx(1.0 / 100, rel=0.01)  # the rate requested by the host
+        assert last_period_s(later) == pytest.approx(1.0 / 100, rel=0.01)  # the rate requested by the host
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=LONG_S)
     assert (process.returncode, out) == (0, "")
@@ -85,7 +86,7 @@ def test_frames_of_the_configured_pack_until_ctrl_c():
 
 def test_text_lines_have_the_format_of_a_sketch():
     with simulate("--text", "--current-a", "0.2", "--load", "constant") as (process, path):
-        with opened(path) as line:
+        with open_line(path) as line:
             lines = read(line, lambda data: data.count(b"\r\n") >= 20).split(b"\r\n")[:-1]
         process.send_signal(signal.SIGTERM)
         assert process.wait(LONG_S) == 0
@@ -114,7 +115,7 @@ def test_simulation_ends_after_the_simulated_duration():
         ("--protocol", "jbd", "--series", "40"),
     ],
 )
-def test_unknown_names_are_reported(arguments, capsys):
+def test_invalid_arguments_are_reported(arguments, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["simulate", *arguments])
     out, err = capsys.readouterr()

@@ -17,7 +17,7 @@ def pack(tmp_path: Path) -> Path:
     return tmp_path / "pack.toml"
 
 
-def linux(pack: Path) -> Path:
+def write_linux_settings(pack: Path) -> Path:
     """Write settings of a pack with a simulated sensor chip of this machine."""
     folder = hwmon(pack.parent / "sys", in1_input=53120, curr1_input=-2510)
     pack.write_text(f'[source]\nkind = "linux"\nchip = "{folder}"\ninterval_s = 0.01\n')
@@ -25,7 +25,7 @@ def linux(pack: Path) -> Path:
 
 
 def test_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys):
-    code, out, _ = run(capsys, "config", "check", linux(pack))
+    code, out, _ = run(capsys, "config", "check", write_linux_settings(pack))
     assert code == 0
     assert "hwmon3 of this machine; no broker" in out
     raw = tmp_path / "chip.raw"
@@ -39,7 +39,7 @@ def test_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys):
 
 @pytest.mark.parametrize(("command", "options"), [("run", ("--no-view",)), ("record", ("x.raw", "--pack"))])
 def test_port_option_is_rejected_without_a_serial_source(command, options, pack, capsys):
-    code, _, err = run(capsys, command, *options, linux(pack), "--port", "/dev/ttyACM0")
+    code, _, err = run(capsys, command, *options, write_linux_settings(pack), "--port", "/dev/ttyACM0")
     assert code == 2
     assert "port: applies to a serial port, but the settings have another [source]" in err
 
@@ -74,6 +74,6 @@ def test_output_of_show_with_a_profile_is_read_back(pack, tmp_path, capsys):
     code, out, _ = run(capsys, "config", "show", pack)
     assert code == 0
     assert tomllib.loads(out)["source"]["voltage"]["path"] == "value"
-    again = tmp_path / "again.toml"
-    again.write_text(out)
-    assert load_settings(again) == load_settings(pack)
+    copy = tmp_path / "copy.toml"
+    copy.write_text(out)
+    assert load_settings(copy) == load_settings(pack)

@@ -1,4 +1,4 @@
-"""``top`` on a real pseudo-terminal with a real broker: it shows the publications."""
+"""``top`` on a real pseudo-terminal with a real broker: it shows the published states."""
 
 import asyncio
 import subprocess
@@ -15,14 +15,14 @@ from tests.pseudo_terminal import BACK, PseudoTerminal
 from tests.sinks.snapshots import NOW, ONE
 
 
-def of(device: str, voltage_v: float) -> Snapshot:
+def snapshot_of(device: str, voltage_v: float) -> Snapshot:
     assert ONE.estimate
     info = ONE.info.model_copy(update={"device": device})
     return ONE._replace(info=info, estimate=ONE.estimate.model_copy(update={"voltage_v": voltage_v}))
 
 
 async def publish(client: Listener, device: str, voltage_v: float) -> None:
-    messages, snapshot = MessageBuilder("bms", device), of(device, voltage_v)
+    messages, snapshot = MessageBuilder("bms", device), snapshot_of(device, voltage_v)
     for message in (
         *messages.birth_messages(),
         *messages.live_messages(PublishedState(), snapshot, NOW)[0],
@@ -37,20 +37,20 @@ async def client(broker: Broker) -> AsyncIterator[Listener]:
         yield client
 
 
-async def test_two_packs_of_a_broker_that_goes(broker: Broker, client: Listener) -> None:
-    def shows(*wanted: str) -> None:
-        terminal.until(lambda: all(each in "\n".join(terminal.screen()) for each in wanted))
+async def test_two_packs_and_a_lost_broker_are_shown(broker: Broker, client: Listener) -> None:
+    def wait_for(*texts: str) -> None:
+        terminal.until(lambda: all(each in "\n".join(terminal.screen()) for each in texts))
 
     with PseudoTerminal("top", "--mqtt", broker.url, columns=100, rows=40) as terminal:
-        await asyncio.to_thread(shows, "no pack has published anything yet")
+        await asyncio.to_thread(wait_for, "no pack has published anything yet")
         await publish(client, "attic", 51.234)
-        await asyncio.to_thread(shows, "attic ", "51.234")
+        await asyncio.to_thread(wait_for, "attic ", "51.234")
         await publish(client, "barn", 13.579)
-        await asyncio.to_thread(shows, "attic ", "51.234", "barn ", "13.579")
+        await asyncio.to_thread(wait_for, "attic ", "51.234", "barn ", "13.579")
         await client.publish("bms/attic/sensor/availability", b"offline", qos=1)
-        await asyncio.to_thread(shows, "attic: stale since")
+        await asyncio.to_thread(wait_for, "attic: stale since")
         broker.stop()
-        await asyncio.to_thread(shows, "no broker since", "51.234")
+        await asyncio.to_thread(wait_for, "no broker since", "51.234")
         terminal.press(b"x\t\x1b[Bq")  # keys other than q do nothing
         await asyncio.to_thread(terminal.until, terminal.ended)
         assert terminal.process.returncode == 0
@@ -59,14 +59,14 @@ async def test_two_packs_of_a_broker_that_goes(broker: Broker, client: Listener)
     assert "Traceback" not in terminal.output
 
 
-async def test_without_a_terminal_each_state_is_a_line(broker: Broker, client: Listener, tmp_path: Path) -> None:
+async def test_each_state_is_a_line_without_a_terminal(broker: Broker, client: Listener, tmp_path: Path) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text(f'[mqtt]\nurl = "{broker.url}"\n')
     process = await asyncio.create_subprocess_exec(PROGRAM, "top", str(pack), stdout=subprocess.PIPE)
     try:
         assert process.stdout
         reading = asyncio.create_task(process.stdout.readline())
-        while not reading.done():  # until it listens: a state is not retained
+        while not reading.done():  # states are not retained, so they are repeated until the program has subscribed
             await publish(client, "attic", 51.234)
             await asyncio.wait([reading], timeout=0.2)
         line = reading.result().decode()
@@ -78,7 +78,7 @@ async def test_without_a_terminal_each_state_is_a_line(broker: Broker, client: L
     assert process.returncode == 0
 
 
-def test_what_cannot_be_watched_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_settings_without_a_broker_are_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text('[pack]\nname = "attic"\n')
     assert run(capsys, "top", pack) == (

@@ -1,4 +1,4 @@
-"""A first start shows that kernels are being compiled."""
+"""Progress line about compiled kernels at a first start."""
 
 import os
 import signal
@@ -15,7 +15,7 @@ from tests.patience import LONG_S
 
 
 @pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.thorough), "replay", "run"])
-def test_a_first_start_says_that_it_compiles_and_can_be_interrupted(command: str, tmp_path: Path) -> None:
+def test_first_start_reports_the_compilation_and_can_be_interrupted(command: str, tmp_path: Path) -> None:
     pack, table = tmp_path / "pack.toml", tmp_path / "table.csv"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
     table.write_text("time_s,current_a,voltage_v\n0,0,3.7\n1,0,3.7\n")
@@ -24,9 +24,13 @@ def test_a_first_start_says_that_it_compiles_and_can_be_interrupted(command: str
         "replay": [table, "--cell", "ncr18650"],
         "run": [pack],
     }
-    cold = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    empty_cache = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     with subprocess.Popen(
-        [PROGRAM, command, *arguments[command]], env=cold, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        [PROGRAM, command, *arguments[command]],
+        env=empty_cache,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         try:
             assert process.stderr
@@ -40,7 +44,7 @@ def test_a_first_start_says_that_it_compiles_and_can_be_interrupted(command: str
     assert ('"level": "info"' in first) == (command == "run")
 
 
-def test_the_line_comes_once_and_only_if_a_kernel_compiles() -> None:
+def test_line_is_printed_once_and_only_if_a_kernel_is_compiled() -> None:
     lines: list[str] = []
     kernel = njit(chen_mora.crossing.py_func)  # not in the cache
     with show_compile_progress(lines.append):

@@ -1,4 +1,4 @@
-"""Numbers accepted by options."""
+"""Formats and limits of numbers in options."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from tests.command_line import run
 
 
 @pytest.mark.parametrize("text", ["3_9", "٣", "nan", "inf", "-inf", "0x3", "3,9", "", "1e999"])
-def test_only_decimal_numbers_are_numbers(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_that_is_no_decimal_number_is_rejected(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, "board", "/dev/null", f"--divider={text}")
     assert code == 2
     assert "--divider" in err
@@ -52,7 +52,7 @@ def test_python_number_formats_are_rejected(option: str, capsys: pytest.CaptureF
     ],
 )
 @pytest.mark.parametrize("text", ["1_200", "٣", "0x3", "3.0", "1e3", ""])
-def test_only_digits_are_an_integer(option: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_that_is_no_integer_is_rejected(option: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, *f"{option}={text}".split(" "))
     assert code == 2
     assert "not an integer" in err

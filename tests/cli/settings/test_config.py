@@ -1,4 +1,4 @@
-"""``config``: its output is accepted, errors are named, and the shown settings can be read."""
+"""``config``: generated files are valid, errors name the setting, and the output of ``show`` can be read."""
 
 import re
 import tomllib
@@ -31,7 +31,7 @@ def test_init_writes_defaults_that_check_accepts(pack, capsys):
     assert load_settings(pack) == Settings()
 
 
-NEEDED = {
+REQUIRED_SETTINGS = {
     "ble": "name = 'battery'\n",
     "can": "dbc = 'pack.dbc'\nvoltage = { signal = 'V' }\ncurrent = { signal = 'I' }\n",
     "mqtt": "profile = 'opendtu'\n",
@@ -45,14 +45,14 @@ def test_file_contains_all_settings_and_accepts_them_uncommented(pack, capsys):
     lines = pack.read_text().splitlines()
     for name, field in Settings.model_fields.items():
         assert f"[{name}]" in lines or f"#[{name}]" in lines, field
-    set_now = [line.removeprefix("#") for line in lines if not line.startswith("# ") and not line.endswith("= ")]
-    sections = re.split(r"^(?=\[)", "\n".join(set_now), flags=re.MULTILINE)
+    uncommented = [line.removeprefix("#") for line in lines if not line.startswith("# ") and not line.endswith("= ")]
+    sections = re.split(r"^(?=\[)", "\n".join(uncommented), flags=re.MULTILINE)
     sources = [section for section in sections if section.startswith("[source]")]
     assert len(sources) == len(KINDS)
-    for source in sources:  # alternatives
+    for source in sources:  # only one [source] is allowed at a time
         kind = tomllib.loads(source)["source"]["kind"]
-        whole = source + NEEDED.get(kind, "")
-        pack.write_text("\n".join([*(section for section in sections if section not in sources), whole]))
+        complete_source = source + REQUIRED_SETTINGS.get(kind, "")
+        pack.write_text("\n".join([*(section for section in sections if section not in sources), complete_source]))
         written = tomllib.loads(pack.read_text())
         assert written["sensor"]["baud"] == Settings().sensor.baud
         assert set(written) == set(Settings.model_fields)
@@ -60,8 +60,8 @@ def test_file_contains_all_settings_and_accepts_them_uncommented(pack, capsys):
         assert loaded.source
         assert loaded.source.kind in KINDS
         assert loaded.sensor.protocol == "text"
-        told = set(written["sensor"]) - {"protocol"}
-        assert loaded.sensor.model_dump(include=told) == Settings().sensor.model_dump(include=told)
+        checked_fields = set(written["sensor"]) - {"protocol"}
+        assert loaded.sensor.model_dump(include=checked_fields) == Settings().sensor.model_dump(include=checked_fields)
 
 
 @pytest.fixture
@@ -169,10 +169,10 @@ def test_show_prints_the_settings_in_effect_as_toml(pack, capsys):
     pack.write_text('[pack]\ncell = "chen_mora"\nseries = 6\n[sensor]\nport = "/dev/ttyACM3"\n')
     code, out, err = run(capsys, "config", "show", pack)
     assert (code, err) == (0, "")
-    shown = tomllib.loads(out)
-    assert shown["pack"]["series"] == 6
-    assert shown["sensor"] == {**tomllib.loads(_shown(capsys))["sensor"], "port": "/dev/ttyACM3"}
-    assert Settings.model_validate(shown) == load_settings(pack)
+    settings = tomllib.loads(out)
+    assert settings["pack"]["series"] == 6
+    assert settings["sensor"] == {**tomllib.loads(default_settings(capsys))["sensor"], "port": "/dev/ttyACM3"}
+    assert Settings.model_validate(settings) == load_settings(pack)
     assert "# pack.series_count = 6\n" in out
 
 
@@ -182,9 +182,9 @@ def test_output_of_show_is_read_back(gain, pack, tmp_path, capsys):
     code, out, _ = run(capsys, "config", "show", pack)
     assert code == 0
     assert f"rearm_gain = {gain}\n" in out
-    again = tmp_path / "again.toml"
-    again.write_text(out)
-    assert load_settings(again) == load_settings(pack) != Settings()
+    copy = tmp_path / "copy.toml"
+    copy.write_text(out)
+    assert load_settings(copy) == load_settings(pack) != Settings()
 
 
 def test_units_and_limits_are_written_in_full(pack, capsys):
@@ -194,7 +194,7 @@ def test_units_and_limits_are_written_in_full(pack, capsys):
     assert "at most 10000000]\n#baud = 500000\n" in text
 
 
-def _shown(capsys):
+def default_settings(capsys):
     """Return the output of ``show`` without a file, which has the defaults."""
     code, out, _ = run(capsys, "config", "show")
     assert code == 0

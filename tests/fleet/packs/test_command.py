@@ -18,9 +18,9 @@ from tests.free_port import free_port
 TABLE = "pack,cell,capacity_ah,series,protocol\nboat,own.toml,,2,\nhouse,lfp,280.0,16,jk\n"
 
 
-async def with_connection(url, work):
+async def with_connection(url, use_connection):
     async with await nats.connect(url) as nc:
-        await work(nc)
+        await use_connection(nc)
 
 
 @pytest.fixture(scope="module")
@@ -45,21 +45,21 @@ def test_table_round_trip(url, table, capsys):
     assert out.startswith(f"{table}: 2 packs of 2 kinds: 2 new")
     code, out, err = run(capsys, "fleet", "packs", "list", "--server", url)
     assert (code, out, err) == (0, "pack,cell,capacity_ah,series,protocol\nboat,own,,2,\nhouse,lfp,280.0,16,jk\n", "")
-    again = table.with_name("again.csv")
-    again.write_text(out)
+    printed = table.with_name("printed.csv")
+    printed.write_text(out)
     assert (
-        run(capsys, "fleet", "packs", "load", again, "--server", url)[1]
-        == f"{again}: 2 packs of 2 kinds: 2 unchanged\n"
+        run(capsys, "fleet", "packs", "load", printed, "--server", url)[1]
+        == f"{printed}: 2 packs of 2 kinds: 2 unchanged\n"
     )
 
 
 def test_rows_are_removed_on_request_and_by_name(url, table, capsys):
     run(capsys, "fleet", "packs", "load", table, "--server", url)
-    less = table.with_name("less.csv")
-    less.write_text("pack,cell\nshed,ncr18650\n")
-    out = run(capsys, "fleet", "packs", "load", less, "--server", url)[1]
-    assert out == f"{less}: 1 packs of 1 kinds: 1 new, 2 not in the table (--remove removes them)\n"
-    assert run(capsys, "fleet", "packs", "load", less, "--remove", "--server", url)[1].endswith(
+    smaller_table = table.with_name("smaller_table.csv")
+    smaller_table.write_text("pack,cell\nshed,ncr18650\n")
+    out = run(capsys, "fleet", "packs", "load", smaller_table, "--server", url)[1]
+    assert out == f"{smaller_table}: 1 packs of 1 kinds: 1 new, 2 not in the table (--remove removes them)\n"
+    assert run(capsys, "fleet", "packs", "load", smaller_table, "--remove", "--server", url)[1].endswith(
         "1 unchanged, 2 removed\n"
     )
     code, _, err = run(capsys, "fleet", "packs", "remove", "shed", "boat", "--server", url)

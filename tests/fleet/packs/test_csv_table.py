@@ -1,4 +1,4 @@
-"""Table of packs: reading, writing and error texts."""
+"""Table of packs: parsing, printing and error texts."""
 
 import pytest
 
@@ -25,9 +25,9 @@ def table(tmp_path):
 
 
 def error_of(path):
-    with pytest.raises(UserError) as caught:
+    with pytest.raises(UserError) as error_info:
         read_table(path)
-    return str(caught.value).replace(f"{path}: ", "")
+    return str(error_info.value).replace(f"{path}: ", "")
 
 
 @pytest.mark.parametrize("separator", [",", ";"])
@@ -35,12 +35,12 @@ def error_of(path):
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_separators_line_ends_and_byte_order_mark(table, separator, encoding, end):
     text = "pack,cell,capacity_ah,series\nhouse,lfp,100,16\n\n boat , nmc ,1.5e2,\n"
-    read = read_table(table(text.replace(",", separator).replace("\n", end), encoding))
-    assert {name: line.kind for name, line in read.packs.items()} == {
+    parsed = read_table(table(text.replace(",", separator).replace("\n", end), encoding))
+    assert {name: line.kind for name, line in parsed.packs.items()} == {
         "house": PackSpec(cell="lfp", capacity_ah=100.0, series=16),
         "boat": PackSpec(cell="nmc", capacity_ah=150.0),
     }
-    assert [line.number for line in read.packs.values()] == [2, 4]
+    assert [line.number for line in parsed.packs.values()] == [2, 4]
 
 
 @pytest.mark.parametrize(
@@ -96,12 +96,12 @@ def test_number_of_errors_is_limited(table):
 def test_cell_file_beside_the_table(table, tmp_path):
     (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
     path = table("pack,cell\nhouse,own.toml\n")
-    read = read_table(path)
-    assert read.packs["house"].kind == PackSpec(cell="own")
-    assert read.cell_files == {"own": tmp_path / "own.toml"}
-    check_models(path, read, {"own": (tmp_path / "own.toml").read_text()})
+    parsed = read_table(path)
+    assert parsed.packs["house"].kind == PackSpec(cell="own")
+    assert parsed.cell_files == {"own": tmp_path / "own.toml"}
+    check_models(path, parsed, {"own": (tmp_path / "own.toml").read_text()})
     with pytest.raises(UserError, match=r"packs\.csv: line 2: own: no cell file of this name was loaded"):
-        check_models(path, read, {})
+        check_models(path, parsed, {})
 
 
 def test_kind_without_a_cell_is_reported_once(table):
@@ -130,8 +130,8 @@ def test_all_shipped_cells_are_valid():
 
 def test_table_round_trip(table):
     kinds = {"b": LFP, "a": PackSpec(cell="ncr18650", protocol="jbd")}
-    read = read_table(table("".join(table_lines(kinds))))
-    assert {name: line.kind for name, line in read.packs.items()} == kinds
+    parsed = read_table(table("".join(table_lines(kinds))))
+    assert {name: line.kind for name, line in parsed.packs.items()} == kinds
 
 
 def test_packs_of_one_kind_share_settings_and_model():
@@ -139,7 +139,7 @@ def test_packs_of_one_kind_share_settings_and_model():
     for i in range(1000):
         registry.set_row(f"p{i}", encode_row(LFP.model_copy(update={"series": 14 + i % 5})))
     entries = [registry(f"p{i}") for i in range(1000)]
-    assert len({id(one) for one in entries}) == 5
+    assert len({id(entry) for entry in entries}) == 5
     settings, model = entries[0]
     assert model.cell.series_count == settings.pack.series == 14
 

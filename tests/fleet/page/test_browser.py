@@ -74,7 +74,7 @@ async def browser() -> AsyncIterator[Browser]:
 
 @pytest.fixture(scope="module")
 def hours(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with hours of twelve packs that lose 6 % of their capacity in a year; one has half the others' capacity."""
+    """Return a folder with hours of twelve packs that lose 6 % of their capacity in a year; one has half the others' capacity."""
     folder, rng = tmp_path_factory.mktemp("hours"), np.random.default_rng(1)
     truth = np.full((12, 1), -0.02) - 0.06 * np.arange(30) / 365.25
     truth[0] -= 0.7
@@ -95,12 +95,12 @@ async def fleet(cluster: NatsCluster, hours: Path) -> AsyncIterator[Fleet]:
     await load(nc, [*PACKS, LISTED_ONLY])
     settings = PageSettings(listen="127.0.0.1:0")
     async with fleet_page(Server(cluster.url), settings, hours, step_s=STEP_S) as url:
-        working = asyncio.create_task(work(nc))
+        publisher_task = asyncio.create_task(work(nc))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(packs, "ALIVE_S", math.inf)  # van-2 has no state, but must not become silent
             yield Fleet(cluster, nc, url)
-        working.cancel()
-        await asyncio.gather(working, return_exceptions=True)
+        publisher_task.cancel()
+        await asyncio.gather(publisher_task, return_exceptions=True)
     await nc.close()
 
 
@@ -123,8 +123,8 @@ async def work(nc: Client) -> None:
 
 
 @contextlib.asynccontextmanager
-async def open_page(browser: Browser, fleet: Fleet, at: str = "") -> AsyncIterator[Tab]:
-    async with tab(browser, f"{fleet.url}{at}") as browser_tab:
+async def open_page(browser: Browser, fleet: Fleet, fragment: str = "") -> AsyncIterator[Tab]:
+    async with tab(browser, f"{fleet.url}{fragment}") as browser_tab:
         await browser_tab.until_status("live")
         await browser_tab.until_text("known", "of 4")
         await browser_tab.until_text("alive", "3")
@@ -132,7 +132,7 @@ async def open_page(browser: Browser, fleet: Fleet, at: str = "") -> AsyncIterat
 
 
 @in_module
-async def test_overview(browser: Browser, fleet: Fleet) -> None:
+async def test_overview_has_counts_and_distributions(browser: Browser, fleet: Fleet) -> None:
     async with open_page(browser, fleet) as browser_tab:
         await browser_tab.until_text("partitions", "of 8")
         await browser_tab.until_text("attention", "3")
@@ -218,7 +218,7 @@ async def test_search_by_prefix_with_the_keyboard(browser: Browser, fleet: Fleet
 
 
 @in_module
-async def test_query_results(browser: Browser, fleet: Fleet) -> None:
+async def test_query_results_are_shown(browser: Browser, fleet: Fleet) -> None:
     async with open_page(browser, fleet) as browser_tab:
         answers = browser_tab.page.locator("#answers")
         text = await answers.locator("[data-answer=soh] tbody").inner_text()
@@ -233,14 +233,14 @@ async def test_query_results(browser: Browser, fleet: Fleet) -> None:
 
 
 @in_module
-async def test_nothing_is_wider_than_the_screen(browser: Browser, fleet: Fleet) -> None:
-    wider = """width => [...document.querySelectorAll("body, header *, #fleet, .card, .card :not(.scroll *)")]
+async def test_no_element_is_wider_than_the_screen(browser: Browser, fleet: Fleet) -> None:
+    overflowing_elements = """width => [...document.querySelectorAll("body, header *, #fleet, .card, .card :not(.scroll *)")]
         .filter((e) => e.getBoundingClientRect().right > width + 0.5).map((e) => e.outerHTML.slice(0, 80))"""
     async with open_page(browser, fleet) as browser_tab:
         await browser_tab.until("() => document.querySelectorAll('#concerns tr').length === 3")
         for width, height in ((320, 600), (390, 844), (768, 1024), (1920, 1080)):
             await browser_tab.page.set_viewport_size({"width": width, "height": height})
-            assert await browser_tab.page.evaluate(wider, width) == []
+            assert await browser_tab.page.evaluate(overflowing_elements, width) == []
 
 
 @in_module
@@ -255,9 +255,9 @@ async def test_page_is_stale_without_the_server_and_reconnects(browser: Browser,
         await browser_tab.until_text("alive", "3")
         await browser_tab.until_text("held", "7")
         assert await browser_tab.page.inner_text("#why") == ""
-        late = await nats.connect(fleet.cluster.url)  # the old connection may still be reconnecting
-        await load(late, [Pack("late-1", HOME, b"")])
-        await late.close()
+        other_connection = await nats.connect(fleet.cluster.url)  # the old connection may still be reconnecting
+        await load(other_connection, [Pack("late-1", HOME, b"")])
+        await other_connection.close()
         await browser_tab.until_text("known", "of 5")
 
 
@@ -278,8 +278,8 @@ async def test_foreign_host_names_are_rejected(fleet: Fleet) -> None:
 def test_served_files_are_small_and_refer_to_no_other_host() -> None:
     assert {file.path for file in FILES.values()} >= set(STATIC.iterdir())
     assert sum(file.path.stat().st_size for file in FILES.values()) <= MAX_BYTES
-    own = [path.read_text() for path in STATIC.iterdir()]
-    assert not any("http://" in text or "https://" in text for text in own)
+    texts = [path.read_text() for path in STATIC.iterdir()]
+    assert not any("http://" in text or "https://" in text for text in texts)
 
 
 @in_module
@@ -309,14 +309,16 @@ async def test_unreachable_server_is_reported_and_retried() -> None:
 
 
 @in_module
-async def test_ends_although_the_library_swallows_a_cancellation(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_feed_ends_although_the_library_swallows_a_cancellation(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     refreshing, swallowed = asyncio.Event(), asyncio.Event()
 
     async def refresh(_: PackBucket) -> set[str]:
         refreshing.set()
         try:
             await asyncio.Event().wait()
-        except asyncio.CancelledError:  # as wait_for of Python 3.11 does if the response arrives at that moment
+        except asyncio.CancelledError:  # wait_for of Python 3.11 swallows it if the response arrives now
             swallowed.set()
         return set()
 
@@ -345,7 +347,7 @@ async def test_end_of_the_feed_is_reported(fleet: Fleet, monkeypatch: pytest.Mon
         while await changes.get() is not None:
             pass
         assert feed._nc
-        await feed._nc.close()  # as after the server has closed the connection permanently
+        await feed._nc.close()  # as if the server had closed the connection permanently
         await until("the server has closed the connection: check --creds")
     monkeypatch.setattr(PackBucket, "refresh", refresh)
     async with FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), changes.put_nowait):
@@ -355,9 +357,9 @@ async def test_end_of_the_feed_is_reported(fleet: Fleet, monkeypatch: pytest.Mon
 @in_module
 async def test_summaries_before_the_start_are_read(fleet: Fleet) -> None:
     hour = json.dumps({"suspects": int(InputFault.OCV)}).encode()
-    late = await nats.connect(fleet.cluster.url)
-    await late.jetstream(timeout=LONG_S).publish(subjects.hours("early-1"), hour)
-    await late.close()
+    other_connection = await nats.connect(fleet.cluster.url)
+    await other_connection.jetstream(timeout=LONG_S).publish(subjects.hours("early-1"), hour)
+    await other_connection.close()
     view = FleetView(1, 0.0)
     async with FleetFeed(Server(fleet.cluster.url), view, lambda _: None), asyncio.timeout(LONG_S):
         while not (view.packs.find("early") and view.workers.partitions == PARTITIONS):  # noqa: ASYNC110 - the view has no notifications

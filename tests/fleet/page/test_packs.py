@@ -88,8 +88,8 @@ def test_packs_with_concerns_are_ranked_and_counted_once():
             "unknown": healthy(soc=None, soc_std=None, stability_margin=None),
         }
     )
-    both = InputFault.CAPACITY | InputFault.SIGN_OF_CURRENT
-    packs.receive_hour("wide", json.dumps({"suspects": int(both)}).encode())
+    faults = InputFault.CAPACITY | InputFault.SIGN_OF_CURRENT
+    packs.receive_hour("wide", json.dumps({"suspects": int(faults)}).encode())
     packs.receive_hour("healthy", json.dumps({"suspects": int(InputFault.OCV)}).encode())
     overview = packs.overview(1.0, 0.0)
     concerns = overview["concerns"]
@@ -117,7 +117,7 @@ def test_worst_of_many_packs_are_listed():
     assert len(json.dumps(overview)) < 10_000
 
 
-def test_names_are_found_by_prefix():
+def test_packs_are_found_by_prefix():
     packs = receive_states({f"van-{n:03d}": healthy() for n in range(100)})
     packs.list_pack("attic", "lfp 16s1p")
     assert packs.find("van-01") == [f"van-{n:03d}" for n in range(10, 20)]
@@ -126,7 +126,7 @@ def test_names_are_found_by_prefix():
     assert len(packs.find("")) == MAX_LISTED
 
 
-def test_details_of_one_pack():
+def test_details_of_a_pack_have_state_parameters_and_suspicions():
     packs = receive_states({"a": healthy()}, 5.0)
     packs.receive_parameters("a", ONE.parameters.model_dump_json().encode())
     packs.receive_hour("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
@@ -162,7 +162,7 @@ def heartbeat(worker: str, *partitions: int, **values: object) -> Heartbeat:
     return Heartbeat.model_validate({"id": worker, "started_s": 0.0, "partitions": partitions, **values})
 
 
-def test_owners_of_partitions():
+def test_unheld_and_twice_held_partitions_are_found():
     workers = FleetWorkers(4)
     workers.receive(heartbeat("b", 2, 9, lag_s=3.0), 0.0)
     workers.receive(heartbeat("a", 0, 2, lag_s=1.0), 1.0)
@@ -204,7 +204,7 @@ def test_unknown_packs_are_listed_until_they_are_known_or_no_worker_has_any():
     assert view.overview(4.0, 0.0)["concerns"]["unknown"] == {"count": 0, "packs": []}
 
 
-def test_rate_of_states():
+def test_rate_of_states_is_measured():
     view = FleetView(1, 0.0)
     for second in range(20):
         for _ in range(5):
@@ -230,6 +230,6 @@ def test_reconnecting_clears_workers_but_not_packs():
     assert overview["listening_s"] == 1.0
 
 
-def test_type_names():
+def test_type_name_has_cell_layout_and_capacity():
     assert type_name(HOME) == "lfp 16s1p 280 Ah"
     assert type_name("series: must be above 0") == "wrong rows"

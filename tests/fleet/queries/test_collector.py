@@ -27,6 +27,7 @@ from tests.fleet.nats_cluster import running
 from tests.patience import LONG_S
 
 MIDNIGHT = 490_000 // 24 * 24
+"""Hour of a midnight [hours since 1970]."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def cluster(tmp_path_factory):
 
 @pytest.fixture
 async def nc(cluster):
-    """Connection to a server with an empty stream of hours."""
+    """Yield a connection to a server with an empty stream of hours."""
     nc = await nats.connect(cluster.url)
     await make_streams(nc, partitions=1)
     await nc.jetstream().purge_stream(subjects.HOURS_STREAM)
@@ -64,7 +65,7 @@ async def until(condition):
 
 
 @contextlib.asynccontextmanager
-async def collecting(collector):
+async def running_collector(collector):
     stop = asyncio.Event()
     task = asyncio.create_task(collector.run(stop))
     try:
@@ -85,19 +86,19 @@ async def test_permanently_closed_connection_raises(cluster, tmp_path):
 async def test_rows_are_written_by_day_and_acknowledged(nc, tmp_path):
     await publish(nc, [make_hour("a", MIDNIGHT - 1), make_hour("a", MIDNIGHT), make_hour("b", MIDNIGHT)])
     collector = Collector(nc, tmp_path, period_s=0.0)
-    async with collecting(collector):
+    async with running_collector(collector):
         await until(lambda: collector.counters["rows"] == 3)
     assert sorted(day.name for day in tmp_path.iterdir()) == ["date=2025-11-23", "date=2025-11-24"]
-    js, left = nc.jetstream(timeout=LONG_S), None
+    js, unprocessed = nc.jetstream(timeout=LONG_S), None
     async with asyncio.timeout(LONG_S):  # the server processes acknowledgments asynchronously
-        while left != (0, 0):
+        while unprocessed != (0, 0):
             info = await js.consumer_info(subjects.HOURS_STREAM, "collector")
-            left = info.num_ack_pending, info.num_pending
+            unprocessed = info.num_ack_pending, info.num_pending
 
 
-async def test_what_waits_is_written_at_the_end_and_rubbish_is_said(nc, tmp_path):
+async def test_waiting_rows_are_written_at_shutdown_and_invalid_rows_are_counted(nc, tmp_path):
     collector = Collector(nc, tmp_path, period_s=3600.0)
-    async with collecting(collector):
+    async with running_collector(collector):
         await nc.publish(subjects.hours("x"), b"{}")
         await publish(nc, [make_hour("a", MIDNIGHT)])
         await until(lambda: collector.counters["unreadable"] == 1 and collector._waiting)
@@ -106,7 +107,7 @@ async def test_what_waits_is_written_at_the_end_and_rubbish_is_said(nc, tmp_path
 
 
 async def test_unacknowledged_rows_of_a_killed_collector_are_redelivered(cluster, nc, tmp_path):
-    """The command is killed with waiting and with written rows; another collector continues."""
+    """Kill the command while it has waiting and written rows, and continue with another collector."""
     rows = [make_hour(f"p{n}", MIDNIGHT + hour) for hour in range(4) for n in range(500)]
     command = PROGRAM, "fleet", "collect", "--server", cluster.url, "--folder", tmp_path, "--period", "0"
     process = await asyncio.create_subprocess_exec(*command)
@@ -119,10 +120,10 @@ async def test_unacknowledged_rows_of_a_killed_collector_are_redelivered(cluster
     await process.wait()
     collector = Collector(nc, tmp_path, period_s=0.0)
     with only_collector(tmp_path):
-        async with collecting(collector):
+        async with running_collector(collector):
             await until(lambda: collector._subscription)
             config = (await nc.jetstream().consumer_info(subjects.HOURS_STREAM, "collector")).config
-            config.ack_wait = 0.5  # shorter than the collector's minute
+            config.ack_wait = 0.5  # shorter than the collector's 60 s
             await nc.jetstream().add_consumer(subjects.HOURS_STREAM, config)
             await until(lambda: len({row[:2] for row in rows_of(tmp_path)}) == len(rows))
 
@@ -136,19 +137,19 @@ async def test_missing_stream_raises(nc, tmp_path):
 def test_files_of_a_day_are_merged_after_its_end_or_if_many(tmp_path):
     for n in range(3):
         write(tmp_path, [make_hour("b", MIDNIGHT), make_hour("a", MIDNIGHT + n)])
-    late_s = (MIDNIGHT + 27) * 3600.0
-    assert to_compact(tmp_path, late_s - 7200.0) == []
-    (day,) = to_compact(tmp_path, late_s)
+    after_day_s = (MIDNIGHT + 27) * 3600.0
+    assert to_compact(tmp_path, after_day_s - 7200.0) == []
+    (day,) = to_compact(tmp_path, after_day_s)
     (day / f".x.parquet{UNFINISHED_SUFFIX}").touch()
     (day / "half.parquet").write_bytes(b"PAR1 and no more")
     compact(day)
     assert [row[:2] for row in rows_of(tmp_path)] == [("a", MIDNIGHT + n) for n in range(3)] + [("b", MIDNIGHT)]
     assert len(complete_files(day)) == 1
-    assert to_compact(tmp_path, late_s) == []
-    (late,) = write(tmp_path, [make_hour("c", MIDNIGHT)])
+    assert to_compact(tmp_path, after_day_s) == []
+    (file,) = write(tmp_path, [make_hour("c", MIDNIGHT)])
     for n in range(MAX_FILES_PER_DAY - 2):
-        shutil.copy(late, day / f"batch-{n}.parquet")
-    assert to_compact(tmp_path, late_s) == [day]
+        shutil.copy(file, day / f"batch-{n}.parquet")
+    assert to_compact(tmp_path, after_day_s) == [day]
 
 
 async def test_disk_error_loses_no_row(nc, tmp_path, monkeypatch):
@@ -156,7 +157,7 @@ async def test_disk_error_loses_no_row(nc, tmp_path, monkeypatch):
     folder.touch()  # a file where the folder should be
     await publish(nc, [make_hour("a", MIDNIGHT)])
     collector = Collector(nc, folder, period_s=0.0)
-    async with collecting(collector):
+    async with running_collector(collector):
         await until(lambda: collector.counters["faults"])
     info = await nc.jetstream().consumer_info(subjects.HOURS_STREAM, "collector")
     assert info.num_ack_pending == 1

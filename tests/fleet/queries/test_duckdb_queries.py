@@ -17,14 +17,15 @@ def test_process_noise_equals_that_of_the_filter():
     assert (Noise.aged_soc, Noise.charge_error) == (AGED_SOC, CHARGE_ERROR)
 
 
-PACKS, DAYS, PER_YEAR = 400, 60, -0.06
+PACKS, DAYS, SLOPE_PER_YEAR = 400, 60, -0.06
+"""Number of packs, number of days, and mean change of ln(capacity) in a year."""
 
 
 @pytest.fixture(scope="module")
-def ageing(tmp_path_factory):
-    """Folder and true slopes of packs that lose 6 % in a year, with a spread of 2 %."""
-    folder, rng = tmp_path_factory.mktemp("ageing"), np.random.default_rng(1)
-    slopes = PER_YEAR + 0.02 * rng.standard_normal(PACKS)
+def ageing_fleet(tmp_path_factory):
+    """Return folder and true slopes of packs that lose 6 % in a year, with a spread of 2 %."""
+    folder, rng = tmp_path_factory.mktemp("ageing_fleet"), np.random.default_rng(1)
+    slopes = SLOPE_PER_YEAR + 0.02 * rng.standard_normal(PACKS)
     truth = -0.1 + slopes[:, None] * np.arange(DAYS) / 365.25
     estimates, variance = capacities(rng, truth, 0.01, through=1.0)
     ratio = np.exp(estimates)
@@ -35,8 +36,8 @@ def ageing(tmp_path_factory):
     return folder, slopes
 
 
-def test_true_trends_are_within_their_95_percent_bands(ageing):
-    folder, slopes = ageing
+def test_true_trends_are_within_their_95_percent_bands(ageing_fleet):
+    folder, slopes = ageing_fleet
     packs = {row["pack"]: row for row in run_query(folder, "soh").records if row["pack"]}
     inside = [
         packs[f"p{n}"]["percent_per_year_low"] < 100 * slope < packs[f"p{n}"]["percent_per_year_high"]
@@ -44,22 +45,22 @@ def test_true_trends_are_within_their_95_percent_bands(ageing):
     ]
     assert 0.93 < np.mean(inside) < 0.98  # 95 %; its std with 400 packs is 1.1 %
     level = np.exp(-0.1 + slopes * (DAYS - 1) / 365.25)
-    within = [
+    level_inside = [
         packs[f"p{n}"]["capacity_ratio_low"] < level[n] < packs[f"p{n}"]["capacity_ratio_high"] for n in range(PACKS)
     ]
-    assert 0.93 < np.mean(within) < 0.98
+    assert 0.93 < np.mean(level_inside) < 0.98
 
 
-def test_trend_and_spread_of_a_type(ageing):
-    (row,) = [row for row in run_query(ageing[0], "soh").records if not row["pack"]]
+def test_trend_and_spread_of_a_type(ageing_fleet):
+    (row,) = [row for row in run_query(ageing_fleet[0], "soh").records if not row["pack"]]
     assert (row["type"], row["packs"], row["days"]) == ("ncr18650 1s1p 3 Ah", PACKS, DAYS)
-    assert row["percent_per_year_low"] < 100 * PER_YEAR < row["percent_per_year_high"]
+    assert row["percent_per_year_low"] < 100 * SLOPE_PER_YEAR < row["percent_per_year_high"]
     assert row["percent_per_year_high"] - row["percent_per_year_low"] < 1.0
     assert row["percent_per_year_spread"] == pytest.approx(2.0, abs=0.7)
 
 
 def test_repeated_estimates_give_no_trend(tmp_path):
-    """The filter has learned once; for two months its estimate does not change, and its variance does not fall."""
+    """Use a filter that has learned once. For two months its estimate does not change, and its variance does not fall."""
     days = 60
     variance = 0.02**2 * np.ones(days)
     retained = np.exp(-1.0 / AGED_SOC) ** 2
@@ -73,13 +74,13 @@ def test_repeated_estimates_give_no_trend(tmp_path):
     assert run_query(tmp_path, "soh").rows == []
 
 
-def test_outliers_are_found_but_not_uncertain_packs(tmp_path):
+def test_only_certain_outliers_are_found(tmp_path):
     rng = np.random.default_rng(2)
     packs = 1000
     capacity, std = 0.9 + 0.02 * rng.standard_normal((packs, 1)), np.full((packs, 1), 0.01)
-    std[:300] = 0.08  # these have learned little, ...
+    std[:300] = 0.08  # these packs have learned little, so that their estimates equal the cell file
     estimates = capacity + std * rng.standard_normal((packs, 1))
-    estimates[:300] = 1.0  # ... and stay at the cell file
+    estimates[:300] = 1.0
     r_s = np.exp(0.3 + 0.05 * rng.standard_normal((packs, 1)))
     estimates[500], estimates[501], r_s[502] = 0.7, 1.1, 2.5
     estimates[10], std[10] = 0.7, 0.3
@@ -140,12 +141,12 @@ def test_coverage_of_correct_narrow_and_wide_bands(tmp_path, factor, minimum, ma
         capacity_offset_correlation=0.0, temperature_c=25.0, **columns,
     )  # fmt: skip
     result = run_query(tmp_path, "honest").records
-    whole, groups = result[0], {(row["of"], row["which"]) for row in result[1:]}
+    overall, groups = result[0], {(row["of"], row["which"]) for row in result[1:]}
     assert {("type", "ncr18650 1s1p 3 Ah"), ("temperature", "20 to 30 C"), ("age", "first day")} <= groups
-    assert minimum < whole["within_2_std"] < maximum
-    assert whole["low"] <= whole["within_2_std"] <= whole["high"]
-    assert whole["high"] - whole["low"] < 0.1
-    assert whole["std_should_be_times"] == pytest.approx(1.0 / factor, rel=0.2)
+    assert minimum < overall["within_2_std"] < maximum
+    assert overall["low"] <= overall["within_2_std"] <= overall["high"]
+    assert overall["high"] - overall["low"] < 0.1
+    assert overall["std_should_be_times"] == pytest.approx(1.0 / factor, rel=0.2)
 
 
 def test_silent_pack_is_reported_with_its_last_values(tmp_path):
@@ -179,7 +180,7 @@ def test_files_of_an_earlier_version_are_read(tmp_path):
         run_query(tmp_path, "soh")
 
 
-def test_errors(tmp_path):
+def test_invalid_arguments_are_reported(tmp_path):
     with pytest.raises(UserError, match="no such query; there are soh, outliers"):
         run_query(tmp_path, "nonsense")
     with pytest.raises(UserError, match="no such folder; `bms-estimator fleet collect"):
@@ -199,5 +200,5 @@ def test_errors(tmp_path):
         run_query(tmp_path, "soh")
 
 
-def test_columns():
+def test_schema_has_the_queried_columns():
     assert {"pack", "hour", "soc", "suspects"} < set(SCHEMA.names)

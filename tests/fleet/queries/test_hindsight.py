@@ -1,4 +1,4 @@
-"""Coverage judged in hindsight, compared with the truth of a real capture."""
+"""Coverage estimated in hindsight, compared with the true coverage of a real capture."""
 
 import numpy as np
 import pytest
@@ -13,31 +13,36 @@ SLOT_S = 60.0
 
 @pytest.fixture(scope="module")
 def packs(data):
-    """Estimates of a Nissan Leaf from four starts, each with an SOC error of 0.2 and -0.2; the truth is counted from full."""
-    cell, whole = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
-    drawn_as = np.r_[0.0, np.cumsum(whole["current_a"][:-1] * np.diff(whole["time_s"]))]
-    soc = 1.0 - drawn_as / (3600.0 * cell.cell.capacity_ah)
-    starts = [(first, wrong) for first in (0, 2000, 4000, 6000) for wrong in (-0.2, 0.2)]
+    """Return estimates of a Nissan Leaf from four starts, each with SOC errors of 0.2 and -0.2.
+
+    The true SOC is counted from full.
+    """
+    cell, capture = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
+    discharged_as = np.r_[0.0, np.cumsum(capture["current_a"][:-1] * np.diff(capture["time_s"]))]
+    soc = 1.0 - discharged_as / (3600.0 * cell.cell.capacity_ah)
+    starts = [(first, soc_error) for first in (0, 2000, 4000, 6000) for soc_error in (-0.2, 0.2)]
     return [
-        slots(f"p{n}", cell, whole.rows[first:], soc[first:], float(np.clip(soc[first] + wrong, 0.0, 1.0)), SLOT_S)
-        for n, (first, wrong) in enumerate(starts)
+        slots(
+            f"p{n}", cell, capture.rows[first:], soc[first:], float(np.clip(soc[first] + soc_error, 0.0, 1.0)), SLOT_S
+        )
+        for n, (first, soc_error) in enumerate(starts)
     ]
 
 
 def test_coverage_in_hindsight_agrees_with_the_truth(packs, tmp_path):
-    write(tmp_path, [known.hour for pack in packs for known in pack])
-    (whole, *_) = run_query(tmp_path, "honest", limits=limits(SLOT_S)).records
-    there = np.abs([x for pack in packs for x in judged(pack)]) <= 2.0
-    assert whole["packs"] == len(packs)
-    assert whole["within_2_std"] == pytest.approx(there.mean(), abs=0.1)
-    assert whole["low"] > 0.5
+    write(tmp_path, [slot.hour for pack in packs for slot in pack])
+    (overall, *_) = run_query(tmp_path, "honest", limits=limits(SLOT_S)).records
+    inside = np.abs([x for pack in packs for x in judged(pack)]) <= 2.0
+    assert overall["packs"] == len(packs)
+    assert overall["within_2_std"] == pytest.approx(inside.mean(), abs=0.1)
+    assert overall["low"] > 0.5
 
 
 def test_too_narrow_band_is_detected(packs, tmp_path):
     narrow = [
-        known.hour.model_copy(update={"soc_mean_std": (known.hour.soc_mean_std or 0.0) / 8.0})
+        slot.hour.model_copy(update={"soc_mean_std": (slot.hour.soc_mean_std or 0.0) / 8.0})
         for pack in packs
-        for known in pack
+        for slot in pack
     ]
     write(tmp_path, narrow)
     assert run_query(tmp_path, "honest", limits=limits(SLOT_S)).records[0]["within_2_std"] < 0.6

@@ -77,8 +77,8 @@ class Fleet:
         async with self.program(Role.READER, tenant) as (nc, _):
             js = nc.jetstream(timeout=LONG_S)
             last = (await js.stream_info(subjects.RAW_STREAM)).state.last_seq
-            found = [await js.get_msg(subjects.RAW_STREAM, seq) for seq in range(1, last + 1)]
-            return [((message.subject or "").rpartition(".")[2], message.data or b"") for message in found]
+            messages = [await js.get_msg(subjects.RAW_STREAM, seq) for seq in range(1, last + 1)]
+            return [((message.subject or "").rpartition(".")[2], message.data or b"") for message in messages]
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ async def connect_with(url: str, token: str) -> None:
 
 
 async def is_disconnected(client: aiomqtt.Client, act: Callable[[], None]) -> bool:
-    """Return whether the server ends the connection after ``act``."""
+    """Return True if the server ends the connection after ``act``."""
     try:
         async with asyncio.timeout(LONG_S), client:
             act()
@@ -176,7 +176,7 @@ FORBIDDEN_FILTERS = (
 
 async def test_edge_publishes_its_own_subject_and_receives_replies(fleet: Fleet) -> None:
     async with fleet.program(Role.ADMIN) as (admin, _), fleet.edge(fleet.token("p1"), identifier="one") as edge:
-        everything = await admin.subscribe(">")
+        all_messages = await admin.subscribe(">")
         await admin.flush()
         for topic in FORBIDDEN_FILTERS:
             assert [code.value >= 0x80 for code in await edge.subscribe(topic, qos=1)] == [True], topic
@@ -187,7 +187,7 @@ async def test_edge_publishes_its_own_subject_and_receives_replies(fleet: Fleet)
         await edge.publish("raw/p1", b"last", qos=1)
         received = []
         while not received or received[-1][1] != b"last":
-            message = await everything.next_msg(LONG_S)
+            message = await all_messages.next_msg(LONG_S)
             received.append((message.subject, message.data))
         assert [pair for pair in received if b"evil" in pair[1]] == []
         await admin.publish(subjects.awaits("p1"), b"yours")
@@ -215,8 +215,8 @@ async def test_tenants_are_isolated(fleet: Fleet) -> None:
         await other.flush()
         await worker.publish(subjects.published("p1", "state"), b"of acme")
         await worker.flush()
-        async with fleet.program(Role.WORKER, "other") as (theirs, _):
-            await theirs.publish(subjects.published("p1", "state"), b"of other")
+        async with fleet.program(Role.WORKER, "other") as (other_worker, _):
+            await other_worker.publish(subjects.published("p1", "state"), b"of other")
         assert (await estimates.next_msg(LONG_S)).data == b"of other"
     async with fleet.edge(fleet.token("p1", "other")) as edge:
         await edge.publish("raw/p1", b"theirs", qos=1)

@@ -21,13 +21,16 @@ from bms_estimator.fleet.worker.block_order import MAX_EARLY_REPEATS
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.fleet.nats_cluster import running
 from tests.fleet.tenant import Tenant, heavy_block, numbered, one_tenant
-from tests.fleet.workers import KIND, Heartbeats, block, end_states, load_packs, until
+from tests.fleet.workers import PACK_ROW, Heartbeats, block, end_states, load_packs, until
 from tests.patience import LONG_S
 
 PARTITIONS = 4
 RAW_BYTES = 8 << 20
-FLOOD = 40
+"""Size limit of the stream [bytes]; small, so that a test can fill it."""
+FLOOD_BLOCKS = 40
 """Number of blocks, each of which takes a worker a tenth of a second."""
+FLOOD_BYTES = 715_000
+"""Total size of the blocks that an attacker sends [bytes]."""
 FORMER_SUBJECT = "p.*.raw.*"
 """Subject of ``RAW`` in the previous version, in which the server mapped the edges' subjects before storing."""
 
@@ -39,7 +42,7 @@ def fleet(tmp_path: Path) -> Iterator[Tenant]:
         yield tenant
 
 
-async def stored(nc: Client, last: bytes) -> dict[str, int]:
+async def stored_counts(nc: Client, last: bytes) -> dict[str, int]:
     """Return the number of messages of each subject in ``RAW``, once the last sent message is in it.
 
     The server acknowledges an MQTT publish before the message is in the stream.
@@ -68,7 +71,7 @@ async def test_other_subjects_and_partitions_are_rejected(fleet: Tenant) -> None
             await edge.publish(f"raw/invented{i}", b"evil", qos=1)
         codes = [(await edge.subscribe(f"edge/attacker/{i}", qos=1))[0].value for i in range(20)]
         await edge.publish("raw/attacker", b"own", qos=1)
-    assert await stored(reader, b"own") == {subject("attacker"): 1}
+    assert await stored_counts(reader, b"own") == {subject("attacker"): 1}
     assert set(codes) == {0x80}
     await reader.close()
 
@@ -84,7 +87,7 @@ async def test_junk_evicts_no_block_of_another_pack(fleet: Tenant) -> None:
         for _ in range(2 * RAW_BYTES // len(junk)):
             await edge.publish("raw/attacker", junk, qos=1)
         await edge.publish("raw/attacker", b"last", qos=1)
-    counts = await stored(reader, b"last")
+    counts = await stored_counts(reader, b"last")
     assert counts == {subject("honest"): 5, subject("attacker"): pack_blocks(RAW_BYTES)}
     await reader.close()
 
@@ -94,13 +97,13 @@ async def test_too_large_message_is_not_stored(fleet: Tenant) -> None:
     async with fleet.edge("attacker") as edge:
         await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES + 1), qos=1)
         await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES - 1024), qos=1)
-    assert await stored(reader, bytes(MAX_BLOCK_BYTES - 1024)) == {subject("attacker"): 1}
+    assert await stored_counts(reader, bytes(MAX_BLOCK_BYTES - 1024)) == {subject("attacker"): 1}
     await reader.close()
 
 
 async def test_rejected_block_counts_as_lost_after_some_resends(fleet: Tenant) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
-    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND})
+    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": PACK_ROW})
     states = await reader.subscribe(subjects.published("p1", "state"))
     await reader.flush()
     async with Heartbeats(reader) as heartbeats, worker(fleet), fleet.edge("p1") as edge:
@@ -124,7 +127,7 @@ async def test_stream_of_the_previous_version_is_updated_and_keeps_its_blocks(tm
         await nc.jetstream().publish(subject("p1"), b"before")
         await make_streams(nc, partitions=PARTITIONS, raw_bytes=RAW_BYTES)
         await nc.jetstream().publish(subjects.raw("p1"), b"after")
-        assert await stored(nc, b"after") == {subject("p1"): 2}
+        assert await stored_counts(nc, b"after") == {subject("p1"): 2}
         await nc.close()
 
 
@@ -156,15 +159,15 @@ async def test_dense_blocks_are_rejected_and_other_packs_are_not_delayed(
     fleet: Tenant, samples: int, seconds: float, reason: str
 ) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
-    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND, "attacker": KIND})
+    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": PACK_ROW, "attacker": PACK_ROW})
     states = await reader.subscribe(subjects.published("*", "state"))
     await reader.flush()
     dense = heavy_block(samples, seconds / samples)
-    count = 715_000 // len(dense)
-    async with fleet.edge("attacker") as attacker, fleet.edge("p1") as honest:
+    count = FLOOD_BYTES // len(dense)
+    async with fleet.edge("attacker") as attacker, fleet.edge("p1") as other_edge:
         for number in range(1, count + 1):
             await attacker.publish("raw/attacker", numbered(dense, number), qos=1)
-        await honest.publish("raw/p1", block("p1", 1), qos=1)
+        await other_edge.publish("raw/p1", block("p1", 1), qos=1)
     with capture_logs() as logs:
         async with Heartbeats(reader) as heartbeats, worker(fleet):
             assert (await states.next_msg(LONG_S)).subject == subjects.published("p1", "state")
@@ -182,24 +185,24 @@ async def test_flood_of_blocks_delays_only_its_own_pack(fleet: Tenant) -> None:
     states = await reader.subscribe(subjects.published("*", "state"))
     await reader.flush()
     heavy = heavy_block(20_000, 1.0)
-    async with fleet.edge("attacker") as attacker, fleet.edge("p1") as honest:
-        for number in range(1, FLOOD + 1):
+    async with fleet.edge("attacker") as attacker, fleet.edge("p1") as other_edge:
+        for number in range(1, FLOOD_BLOCKS + 1):
             await attacker.publish("raw/attacker", numbered(heavy, number), qos=1)
-        await honest.publish("raw/p1", block("p1", 1), qos=1)
+        await other_edge.publish("raw/p1", block("p1", 1), qos=1)
     async with worker(fleet):
         before = 0
         while (await states.next_msg(LONG_S)).subject != subjects.published("p1", "state"):
             before += 1
-        assert before < FLOOD // 2
+        assert before < FLOOD_BLOCKS // 2
     async with Heartbeats(reader) as heartbeats, worker(fleet):  # continues from the checkpoint of the first worker
-        await until_counted(heartbeats, "blocks", FLOOD + 1)
-        await until_counted(heartbeats, "deferred", FLOOD // 2)
+        await until_counted(heartbeats, "blocks", FLOOD_BLOCKS + 1)
+        await until_counted(heartbeats, "deferred", FLOOD_BLOCKS // 2)
     state = (await end_states(admin, registry, PARTITIONS))[subjects.partition_of("attacker", PARTITIONS)].state(
         "attacker"
     )
     assert state is not None
     estimator = make_estimator(*(registry("attacker") or ()))
-    for _ in range(FLOOD):
+    for _ in range(FLOOD_BLOCKS):
         estimator.run(decode(heavy).samples)
     assert state["estimator"].tobytes() == estimator.record.tobytes()
     await admin.close()
@@ -208,18 +211,18 @@ async def test_flood_of_blocks_delays_only_its_own_pack(fleet: Tenant) -> None:
 
 async def test_worker_rejects_a_block_in_the_wrong_partition(fleet: Tenant) -> None:
     admin = await fleet.program(Role.ADMIN)
-    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND})
-    wrong = (subjects.partition_of("p1", PARTITIONS) + 1) % PARTITIONS
-    await admin.jetstream().update_stream(  # as in the previous version
+    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": PACK_ROW})
+    wrong_partition = (subjects.partition_of("p1", PARTITIONS) + 1) % PARTITIONS
+    await admin.jetstream().update_stream(  # the stream of the previous version, which accepts any partition
         name=subjects.RAW_STREAM,
         subjects=[FORMER_SUBJECT],
         metadata={"bms.partitions": str(PARTITIONS)},
         allow_direct=True,
     )
-    await admin.jetstream().publish(subjects.stored_raw(wrong, "p1"), block("p1", 1))
+    await admin.jetstream().publish(subjects.stored_raw(wrong_partition, "p1"), block("p1", 1))
     with capture_logs() as logs:
         async with worker(fleet):
             await until(lambda: [line for line in logs if line["event"] == "a block is rejected"], lambda: logs)
     (rejection,) = [line for line in logs if line["event"] == "a block is rejected"]
-    assert (rejection["partition"], rejection["reason"]) == (wrong, "the pack belongs to another partition")
+    assert (rejection["partition"], rejection["reason"]) == (wrong_partition, "the pack belongs to another partition")
     await admin.close()

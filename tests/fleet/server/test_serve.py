@@ -23,7 +23,7 @@ from bms_estimator.fleet.nats.streams import NoAnswerError
 from bms_estimator.fleet.server import credentials, nats_server
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec
-from bms_estimator.fleet.server.nats_server import serve as serving
+from bms_estimator.fleet.server.nats_server import serve as serve_node
 from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
@@ -64,7 +64,7 @@ ca_file = "{authority.certificate}"
 
 
 class Serving:
-    """``fleet serve FILE`` as a process."""
+    """Process of ``fleet serve FILE``."""
 
     def __init__(self, file: Path, folder: Path) -> None:
         self._errors = folder.with_suffix(".err")
@@ -79,14 +79,14 @@ class Serving:
     def wait(self, text: str) -> None:
         """Wait for a line with ``text``."""
         assert self.process.stdout
-        late = threading.Timer(LONG_S, self.process.kill)
-        late.start()
+        timeout = threading.Timer(LONG_S, self.process.kill)
+        timeout.start()
         try:
             for line in self.process.stdout:
                 if text in line:
                     return
         finally:
-            late.cancel()
+            timeout.cancel()
         raise AssertionError(f"ended without {text!r}: {self.errors()}")
 
     def errors(self) -> str:
@@ -151,7 +151,7 @@ async def test_edges_and_workers_need_tls(serve: tuple[Serving, Path], authority
     assert await blocks(folder, context) == 1
     for port in (port_of(settings_of(folder).server.mqtt), port_of(settings_of(folder).server.listen)):
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        writer.write(b"\x10\x0d\x00\x04MQTT\x04\x02\x00\x3c\x00\x01a")  # a CONNECT in the clear
+        writer.write(b"\x10\x0d\x00\x04MQTT\x04\x02\x00\x3c\x00\x01a")  # a CONNECT without TLS
         async with asyncio.timeout(LONG_S):
             with contextlib.suppress(ConnectionResetError):
                 assert b"\x20\x02" not in await reader.read()  # no CONNACK
@@ -210,17 +210,17 @@ async def until(condition: Callable[[], bool]) -> None:
 async def test_late_server_is_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls, make_streams = [], nats_server.make_streams
 
-    async def busy(nc, **options) -> None:
+    async def fail_once(nc, **options) -> None:
         calls.append(options)
         if len(calls) == 1:
             raise NoAnswerError("nothing")
         await make_streams(nc, **options)
 
-    monkeypatch.setattr(nats_server, "make_streams", busy)
+    monkeypatch.setattr(nats_server, "make_streams", fail_once)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
     spec = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4)))
     lines: list[str] = []
-    task = asyncio.create_task(serving(NodeLocation(tmp_path), lambda: spec, lines.append))
+    task = asyncio.create_task(serve_node(NodeLocation(tmp_path), lambda: spec, lines.append))
     await until(lambda: "streams ready, 4 partitions" in lines or task.done())
     assert len(calls) == 2
     task.cancel()
@@ -229,20 +229,20 @@ async def test_late_server_is_retried(tmp_path: Path, monkeypatch: pytest.Monkey
 
 async def test_three_nodes_have_three_replicas(tmp_path: Path, authority: Authority) -> None:
     nodes = tuple(f"127.0.0.1:{free_port()}" for _ in range(3))
-    places = [NodeLocation(tmp_path / str(i), i, nodes) for i in (1, 2, 3)]
+    locations = [NodeLocation(tmp_path / str(i), i, nodes) for i in (1, 2, 3)]
     lines: list[str] = []
     tasks = []
-    for place in places:
-        place.keys.mkdir(parents=True)
-        (place.folder / "fleet.toml").write_text(settings_text(authority))
-        settings = settings_of(place.folder)
-        if place.number == 1:
-            credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC))
+    for location in locations:
+        location.keys.mkdir(parents=True)
+        (location.folder / "fleet.toml").write_text(settings_text(authority))
+        settings = settings_of(location.folder)
+        if location.number == 1:
+            credentials.make_accounts(location.keys, settings.tenants, datetime.now(UTC))
         else:
-            shutil.copy(places[0].keys / "claims.json", place.keys)
-        spec = ServerSpec(settings, credentials.read_accounts(place.keys))
+            shutil.copy(locations[0].keys / "claims.json", location.keys)
+        spec = ServerSpec(settings, credentials.read_accounts(location.keys))
         tasks.append(
-            asyncio.create_task(serving(place, partial(ServerSpec, spec.settings, spec.accounts), lines.append))
+            asyncio.create_task(serve_node(location, partial(ServerSpec, spec.settings, spec.accounts), lines.append))
         )
     try:
         ready = ("streams ready", "made by the node that has the keys")
@@ -250,10 +250,10 @@ async def test_three_nodes_have_three_replicas(tmp_path: Path, authority: Author
             lambda: sum(any(text in line for text in ready) for line in lines) == 3 or any(t.done() for t in tasks)
         )
         assert [task for task in tasks if task.done()] == []
-        file = credentials.credentials_file(places[0].keys, "acme", Role.READER)
+        file = credentials.credentials_file(locations[0].keys, "acme", Role.READER)
         context = ssl.create_default_context(cafile=str(authority.certificate))
-        last = settings_of(places[2].folder).server.listen
-        nc = await nats.connect(f"tls://{last}", tls=context, user_credentials=file)
+        third_node = settings_of(locations[2].folder).server.listen
+        nc = await nats.connect(f"tls://{third_node}", tls=context, user_credentials=file)
         info = await nc.jetstream(timeout=LONG_S).stream_info(subjects.RAW_STREAM)
         await nc.close()
         assert info.config.num_replicas == 3
@@ -310,8 +310,8 @@ def test_errors_of_certificates(
 
 def test_every_setting_is_documented() -> None:
     text = (Path(__file__).parents[3] / "docs" / "fleet" / "server.md").read_text()
-    named = [name for model in (ServerSettings, TlsSettings, TenantSettings) for name in model.model_fields]
-    assert [name for name in named if f"{name}`" not in text] == []
+    names = [name for model in (ServerSettings, TlsSettings, TenantSettings) for name in model.model_fields]
+    assert [name for name in names if f"{name}`" not in text] == []
 
 
 def test_token_needs_a_valid_pack_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -50,9 +50,9 @@ def test_charge_agrees_with_the_true_soc() -> None:
     assert charge_as / simulated.truth.capacity_as == pytest.approx(socs[0] - socs[1], abs=2e-4)
 
 
-def test_estimator_with_the_settings_of_the_table_finds_the_true_soc() -> None:
+def test_estimator_with_the_settings_of_the_table_converges_to_the_true_soc() -> None:
     simulated = fleet(len(KINDS))
-    within = []
+    inside = []
     for pack, kind in enumerate(KINDS):
         cell = load_cell(kind.cell, kind.capacity_ah).pack(kind.series, kind.parallel)
         sampling = Sampling(kind.current_resolution_a, 0.0, 1.0)
@@ -61,21 +61,21 @@ def test_estimator_with_the_settings_of_the_table_finds_the_true_soc() -> None:
             samples = simulated.samples(np.array([pack]), np.array([number]))[0]
             row = estimator.run(samples)[-1]
             truth = simulated.soc(np.array([pack]), samples["time_s"][-1:])[0]
-            within.append(abs(row["soc"] - truth) < 3.0 * row["soc_std"])
+            inside.append(abs(row["soc"] - truth) < 3.0 * row["soc_std"])
         assert row["soc"] == pytest.approx(truth, abs=0.1)
-    assert np.mean(within) > 0.9
+    assert np.mean(inside) > 0.9
 
 
 def test_edges_send_each_complete_block_once_oldest_first() -> None:
     simulated = fleet(50)
     edges = SimulatedEdges(simulated, start_s=1000.0, speed=60.0)
     assert edges.due(1000.9, 100).packs.size == 0
-    late = edges.due(1003.0, 7)
-    assert late.packs.size == 7
-    assert edges.lag_s(1003.0) <= 1003.0 - late.arrival_s.max()
-    rest = edges.due(1003.0, 100)
-    assert set(rest.packs[rest.numbers == 1]) | set(late.packs) == set(range(50))
-    assert (rest.arrival_s <= 1003.0).all()
+    first_due = edges.due(1003.0, 7)
+    assert first_due.packs.size == 7
+    assert edges.lag_s(1003.0) <= 1003.0 - first_due.arrival_s.max()
+    remaining = edges.due(1003.0, 100)
+    assert set(remaining.packs[remaining.numbers == 1]) | set(first_due.packs) == set(range(50))
+    assert (remaining.arrival_s <= 1003.0).all()
     assert edges.again == 0
 
 
@@ -91,8 +91,8 @@ def test_edges_resend_from_the_requested_block() -> None:
     assert not edges.receive_reply(simulated.names[1], BlockRequest(store=store + 1, number=2, resend=True), 0.0)
     assert edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), 0.0)
     assert not edges.done
-    again = [edges.due(100.0, 10) for _ in range(3)]
-    assert [list(zip(due.packs, due.numbers, strict=True)) for due in again] == [[(1, 3)], [(1, 4)], []]
+    resent = [edges.due(100.0, 10) for _ in range(3)]
+    assert [list(zip(due.packs, due.numbers, strict=True)) for due in resent] == [[(1, 3)], [(1, 4)], []]
     assert (edges.again, edges.resends, edges.safe[1]) == (2, 1, 3)
     # A request is ignored if its block was resent recently, or is confirmed.
     edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S / 2.0)

@@ -62,34 +62,34 @@ def test_many_packs_are_split_into_chunks() -> None:
 @given(snapshots, st.data())
 @settings(max_examples=200)
 def test_any_damage_raises_checkpoint_error(snapshot: PartitionCheckpoint, data) -> None:
-    good = to_bytes(snapshot)
-    bad = bytearray(good)
-    at = data.draw(st.integers(0, len(good) - 1))
+    intact = to_bytes(snapshot)
+    damaged = bytearray(intact)
+    position = data.draw(st.integers(0, len(intact) - 1))
     change = data.draw(st.sampled_from(["flip", "cut", "append", "drop"]))
     if change == "flip":
-        bad[at] ^= 1 << data.draw(st.integers(0, 7))
+        damaged[position] ^= 1 << data.draw(st.integers(0, 7))
     elif change == "cut":
-        del bad[at:]
+        del damaged[position:]
     elif change == "drop":
-        del bad[at : at + data.draw(st.integers(1, 20))]
+        del damaged[position : position + data.draw(st.integers(1, 20))]
     else:
-        bad += data.draw(st.binary(min_size=1))
+        damaged += data.draw(st.binary(min_size=1))
     with pytest.raises(CheckpointError):
-        read_checkpoint(bytes(bad))
+        read_checkpoint(bytes(damaged))
 
 
 def test_any_changed_byte_is_detected() -> None:
-    good = to_bytes(PartitionCheckpoint(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
-    for at in range(len(good)):
+    intact = to_bytes(PartitionCheckpoint(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
+    for position in range(len(intact)):
         with pytest.raises(CheckpointError):
-            read_checkpoint(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
+            read_checkpoint(intact[:position] + bytes([intact[position] ^ 1]) + intact[position + 1 :])
 
 
 def test_blocks_stored_by_an_earlier_version_are_read_from_the_stream_again(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [checkpoint_format._entry(0, "known", b"12345678"), checkpoint_format._entry(255, "unknown", b"block")]
     monkeypatch.setattr(PartitionCheckpoint, "_entries", lambda *_: iter(entries))
-    read = read_checkpoint(to_bytes(PartitionCheckpoint(3, 7, packs={"known": b"", "unknown": b""})))
-    assert (read.packs, read.deferred) == ({"known": b"12345678"}, {"unknown": Span(1, 7)})
+    checkpoint = read_checkpoint(to_bytes(PartitionCheckpoint(3, 7, packs={"known": b"", "unknown": b""})))
+    assert (checkpoint.packs, checkpoint.deferred) == ({"known": b"12345678"}, {"unknown": Span(1, 7)})
 
 
 @pytest.mark.parametrize("data", [b"", b"BMSFLEET", b"x" * 100])
@@ -105,10 +105,10 @@ def test_checkpoint_of_another_partition_is_rejected() -> None:
 
 def test_error_of_a_newer_format_names_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoint_format, "FORMAT", 2)
-    later = to_bytes(PartitionCheckpoint(3, 0))
+    newer_format = to_bytes(PartitionCheckpoint(3, 0))
     monkeypatch.undo()
     with pytest.raises(CheckpointError, match="is of format 2, this version reads 1: start the version that wrote it"):
-        read_checkpoint(later)
+        read_checkpoint(newer_format)
 
 
 def test_layout_round_trip() -> None:
@@ -132,7 +132,7 @@ class TestPreviousLayout:
     """Layout without ``fit_age_s``, with an additional counter, and with another order of fields."""
 
     @pytest.fixture
-    def before(self, samples):
+    def previous_layout(self, samples):
         """Return a partition of this version, and its checkpoint as the other version would have written it."""
         stream = Stream(Partition(5, table))
         deliver(stream, "a", blocks_of(samples[:3000]))
@@ -147,59 +147,59 @@ class TestPreviousLayout:
             for name in set(dtype[part].names) & set(PACK_STATE[part].names):
                 work.record[part][name] = state[part][name]
         work.record["delivery"]["once_known"] = 7
-        former = PreviousLayoutState(layout_of(dtype), work.packed_bytes())
+        previous_state = PreviousLayoutState(layout_of(dtype), work.packed_bytes())
         snapshot = stream.partition.snapshot()
-        return stream, to_bytes(replace(snapshot, packs={}, former={"a": former}))
+        return stream, to_bytes(replace(snapshot, packs={}, former={"a": previous_state}))
 
-    def test_next_block_migrates_the_record_by_field_names(self, before, samples) -> None:
-        stream, data = before
+    def test_next_block_migrates_the_record_by_field_names(self, previous_layout, samples) -> None:
+        stream, data = previous_layout
         same_version = stream.partition
         other_version = Partition.restore(5, table, data)
         next_block = blocks_of(samples)[150]
         sequence = other_version.sequence + 1
-        was, now = (
+        expected, migrated = (
             Estimate.model_validate_json(each.take("a", next_block, sequence).state)
             for each in (same_version, other_version)
         )
-        assert now.soc == pytest.approx(was.soc, abs=0.005)
-        assert now.soc_std < 0.05
-        assert now.charge_out_ah == pytest.approx(was.charge_out_ah)
+        assert migrated.soc == pytest.approx(expected.soc, abs=0.005)
+        assert migrated.soc_std < 0.05
+        assert migrated.charge_out_ah == pytest.approx(expected.charge_out_ah)
         assert other_version.counters["taken_over"] == 1
         assert other_version.snapshot().former == {}
 
-    def test_record_stays_unchanged_until_a_block_is_processed(self, before, samples) -> None:
-        _, data = before
+    def test_record_stays_unchanged_until_a_block_is_processed(self, previous_layout, samples) -> None:
+        _, data = previous_layout
         partition = Partition.restore(5, table, data)
         blocks = blocks_of(samples)
         assert partition.take("a", blocks[3], partition.sequence + 1).state is None
         assert partition.take("a", blocks[155], partition.sequence + 1).reply.number == 3000 // SAMPLES + 1
         assert partition.counters["packs"] == 1
         assert partition.snapshot().former == read_checkpoint(data).former
-        again = Partition.restore(5, table, to_bytes(partition.snapshot()))
-        assert again.take("a", blocks[150], again.sequence + 1).state
+        restored = Partition.restore(5, table, to_bytes(partition.snapshot()))
+        assert restored.take("a", blocks[150], restored.sequence + 1).state
 
-    def test_continues_after_a_lost_block(self, before, samples) -> None:
-        _, data = before
+    def test_continues_after_a_lost_block(self, previous_layout, samples) -> None:
+        _, data = previous_layout
         partition = Partition.restore(5, table, data)
-        behind = blocks_of(samples)[151]
-        states = [partition.take("a", behind, partition.sequence + 1).state for _ in range(MAX_EARLY_REPEATS)]
+        early_block = blocks_of(samples)[151]
+        states = [partition.take("a", early_block, partition.sequence + 1).state for _ in range(MAX_EARLY_REPEATS)]
         assert [state is None for state in states] == (MAX_EARLY_REPEATS - 1) * [True] + [False]
         assert partition.counters["lost_blocks"] == 1
         assert partition.snapshot().former == {}
 
-    def test_continues_after_a_lost_and_a_rejected_block(self, before, samples, monkeypatch) -> None:
-        _, data = before
+    def test_continues_after_a_lost_and_a_rejected_block(self, previous_layout, samples, monkeypatch) -> None:
+        _, data = previous_layout
         partition = Partition.restore(5, table, data)
-        behind, following = blocks_of(samples)[151:153]
+        early_block, following = blocks_of(samples)[151:153]
         with monkeypatch.context() as patched:
             patched.setattr("bms_estimator.fleet.worker.partition.density_fault", lambda _: "too many samples")
             for _ in range(MAX_EARLY_REPEATS):
-                partition.take("a", behind, partition.sequence + 1)
+                partition.take("a", early_block, partition.sequence + 1)
         assert partition.take("a", following, partition.sequence + 1).state
         assert (partition.counters["lost_blocks"], partition.counters["too_dense"]) == (1, 1)
 
     def test_invalid_record_is_reset(self, samples) -> None:
-        former = PreviousLayoutState(layout_of(np.dtype([("x", "<f8")])), b"1234567")
-        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, former={"a": former})))
+        previous_state = PreviousLayoutState(layout_of(np.dtype([("x", "<f8")])), b"1234567")
+        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, former={"a": previous_state})))
         assert partition.take("a", blocks_of(samples)[0], 1).state
         assert partition.counters["damaged_states"] == 1

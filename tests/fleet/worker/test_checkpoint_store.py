@@ -18,9 +18,9 @@ from tests.fleet.nats_cluster import running
 from tests.fleet.workers import PERIOD_S, SAMPLES, block, end_states, estimated, load_packs, send, until
 from tests.patience import LONG_S
 
-STATES = f"OBJ_{subjects.STATES_BUCKET}"
-CHUNKS = 300_000
-"""Size of a checkpoint [bytes], more than one message of the object store."""
+STATES_STREAM = f"OBJ_{subjects.STATES_BUCKET}"
+CHECKPOINT_BYTES = 300_000
+"""Size of a checkpoint, which the object store splits into several messages [bytes]."""
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ async def _objects(nc: Client, partition: int) -> set[str]:
 async def test_last_two_are_stored_and_damaged_ones_are_logged_and_skipped(nc):
     store = await _checkpoint_store(nc, "a")
     claim = await store.claim(7)
-    written = [bytes([i]) * CHUNKS for i in range(3)]
+    written = [bytes([i]) * CHECKPOINT_BYTES for i in range(3)]
     for i, data in enumerate(written):
         claim = await store.write(claim, i, iter([data[:1], b"", data[1:]]))
     assert await _load(store, claim) == [written[2], written[1]]
@@ -71,34 +71,34 @@ async def test_last_two_are_stored_and_damaged_ones_are_logged_and_skipped(nc):
     assert await _objects(nc, 7) == {newest.object, oldest.object}
 
     subject = await _chunk_subject(nc, newest.object)
-    await nc.jetstream().purge_stream(STATES, subject=subject, keep=1)  # a chunk is missing
+    await nc.jetstream().purge_stream(STATES_STREAM, subject=subject, keep=1)  # a chunk is missing
     with capture_logs() as logs:
         assert await _load(store, claim) == [written[1]]
     assert logs[0]["event"].startswith("a checkpoint is damaged")
     assert logs[0]["object"] == newest.object
     subject = await _chunk_subject(nc, oldest.object)
-    await nc.jetstream().purge_stream(STATES, subject=subject)  # all chunks are replaced
-    await nc.jetstream().publish(subject, b"x" * CHUNKS)
+    await nc.jetstream().purge_stream(STATES_STREAM, subject=subject)  # all chunks are replaced
+    await nc.jetstream().publish(subject, b"x" * CHECKPOINT_BYTES)
     assert await _load(store, claim) == []
 
 
 async def test_fenced_worker_cannot_write_and_leaves_no_object(nc):
     slow, quick = await _checkpoint_store(nc, "slow"), await _checkpoint_store(nc, "quick")
     claim = await slow.write(await slow.claim(8), 1, iter([b"1"]))
-    theirs = await quick.claim(8)
-    assert await quick.confirm_claim(theirs) == theirs
+    other_claim = await quick.claim(8)
+    assert await quick.confirm_claim(other_claim) == other_claim
     with pytest.raises(FencedError, match="quick"):
         await slow.confirm_claim(claim)
     with pytest.raises(FencedError, match="quick"):
         await slow.write(claim, 2, iter([b"2"]))
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
-    assert await _load(quick, theirs) == [b"1"]
+    assert await _load(quick, other_claim) == [b"1"]
     # A worker was killed between two chunks of an object.
-    await nc.jetstream().publish(f"$O.{subjects.STATES_BUCKET}.C.{theirs.pointer.next}", b"3")
+    await nc.jetstream().publish(f"$O.{subjects.STATES_BUCKET}.C.{other_claim.pointer.next}", b"3")
     assert await _load(slow, await slow.claim(8)) == [b"1"]
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
-    left = (await nc.jetstream().stream_info(STATES, subjects_filter=">")).state.subjects
-    assert sum(".C.p8-" in subject for subject in left) == 1
+    remaining_subjects = (await nc.jetstream().stream_info(STATES_STREAM, subjects_filter=">")).state.subjects
+    assert sum(".C.p8-" in subject for subject in remaining_subjects) == 1
 
 
 async def test_write_with_a_lost_response_is_recognized(nc):
@@ -109,10 +109,10 @@ async def test_write_with_a_lost_response_is_recognized(nc):
     assert await _load(store, written) == [b"2", b"1"]
     assert await _objects(nc, 9) == {kept.object for kept in written.pointer.kept}
     await store.write(written, 3, iter([b"3"]))
-    theirs = await other.claim(9)
+    other_claim = await other.claim(9)
     with pytest.raises(FencedError, match="b"):
         await store.write(written, 4, iter([b"4"]))
-    assert await _load(other, theirs) == [b"3", b"2"]
+    assert await _load(other, other_claim) == [b"3", b"2"]
 
 
 async def test_worker_waits_for_streams_and_rows_and_continues_from_an_intact_checkpoint(tmp_path):
@@ -120,7 +120,7 @@ async def test_worker_waits_for_streams_and_rows_and_continues_from_an_intact_ch
         nc = await nats.connect(cluster.url)
         stop = asyncio.Event()
         with capture_logs() as logs:
-            working = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+            worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
             await until(lambda: any("fleet serve" in line.get("reason", "") for line in logs), lambda: logs)
             await make_streams(nc, partitions=1)
             unknown = await nc.subscribe(subjects.unknown())
@@ -128,34 +128,34 @@ async def test_worker_waits_for_streams_and_rows_and_continues_from_an_intact_ch
             message = await unknown.next_msg(LONG_S)
             assert (message.subject, b"not in the table" in message.data) == (subjects.unknown("p1"), True)
             states = await nc.subscribe(subjects.published("p1", "state"))
-            known = await load_packs(nc, ["p1"])
+            registry = await load_packs(nc, ["p1"])
             await _until_block(states, 1)  # deferred until the pack was known
             await send(nc, "p2", block("p2", 1))
             await unknown.next_msg(LONG_S)
             stop.set()
-            await working
-        late = await nc.subscribe(subjects.published("p2", "state"))
-        known = await load_packs(nc, ["p1", "p2"])
+            await worker_task
+        late_states = await nc.subscribe(subjects.published("p2", "state"))
+        registry = await load_packs(nc, ["p1", "p2"])
         number = 1
         for damaged in (0, 1, 2):
             number += 1
             store = await _checkpoint_store(nc, "test")
             for kept in (await store.claim(0)).pointer.kept[:damaged]:
-                await nc.jetstream().purge_stream(STATES, subject=await _chunk_subject(nc, kept.object))
+                await nc.jetstream().purge_stream(STATES_STREAM, subject=await _chunk_subject(nc, kept.object))
             stop = asyncio.Event()
             with capture_logs() as logs:
-                working = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+                worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
                 await send(nc, "p1", block("p1", number))
                 await _until_block(states, number)
                 stop.set()
-                await working
+                await worker_task
             # a damaged checkpoint may be logged again when the worker is fenced and starts again
             assert len({line["object"] for line in logs if "is damaged" in line["event"]}) == damaged
             assert any("from its beginning" in line["event"] for line in logs) == (damaged == 2)
-        await _until_block(late, 1)  # although no block arrived after the pack became known
-        state = (await end_states(nc, known, 1))[0].state("p1")
+        await _until_block(late_states, 1)  # although no block arrived after the pack became known
+        state = (await end_states(nc, registry, 1))[0].state("p1")
         assert state is not None
-        assert state["estimator"].tobytes() == estimated(known, "p1", number)
+        assert state["estimator"].tobytes() == estimated(registry, "p1", number)
         await nc.close()
 
 

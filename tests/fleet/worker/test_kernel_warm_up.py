@@ -26,6 +26,6 @@ def test_warm_up_processes_a_block_and_an_hour(monkeypatch) -> None:
 
 
 def test_each_kernel_is_compiled_for_one_signature() -> None:
-    """Run in a separate process, because other tests may have called the kernels with other array types."""
-    done = subprocess.run([sys.executable, "-c", COUNT_SIGNATURES], check=True, capture_output=True, text=True)
-    assert done.stdout == "[1, 1, 1, 1, 1]\n"
+    """Count the signatures in a separate process, because other tests may have called the kernels with other array types."""
+    process = subprocess.run([sys.executable, "-c", COUNT_SIGNATURES], check=True, capture_output=True, text=True)
+    assert process.stdout == "[1, 1, 1, 1, 1]\n"

@@ -23,7 +23,7 @@ from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.sources.captures.replay import Replay
 from tests.estimator.simulated_cell import pulses
-from tests.fleet.partition_stream import CELL, SETTINGS, STORE, Stream, blocks_of, deliver, one_block, table
+from tests.fleet.partition_stream import CELL, SETTINGS, STORE_ID_NS, Stream, blocks_of, deliver, one_block, table
 
 HOUR_NS = 3600 * 10**9
 
@@ -69,7 +69,7 @@ def test_duplicates_gaps_and_resends_with_a_restart_at_every_message_give_the_st
 
 
 class MemoryCapture:
-    """A capture in memory."""
+    """Capture in memory."""
 
     fraction, implausible = 1.0, 0
 
@@ -91,7 +91,7 @@ async def test_final_state_equals_that_of_a_replay(stream, samples) -> None:
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.integers(-6, 6), max_size=MAX_EARLY_REPEATS - 2), st.data())
 def test_any_order_of_delivery_gives_the_same_state(steps, data) -> None:
-    """An edge sends blocks in any order, and a worker continues from any earlier snapshot."""
+    """Send blocks in any order, and continue from any earlier snapshot."""
     rows = pulses(soc=0.6, hours=0.1)[0]
     blocks, stream = blocks_of(rows, size=30), Stream(Partition(5, table))
     number, snapshots = 1, [stream.partition.snapshot()]
@@ -103,13 +103,13 @@ def test_any_order_of_delivery_gives_the_same_state(steps, data) -> None:
     assert_state_equals(stream, "a", record_of_one_run(rows))
     assert stream.partition.counters["samples"] == rows.size
     snapshot = data.draw(st.sampled_from(snapshots))
-    again = Partition.restore(5, table, b"".join(snapshot.chunks()))
+    restored = Partition.restore(5, table, b"".join(snapshot.chunks()))
     for sequence, (pack, message) in enumerate(stream.messages, 1):
-        again.take(pack, message, sequence)
-    counters = dict(again.counters)
+        restored.take(pack, message, sequence)
+    counters = dict(restored.counters)
     assert counters.pop("repeated", 0) == snapshot.sequence
     assert counters == stream.partition.counters
-    assert again.snapshot().packs == stream.partition.snapshot().packs
+    assert restored.snapshot().packs == stream.partition.snapshot().packs
 
 
 def test_later_blocks_do_not_change_a_snapshot(stream, samples) -> None:
@@ -137,7 +137,7 @@ class TestReplies:
         blocks = blocks_of(samples[:600])
         replies = {number: stream.send("a", data).reply for number, data in enumerate(blocks, 1)}
         assert [number for number, reply in replies.items() if reply] == [1, *range(CONFIRM_EVERY, 31, CONFIRM_EVERY)]
-        assert (replies[20].store, replies[20].number, replies[20].resend) == (STORE, 21, False)
+        assert (replies[20].store, replies[20].number, replies[20].resend) == (STORE_ID_NS, 21, False)
         stream.take_over()
         assert stream.send("a", one_block(samples[600:620], 31)).reply.number == 32
 
@@ -149,9 +149,9 @@ class TestReplies:
         assert all(reply.resend and reply.number == 2 for reply in replies if reply)
 
     def test_block_of_a_former_store_is_answered_with_the_present_store(self, stream, samples) -> None:
-        stream.send("a", one_block(samples[:20], 1, STORE + 1))
-        reply = stream.send("a", one_block(samples[:20], 10, STORE)).reply
-        assert (reply.store, reply.number) == (STORE + 1, 2)
+        stream.send("a", one_block(samples[:20], 1, STORE_ID_NS + 1))
+        reply = stream.send("a", one_block(samples[:20], 10, STORE_ID_NS)).reply
+        assert (reply.store, reply.number) == (STORE_ID_NS + 1, 2)
         assert stream.partition.counters["former_store"] == 1
 
 
@@ -160,16 +160,16 @@ class TestNewStore:
         first, second = samples[:600], samples[600:1200].copy()
         second["time_s"] -= second["time_s"][0] - 3.0
         deliver(stream, "a", blocks_of(first))
-        deliver(stream, "a", blocks_of(second, STORE + HOUR_NS))
+        deliver(stream, "a", blocks_of(second, STORE_ID_NS + HOUR_NS))
         estimator = make_estimator(SETTINGS, CELL)
         estimator.run(first)
-        estimator.resume(3600.0 + 3.0 - 599.0)
+        estimator.resume(unseen_s=3600.0 + 3.0 - 599.0)
         estimator.run(second)
         assert_state_equals(stream, "a", estimator.record)
 
     def test_store_created_before_the_last_sample_is_a_gap_of_unknown_length(self, stream, samples) -> None:
         deliver(stream, "a", blocks_of(samples[:600]))
-        deliver(stream, "a", blocks_of(samples[:60], STORE + 10**9))
+        deliver(stream, "a", blocks_of(samples[:60], STORE_ID_NS + 10**9))
         estimator = make_estimator(SETTINGS, CELL)
         estimator.run(samples[:600])
         estimator.resume(np.inf)
@@ -178,13 +178,13 @@ class TestNewStore:
 
     def test_replaces_the_former_store_only_with_its_first_block(self, stream, samples) -> None:
         deliver(stream, "a", blocks_of(samples[:600]))
-        later = blocks_of(samples[:200], STORE + HOUR_NS)
+        later = blocks_of(samples[:200], STORE_ID_NS + HOUR_NS)
         assert stream.send("a", later[3]).reply.resend
         stream.take_over()
         deliver(stream, "a", later)
         estimator = make_estimator(SETTINGS, CELL)
         estimator.run(samples[:600])
-        estimator.resume(3600.0 - 599.0)
+        estimator.resume(unseen_s=3600.0 - 599.0)
         estimator.run(samples[:200])
         assert_state_equals(stream, "a", estimator.record)
 
@@ -192,9 +192,9 @@ class TestNewStore:
 def test_blocks_that_the_edge_no_longer_has_count_as_lost(stream, samples) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
-    rest = blocks_of(samples[200:400], oldest=11)
-    assert stream.send("a", rest[3]).reply.number == 11
-    deliver(stream, "a", rest, first=11)
+    later_blocks = blocks_of(samples[200:400], oldest=11)
+    assert stream.send("a", later_blocks[3]).reply.number == 11
+    deliver(stream, "a", later_blocks, first=11)
     estimator = make_estimator(SETTINGS, CELL)
     estimator.run(samples[:100])
     estimator.run(samples[200:400])
@@ -203,15 +203,15 @@ def test_blocks_that_the_edge_no_longer_has_count_as_lost(stream, samples) -> No
     assert json.loads(stream.send("a", one_block(samples[400:420], 21)).state)["frames_lost"] == 5
 
 
-@pytest.mark.parametrize("refused", [None, b"damaged"])
-def test_block_that_is_repeatedly_rejected_counts_as_lost(stream, samples, refused) -> None:
+@pytest.mark.parametrize("rejected_block", [None, b"damaged"])
+def test_block_that_is_repeatedly_rejected_counts_as_lost(stream, samples, rejected_block) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
     reply = stream.send("a", blocks[6]).reply
     assert (reply.number, reply.resend) == (6, True)
     for _ in range(MAX_EARLY_REPEATS - 2):
-        if refused:
-            stream.send("a", refused)
+        if rejected_block:
+            stream.send("a", rejected_block)
         assert stream.send("a", blocks[6]).state is None
         stream.take_over()
     assert stream.send("a", blocks[6]).state
@@ -277,8 +277,8 @@ class TestPublishedMessages:
 
     def test_fuel_cell_and_pack_without_identifier(self, samples) -> None:
         cell = load_any("pem_30w")
-        plain = Settings(identifier=IdentifierSettings(enabled=False))
-        packs = {"stack": (Settings(), cell), "plain": (plain, CELL)}
+        without_identifier = Settings(identifier=IdentifierSettings(enabled=False))
+        packs = {"stack": (Settings(), cell), "plain": (without_identifier, CELL)}
         stream = Stream(Partition(5, packs.get))
         stack = samples[:600].copy()
         stack["voltage_v"], stack["current_a"] = cell.cell.nominal_voltage_v, 1.0
@@ -411,10 +411,10 @@ class TestChangedSettings:
         packs = {"a": (SETTINGS, CELL)}
         stream = Stream(Partition(5, packs.get))
         self.take(stream, samples, 0, 10)
-        of_pack = packs.pop("a")
+        row = packs.pop("a")
         stream.partition.settings_changed("a")
         assert self.take(stream, samples, 10, 20).state is None
-        packs["a"] = of_pack
+        packs["a"] = row
         stream.partition.settings_changed("a")
         assert len(stream.take_deferred()) == 10
         assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
@@ -483,14 +483,16 @@ class TestInvalidBlocks:
 
     @pytest.mark.parametrize("arrival_s", [-1e300, -1.0, 1e300])
     def test_implausible_arrival_is_replaced_by_the_last_sample_time(self, stream, samples, arrival_s: float) -> None:
-        result = stream.send("a", encode(Block(STORE, 1, 1, arrival_s, samples[:20])))
+        result = stream.send(
+            "a", encode(Block(store=STORE_ID_NS, number=1, oldest=1, arrival_s=arrival_s, samples=samples[:20]))
+        )
         assert Estimate.model_validate_json(result.state).time == "2024-10-04T00:00:19.000Z"
         assert stream.partition.counters["no_arrival"] == 1
 
     @given(
         st.lists(
             st.tuples(
-                st.sampled_from([1, 2, STORE, STORE + 1, 2**63 - 1]),
+                st.sampled_from([1, 2, STORE_ID_NS, STORE_ID_NS + 1, 2**63 - 1]),
                 st.sampled_from([1, 2, 3, 2**62, 2**63 - 1]),
                 st.sampled_from([1, 2, 2**62, 2**63 - 1]),
                 st.floats(allow_nan=False, allow_infinity=False),
@@ -501,12 +503,12 @@ class TestInvalidBlocks:
         )
     )
     @settings(max_examples=60, deadline=None)
-    def test_no_header_or_sample_value_raises(self, sent) -> None:
+    def test_no_header_or_sample_value_causes_an_exception(self, sent) -> None:
         stream = Stream(Partition(5, table))
         rows = pulses(hours=0.02)[0][:3]
         for store, number, oldest, arrival_s, time_s, value in sent:
             rows["time_s"][1], rows["voltage_v"][2] = time_s, value
-            block = Block(store, number, min(oldest, number), arrival_s, rows)
+            block = Block(store=store, number=number, oldest=min(oldest, number), arrival_s=arrival_s, samples=rows)
             for pack in ("a", "unknown"):
                 stream.send(pack, encode(replace(block, samples=rows)))
             stream.take_over()
@@ -517,11 +519,11 @@ def test_long_block_equals_many_short_ones(stream, samples) -> None:
     last = [short.send("a", data) for data in blocks_of(samples, size=MAX_PART_SAMPLES // 2)][-1]
     assert_state_equals(stream, "a", record_of_one_run(samples))
     assert_state_equals(short, "a", record_of_one_run(samples))
-    of_long, of_short = (json.loads(result.state) for result in (long, last))
-    assert of_long["sample_rate_hz"] == of_short["sample_rate_hz"] == 1.0
-    assert of_long["voltage_v"] == pytest.approx(samples["voltage_v"].mean())
-    net = [state["charge_out_ah"] - state["charge_in_ah"] for state in (of_long, of_short)]
-    assert net[0] == pytest.approx(net[1])
+    long_state, short_state = (json.loads(result.state) for result in (long, last))
+    assert long_state["sample_rate_hz"] == short_state["sample_rate_hz"] == 1.0
+    assert long_state["voltage_v"] == pytest.approx(samples["voltage_v"].mean())
+    net_charge_ah = [state["charge_out_ah"] - state["charge_in_ah"] for state in (long_state, short_state)]
+    assert net_charge_ah[0] == pytest.approx(net_charge_ah[1])
 
 
 def test_packs_of_different_types_are_independent(samples) -> None:
@@ -531,7 +533,7 @@ def test_packs_of_different_types_are_independent(samples) -> None:
     for data in blocks_of(samples[:200]):
         for name in packs:
             stream.send(name, data)
-    for name, of_pack in packs.items():
-        estimator = make_estimator(*of_pack)
+    for name, row in packs.items():
+        estimator = make_estimator(*row)
         estimator.run(samples[:200])
         assert_state_equals(stream, name, estimator.record)

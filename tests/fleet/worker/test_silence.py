@@ -1,4 +1,4 @@
-"""Partition lease without deliveries: messages of a dead worker, another owner meanwhile, and an internal error."""
+"""Partition lease without deliveries: messages of a dead worker, an intermediate owner, and an internal error."""
 
 import asyncio
 from pathlib import Path
@@ -22,6 +22,7 @@ from tests.patience import end
 PARTITIONS = 4
 PACKS = ["p1", "p2", "p3"]
 BLOCKS = 3
+"""Number of blocks of each pack."""
 
 
 async def test_messages_delivered_to_a_dead_worker_are_processed_without_further_blocks(tmp_path: Path) -> None:
@@ -29,15 +30,15 @@ async def test_messages_delivered_to_a_dead_worker_are_processed_without_further
         nc = await nats.connect(cluster.url)
         await make_streams(nc, partitions=PARTITIONS)
         registry = await load_packs(nc, PACKS)
-        used = {subjects.partition_of(pack, PARTITIONS) for pack in PACKS}
-        assert 0 < len(used) < PARTITIONS
+        used_partitions = {subjects.partition_of(pack, PARTITIONS) for pack in PACKS}
+        assert 0 < len(used_partitions) < PARTITIONS
         for number in range(1, BLOCKS):
             for pack in PACKS:
                 await send(nc, pack, block(pack, number))
-        for number in used:
+        for number in used_partitions:
             await _receive_and_die(nc, number, (BLOCKS - 1) * _packs_of(number))
         stop = asyncio.Event()
-        working = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+        worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
         async with Heartbeats(nc) as heartbeats:
             await heartbeats.until_held(PARTITIONS, "w")
             await heartbeats.until(lambda last: last["w"].blocks >= (BLOCKS - 1) * len(PACKS))
@@ -45,7 +46,7 @@ async def test_messages_delivered_to_a_dead_worker_are_processed_without_further
                 await send(nc, pack, block(pack, BLOCKS))
             await heartbeats.until(lambda last: last["w"].blocks >= BLOCKS * len(PACKS))
         stop.set()
-        await working
+        await worker_task
         states = await end_states(nc, registry, PARTITIONS)
         for pack in PACKS:
             partition = states[subjects.partition_of(pack, PARTITIONS)]
@@ -81,9 +82,9 @@ async def test_fenced_worker_that_owns_the_partition_again_continues_from_the_ch
         await make_streams(nc, partitions=1)
         registry = await load_packs(nc, PACKS)
         lease, running_lease = await _lease_after_first_blocks(nc, registry)
-        await (await _checkpoint_store(nc, "other")).claim(
-            0
-        )  # another worker claims the partition and dies; its pin lapses
+        # another worker claims the partition and dies, so that its pin lapses
+        other_store = await _checkpoint_store(nc, "other")
+        await other_store.claim(0)
 
         def is_fenced() -> object:
             lease.check_silence()
@@ -122,7 +123,7 @@ async def _lease_after_first_blocks(nc: Client, table: Table) -> tuple[Partition
 
 
 async def _receive_and_die(nc: Client, partition: int, messages: int) -> None:
-    """Receive all messages of a partition like a worker that then dies."""
+    """Receive all messages of a partition without an acknowledgment, as a worker that dies."""
     inbox = nc.new_inbox()
     consumer = PinnedConsumer(nc, partition, inbox)
     await _subscribe(nc, f"{inbox}.*", consumer.receive)

@@ -1,4 +1,4 @@
-"""Workers and server nodes killed while simulated edges send: no block is lost or counted twice.
+"""Workers and server nodes kills while simulated edges send: no block is lost or counted twice.
 
 ``make fleet-kills`` sets the numbers of kills, nodes and packs by ``KILLS``, ``NODES`` and ``PACKS``.
 """
@@ -40,13 +40,13 @@ KILLS, NODES, PACKS, SEED = (
 )
 PARTITIONS = 4
 BLOCKS_PER_S = 40.0
-"""Blocks of all edges [1/s]: eight edges send an hour in 12 s."""
-MEAN_S = 1.0
+"""Rate of the blocks of all edges, at which eight edges send an hour in 12 s [1/s]."""
+MEAN_UPTIME_S = 1.0
 """Mean time from the restart after a kill to the next kill [s]."""
-MAX_AWAY_S = 2.0
+MAX_DOWNTIME_S = 2.0
 """Maximum delay of the restart after a kill [s]."""
-BLOCKS_AFTER = 5
-"""Blocks of each edge after the last kill: a worker requests a missing block when the next one arrives."""
+BLOCKS_AFTER_KILLS = 5
+"""Number of blocks of each edge after the last kill. They are needed because a worker requests a missing block when the next one arrives."""
 
 
 async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path) -> None:
@@ -72,22 +72,22 @@ async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path)
         speed = BLOCKS_PER_S * BLOCK_S / PACKS
         edges, stop = SimulatedEdges(fleet, start_s=time.time(), speed=speed), asyncio.Event()
         settings = MqttSettings(url=tuple(f"mqtt://127.0.0.1:{port}" for port in cluster.mqtt_ports))
-        sending = asyncio.create_task(
+        publisher_task = asyncio.create_task(
             run_edges(fleet, edges, settings, connections=2, stop=stop, report=lambda _: None)
         )
         async with Heartbeats(nc) as heartbeats:
             await heartbeats.until_held(PARTITIONS, *workers)
             await heartbeats.until(blocks)
-            dice, killed = random.Random(SEED), Counter[str]()
+            dice, kills = random.Random(SEED), Counter[str]()
             for kill in range(KILLS):
-                await asyncio.sleep(dice.expovariate(1.0 / MEAN_S))
+                await asyncio.sleep(dice.expovariate(1.0 / MEAN_UPTIME_S))
                 if kill % 2:
-                    killed[await kill_node(cluster, dice)] += 1
+                    kills[await kill_node(cluster, dice)] += 1
                 else:
                     workers.pop(dice.choice(sorted(workers))).kill()
-                    await asyncio.sleep(dice.uniform(0.0, MAX_AWAY_S))
+                    await asyncio.sleep(dice.uniform(0.0, MAX_DOWNTIME_S))
                     start()
-                    killed["worker"] += 1
+                    kills["worker"] += 1
             await heartbeats.until_held(PARTITIONS, *workers)
             suspended, other = workers
             workers[suspended].signal(signal.SIGSTOP)
@@ -95,14 +95,14 @@ async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path)
             workers[suspended].signal(signal.SIGCONT)
             await workers[suspended].logged("fenced out")
             await heartbeats.until_held(PARTITIONS, *workers)
-            edges.last = int(edges.next.max()) + BLOCKS_AFTER
-            taken = 0
-            while taken < edges.last * PACKS:  # a busy machine may take longer than the limit of one wait
-                await heartbeats.until(lambda last, before=taken: blocks(last) > before)
-                taken = blocks(heartbeats.last)
-        assert taken == edges.last * PACKS
+            edges.last = int(edges.next.max()) + BLOCKS_AFTER_KILLS
+            processed_blocks = 0
+            while processed_blocks < edges.last * PACKS:  # a busy machine may take longer than the limit of one wait
+                await heartbeats.until(lambda last, before=processed_blocks: blocks(last) > before)
+                processed_blocks = blocks(heartbeats.last)
+        assert processed_blocks == edges.last * PACKS
         stop.set()
-        sys.stdout.write(f"{NODES} nodes, kills: {dict(killed)}; {await sending}\n")
+        sys.stdout.write(f"{NODES} nodes, kills: {dict(kills)}; {await publisher_task}\n")
         assert [await worker.end() for worker in workers.values()] == [0, 0]
         states = await end_states(nc, bucket.packs, PARTITIONS)
         for i, pack in enumerate(fleet.names):
@@ -124,11 +124,11 @@ def pack_rows(fleet: SimulatedFleet, path: Path) -> dict[str, bytes]:
 
 
 async def kill_node(cluster: NatsCluster, dice: random.Random) -> str:
-    """Kill and restart a node, half of the times the leader of the blocks' stream. Returns its role."""
+    """Kill and restart a node, in half of the cases the leader of the blocks' stream. Return its role."""
     leader = cluster.leader(subjects.RAW_STREAM)
     node = leader if leader >= 0 and dice.random() < 0.5 else dice.randrange(NODES)
     cluster.kill(node)
-    await asyncio.sleep(dice.uniform(0.0, MAX_AWAY_S))
+    await asyncio.sleep(dice.uniform(0.0, MAX_DOWNTIME_S))
     await asyncio.to_thread(cluster.start, node)
     return "leader" if node == leader else "node"
 
@@ -145,9 +145,9 @@ async def hours(nc: Client) -> dict[str, bytes]:
     return rows
 
 
-def expected_hours(known: PackRegistry, fleet: SimulatedFleet, edges: SimulatedEdges) -> dict[str, bytes]:
-    """Return the hour rows of one partition that takes all blocks in order."""
-    partition, packs = Partition(0, known), np.arange(PACKS)
+def expected_hours(registry: PackRegistry, fleet: SimulatedFleet, edges: SimulatedEdges) -> dict[str, bytes]:
+    """Return the hour rows of one partition that processes all blocks in order."""
+    partition, packs = Partition(0, registry), np.arange(PACKS)
     rows = {}
     for number in range(1, edges.last + 1):
         numbers = np.full(PACKS, number)

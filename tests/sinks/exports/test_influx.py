@@ -21,10 +21,11 @@ from tests.influxdb import INFLUXD, InfluxDB
 from tests.sinks.service import until
 from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW
 
-LOW = SOC_LOW.model_copy(update={"text": 'charge "it" soon, \\now\nor never'})
+LOW_SOC_ALARM = SOC_LOW.model_copy(update={"text": 'charge "it" soon, \\now\nor never'})
 
 
 def at(second: int, **changes: Any) -> Snapshot:
+    """Return a snapshot ``second`` seconds after 12:00:00.250."""
     assert ONE.estimate
     time = f"2024-05-01T12:{second // 60:02}:{second % 60:02}.250Z"
     return ONE._replace(estimate=ONE.estimate.model_copy(update={"time": time} | changes))
@@ -40,15 +41,15 @@ def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
 
 
 def sink(url: str, **options: Any) -> InfluxSink:
-    told = {"url": url, "database": "bms", "every_s": 0.1} | options
-    return InfluxSink(InfluxSettings(**told), first_delay_s=0.1)
+    settings_values = {"url": url, "database": "bms", "every_s": 0.1} | options
+    return InfluxSink(InfluxSettings(**settings_values), first_delay_s=0.1)
 
 
 async def test_written_lines_can_be_queried(influxdb: InfluxDB) -> None:
-    async with sink(influxdb.url) as writing:
+    async with sink(influxdb.url) as influx:
         state = at(0, voltage_v=51.25, cells_v=[3.25, None, 3.5])
-        writing.publish(state._replace(alarms=(LOW,)))
-        await until(lambda: not writing.waiting)
+        influx.publish(state._replace(alarms=(LOW_SOC_ALARM,)))
+        await until(lambda: not influx.waiting)
         [row] = await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state")
         assert row["device"] == "pack"
         assert row["time"] == 1000 * datetime.fromisoformat("2024-05-01T12:00:00.250Z").timestamp()
@@ -62,36 +63,36 @@ async def test_written_lines_can_be_queried(influxdb: InfluxDB) -> None:
 
 
 async def test_lines_of_an_outage_are_written_afterwards(influxdb: InfluxDB) -> None:
-    async with sink(influxdb.url) as writing:
+    async with sink(influxdb.url) as influx:
         await asyncio.to_thread(influxdb.stop)
         with structlog.testing.capture_logs() as logs:
             for second in range(100, 110):
-                writing.publish(at(second))
+                influx.publish(at(second))
             await until(lambda: logs)
             await asyncio.to_thread(influxdb.start)
-            await until(lambda: not writing.waiting)
+            await until(lambda: not influx.waiting)
         events = [entry["event"] for entry in logs]
         assert events[0] == "influxdb rejects lines"
         assert events.count("influxdb accepts lines again") == 1
         rows = await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state WHERE time >= '2024-05-01T12:01:40Z'")
         assert len(rows) == 10
-    assert writing.dropped == 0
+    assert influx.dropped == 0
 
 
 async def test_queued_lines_are_written_at_shutdown(influxdb: InfluxDB) -> None:
-    async with sink(influxdb.url, every_s=3600.0) as writing:
-        writing.publish(at(600, frames_received=777))
-    assert writing.waiting == 0
+    async with sink(influxdb.url, every_s=3600.0) as influx:
+        influx.publish(at(600, frames_received=777))
+    assert influx.waiting == 0
     assert await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state WHERE frames_received = 777")
 
 
-class Answers(BaseHTTPRequestHandler):
+class ConfiguredHandler(BaseHTTPRequestHandler):
     """HTTP handler that gives configured responses and stores the requests."""
 
     def do_POST(self) -> None:
         server: Any = self.server
-        server.asked.append((self.path, dict(self.headers), self.rfile.read(int(self.headers["Content-Length"]))))
-        status, text = server.answers[0] if len(server.answers) == 1 else server.answers.pop(0)
+        server.requests.append((self.path, dict(self.headers), self.rfile.read(int(self.headers["Content-Length"]))))
+        status, text = server.responses[0] if len(server.responses) == 1 else server.responses.pop(0)
         self.send_response(status)
         self.send_header("Location", "/elsewhere")
         self.send_header("Content-Length", str(len(text)))
@@ -104,13 +105,13 @@ class Answers(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server() -> Iterator[Any]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), Answers) as server:
-        told: Any = server
-        told.asked, told.answers = [], [(204, b"")]
-        told.url = f"http://127.0.0.1:{server.server_port}"
+    with ThreadingHTTPServer(("127.0.0.1", 0), ConfiguredHandler) as server:
+        configured: Any = server
+        configured.requests, configured.responses = [], [(204, b"")]
+        configured.url = f"http://127.0.0.1:{server.server_port}"
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
         thread.start()
-        yield told
+        yield configured
         server.shutdown()
         thread.join()
 
@@ -119,52 +120,52 @@ async def test_influxdb_2_request_has_bucket_and_token(server: Any, tmp_path: Pa
     token = tmp_path / "token"
     token.write_text("secret\n")
     settings = InfluxSettings(url=server.url + "/in/", bucket="b c", org="home", token_file=token, every_s=0.1)
-    async with InfluxSink(settings) as writing:
-        writing.publish(at(0))
-        await until(lambda: server.asked)
-    path, headers, body = server.asked[0]
+    async with InfluxSink(settings) as influx:
+        influx.publish(at(0))
+        await until(lambda: server.requests)
+    path, headers, body = server.requests[0]
     assert path == "/in/api/v2/write?bucket=b+c&org=home&precision=ms"
     assert headers["Authorization"] == "Token secret"
     assert body.decode() == "\n".join(lines(None, at(0)))
 
 
 async def test_permanently_rejected_lines_are_dropped_and_others_retried(server: Any) -> None:
-    server.answers = [(302, b""), (503, b"busy"), (400, b"bad \x1b line"), (204, b"")]
-    async with sink(server.url) as writing:
+    server.responses = [(302, b""), (503, b"busy"), (400, b"bad \x1b line"), (204, b"")]
+    async with sink(server.url) as influx:
         with structlog.testing.capture_logs() as logs:
-            writing.publish(at(0))
-            await until(lambda: writing.dropped)
-            writing.publish(at(1))
-            await until(lambda: not writing.waiting)
-    bodies = [body for _, _, body in server.asked]
+            influx.publish(at(0))
+            await until(lambda: influx.dropped)
+            influx.publish(at(1))
+            await until(lambda: not influx.waiting)
+    bodies = [body for _, _, body in server.requests]
     assert bodies[0] == bodies[1] == bodies[2] != bodies[3]
-    assert writing.dropped == 1
+    assert influx.dropped == 1
     reasons = [entry["reason"] for entry in logs if "reason" in entry]
     assert [reason[:3] for reason in reasons] == ["302", "503", "400"]
     assert all(reason.isprintable() for reason in reasons)
 
 
 async def test_queue_is_bounded_and_sent_in_batches(server: Any) -> None:
-    server.answers = [(503, b"")]
-    async with sink(server.url) as writing:
-        writing.publish(at(0))
-        await until(lambda: server.asked)
+    server.responses = [(503, b"")]
+    async with sink(server.url) as influx:
+        influx.publish(at(0))
+        await until(lambda: server.requests)
         for second in range(1, MAX_WAITING + 2 * BATCH):
-            writing.publish(at(second % 3600))
-        assert writing.waiting <= MAX_WAITING + BATCH
-        assert writing.dropped >= BATCH - 1
-        server.answers = [(204, b"")]
-        await until(lambda: not writing.waiting)
-    assert max(body.count(b"\n") + 1 for _, _, body in server.asked) <= BATCH
+            influx.publish(at(second % 3600))
+        assert influx.waiting <= MAX_WAITING + BATCH
+        assert influx.dropped >= BATCH - 1
+        server.responses = [(204, b"")]
+        await until(lambda: not influx.waiting)
+    assert max(body.count(b"\n") + 1 for _, _, body in server.requests) <= BATCH
 
 
 async def test_server_without_response_does_not_block_shutdown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)
-    with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts
-        async with sink(f"http://127.0.0.1:{silent.getsockname()[1]}") as writing:
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts connections, but no program responds
+        async with sink(f"http://127.0.0.1:{silent.getsockname()[1]}") as influx:
             for second in range(20):
-                writing.publish(at(second))
-        assert writing.waiting == 20
+                influx.publish(at(second))
+        assert influx.waiting == 20
 
 
 async def test_truncated_response_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,27 +181,27 @@ async def test_truncated_response_is_retried(monkeypatch: pytest.MonkeyPatch) ->
                     pass
 
         with structlog.testing.capture_logs() as logs:
-            async with sink(f"http://127.0.0.1:{listening.getsockname()[1]}") as writing:
-                answered = asyncio.create_task(asyncio.to_thread(answer))
-                writing.publish(at(0))
-                await answered
+            async with sink(f"http://127.0.0.1:{listening.getsockname()[1]}") as influx:
+                response_sent = asyncio.create_task(asyncio.to_thread(answer))
+                influx.publish(at(0))
+                await response_sent
                 await until(lambda: logs)
-                writing.publish(at(1))
+                influx.publish(at(1))
         assert logs[0]["reason"].startswith("503 Busy")
-        assert writing.waiting == 2
+        assert influx.waiting == 2
 
 
 async def test_invalid_host_name_is_reported() -> None:
     with structlog.testing.capture_logs() as logs:
-        async with sink("http://influx..local:8086") as writing:
-            writing.publish(at(0))
+        async with sink("http://influx..local:8086") as influx:
+            influx.publish(at(0))
             await until(lambda: logs)
-            writing.publish(at(1))
+            influx.publish(at(1))
     assert "label empty or too long" in logs[0]["reason"]
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("settings_values", "message"),
     [
         ({"bucket": "b", "username": "me"}, "of no use with bucket"),
         ({"org": "o"}, "of no use without bucket"),
@@ -208,9 +209,9 @@ async def test_invalid_host_name_is_reported() -> None:
         ({"url": "udp://house"}, "url"),
     ],
 )
-def test_invalid_settings_are_rejected(told: dict[str, Any], message: str) -> None:
+def test_invalid_settings_are_rejected(settings_values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        InfluxSettings(**({"database": "bms"} | told))
+        InfluxSettings(**({"database": "bms"} | settings_values))
 
 
 def test_unusable_file_raises_an_error_at_start(tmp_path: Path) -> None:
@@ -226,7 +227,7 @@ def test_unusable_file_raises_an_error_at_start(tmp_path: Path) -> None:
 
 def test_snapshot_without_changes_has_no_lines() -> None:
     assert lines(None, NOTHING_YET) == []
-    raised = NOTHING_YET._replace(alarms=(LOW,))
+    raised = NOTHING_YET._replace(alarms=(LOW_SOC_ALARM,))
     [line] = lines(NOTHING_YET, raised)
     assert line.startswith(
         "bms_alarm,device=pack,name=soc_low,severity=warning active=true,watched=true,value=9.5,limit=10.0,text="

@@ -31,14 +31,14 @@ from bms_estimator.sinks.exports.prometheus_metrics import (
 PROMTOOL = shutil.which("promtool")
 
 
-def full() -> Snapshot:
+def snapshot_with_all_values() -> Snapshot:
     """Return a snapshot with cells, energy and an alarm."""
     assert ONE.estimate
-    told = {"cells_v": [3.25, None, 3.5], "energy_out_kwh": 1.5, "time_to_empty_s": 60.0, "temperature_c": 21.5}
-    return ONE._replace(estimate=ONE.estimate.model_copy(update=told), alarms=(SOC_LOW,))
+    values = {"cells_v": [3.25, None, 3.5], "energy_out_kwh": 1.5, "time_to_empty_s": 60.0, "temperature_c": 21.5}
+    return ONE._replace(estimate=ONE.estimate.model_copy(update=values), alarms=(SOC_LOW,))
 
 
-async def fetched(snapshot: Snapshot | None) -> str:
+async def scrape(snapshot: Snapshot | None) -> str:
     settings = PrometheusSettings(listen=f"127.0.0.1:{free_port()}")
     async with PrometheusSink(settings) as sink:
         if snapshot is not None:
@@ -53,44 +53,44 @@ async def fetched(snapshot: Snapshot | None) -> str:
 
 def values(text: str) -> dict[tuple[str, ...], float]:
     """Return the values by name and labels other than the device."""
-    found = {}
+    metrics = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
             labels = dict(sample.labels)
             assert labels.pop("device") == "pack"
-            found[sample.name, *labels.values()] = sample.value
-    return found
+            metrics[sample.name, *labels.values()] = sample.value
+    return metrics
 
 
 async def test_a_scrape_has_the_values_in_base_units() -> None:
-    text = await fetched(full())
-    told = values(text)
-    assert told["bms_voltage_volts",] == 3.8
-    assert told["bms_soc_ratio",] == pytest.approx(0.5)
-    assert told["bms_energy_out_joules_total",] == 1.5 * 3.6e6
-    assert told["bms_temperature_celsius",] == 21.5
-    assert told["bms_crc_errors_total",] == 3.0
-    assert told["bms_line_total", "frames_received"] == 2.0
-    assert (told["bms_cell_volts", "1"], told["bms_cell_volts", "3"]) == (3.25, 3.5)
-    assert ("bms_cell_volts", "2") not in told
-    assert told["bms_alarm", "soc_low", "warning"] == 1.0
-    assert told["bms_sensor_online",] == 1.0
+    text = await scrape(snapshot_with_all_values())
+    metrics = values(text)
+    assert metrics["bms_voltage_volts",] == 3.8
+    assert metrics["bms_soc_ratio",] == pytest.approx(0.5)
+    assert metrics["bms_energy_out_joules_total",] == 1.5 * 3.6e6
+    assert metrics["bms_temperature_celsius",] == 21.5
+    assert metrics["bms_crc_errors_total",] == 3.0
+    assert metrics["bms_line_total", "frames_received"] == 2.0
+    assert (metrics["bms_cell_volts", "1"], metrics["bms_cell_volts", "3"]) == (3.25, 3.5)
+    assert ("bms_cell_volts", "2") not in metrics
+    assert metrics["bms_alarm", "soc_low", "warning"] == 1.0
+    assert metrics["bms_sensor_online",] == 1.0
     assert "# TYPE bms_energy_out_joules_total counter" in text
     assert "positive on discharge" in text
     if PROMTOOL:
-        judge = [PROMTOOL, "check", "metrics"]
-        judged = await asyncio.to_thread(subprocess.run, judge, input=text, capture_output=True, text=True)
-        assert (judged.returncode, judged.stderr) == (0, "")
+        command = [PROMTOOL, "check", "metrics"]
+        check = await asyncio.to_thread(subprocess.run, command, input=text, capture_output=True, text=True)
+        assert (check.returncode, check.stderr) == (0, "")
 
 
 async def test_unknown_and_stale_values_have_no_metrics() -> None:
-    assert values(await fetched(None)) == {}
+    assert values(await scrape(None)) == {}
     for stale in (NOTHING_YET, snapshot("no board")):
-        told = values(await fetched(stale))
-        assert not {"bms_voltage_volts", "bms_soc_ratio"} & {name for name, *_ in told}
-        assert ("bms_uptime_seconds",) in told
-    assert values(await fetched(snapshot("no board")))["bms_sensor_online",] == 0.0
-    assert ("bms_soc_ratio",) not in values(await fetched(STACK))
+        metrics = values(await scrape(stale))
+        assert not {"bms_voltage_volts", "bms_soc_ratio"} & {name for name, *_ in metrics}
+        assert ("bms_uptime_seconds",) in metrics
+    assert values(await scrape(snapshot("no board")))["bms_sensor_online",] == 0.0
+    assert ("bms_soc_ratio",) not in values(await scrape(STACK))
 
 
 async def test_occupied_address_raises_an_error() -> None:
@@ -100,7 +100,7 @@ async def test_occupied_address_raises_an_error() -> None:
             await PrometheusSink(settings).__aenter__()
 
 
-def test_tables_name_existing_fields() -> None:
+def test_tables_contain_only_existing_fields() -> None:
     fields = set(Estimate.model_fields) | set(Health.model_fields)
     assert {*KINDS, *LIST_ITEMS} <= fields
 
@@ -122,25 +122,25 @@ def test_invalid_address_is_rejected(listen: str) -> None:
 
 
 def test_ipv4_and_ipv6_addresses_are_accepted() -> None:
-    told: Any = [PrometheusSettings(listen=listen) for listen in ("127.0.0.1:9108", "[::1]:1")]
-    assert [(each.host, each.port) for each in told] == [("127.0.0.1", 9108), ("::1", 1)]
+    settings: Any = [PrometheusSettings(listen=listen) for listen in ("127.0.0.1:9108", "[::1]:1")]
+    assert [(each.host, each.port) for each in settings] == [("127.0.0.1", 9108), ("::1", 1)]
 
 
-async def test_a_slow_name_service_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, answer, found = threading.Event(), threading.Event(), socket.getaddrinfo
+async def test_slow_name_lookup_does_not_block_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    called, may_return, original = threading.Event(), threading.Event(), socket.getaddrinfo
 
     def slow(*arguments: Any, **options: Any) -> Any:
-        asked.set()
-        assert answer.wait(LONG_S)
-        return found(*arguments, **options)
+        called.set()
+        assert may_return.wait(LONG_S)
+        return original(*arguments, **options)
 
     monkeypatch.setattr(socket, "getaddrinfo", slow)
 
-    async def turn() -> None:
-        await asyncio.to_thread(asked.wait, LONG_S)
-        answer.set()
+    async def release() -> None:
+        await asyncio.to_thread(called.wait, LONG_S)
+        may_return.set()
 
     async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(turn())
+        tasks.create_task(release())
         async with PrometheusSink(PrometheusSettings(listen=f"127.0.0.1:{free_port()}")):
             pass

@@ -17,20 +17,21 @@ from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.sinks.snapshots import ONE, STACK
 
 ROOT = "bms/pack"
-HOME = HomeAssistantSettings()
+SETTINGS = HomeAssistantSettings()
 
 
-def described(found: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def components_of(message: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the components of a discovery message, without removed ones."""
-    return {key: component for key, component in found["components"].items() if set(component) != {"platform"}}
+    return {key: component for key, component in message["components"].items() if set(component) != {"platform"}}
 
 
-COMPONENTS = described(discovery(HOME, DiscoveryInputs(ONE.info), ROOT, 0.0))
+COMPONENTS = components_of(discovery(SETTINGS, DiscoveryInputs(ONE.info), ROOT, 0.0))
 SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
 MAX_ROWS_PER_MIN = 20
+"""Maximum number of recorder rows per minute."""
 
 
-OF_STACK = described(discovery(HOME, DiscoveryInputs(STACK.info), ROOT, 0.0))
+STACK_COMPONENTS = components_of(discovery(SETTINGS, DiscoveryInputs(STACK.info), ROOT, 0.0))
 
 
 def with_values(**values: float | None) -> Snapshot:
@@ -38,8 +39,8 @@ def with_values(**values: float | None) -> Snapshot:
     return ONE._replace(estimate=ONE.estimate.model_copy(update=values))
 
 
-def noisy(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, Snapshot]]:
-    """Yield noisy measurements of an 18650 cell under a load that changes every twenty seconds."""
+def noisy_cell(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, Snapshot]]:
+    """Yield noisy measurements of an 18650 cell under a load that changes every 20 s."""
     rng, soc, load_a = np.random.default_rng(5), 0.9, 0.0
     for i in range(round(seconds / period_s)):
         now_s = i * period_s
@@ -66,23 +67,24 @@ def noisy(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, Snapsh
 
 
 CELLS = 4
-MOVED = ("soc_std", "time_to_empty_s", "time_to_full_s", "cell_lowest", "cell_lowest_v")
-"""What entities are made of that have other names."""
+"""Number of cells with a voltage."""
+SOURCE_FIELDS = ("soc_std", "time_to_empty_s", "time_to_full_s", "cell_lowest", "cell_lowest_v")
+"""Fields of the estimate whose entities have other names."""
 
 
-def restless(seconds: float, period_s: float = 0.1, one: Snapshot = ONE) -> Iterator[tuple[float, Snapshot]]:
+def all_changing(seconds: float, period_s: float = 0.1, base: Snapshot = ONE) -> Iterator[tuple[float, Snapshot]]:
     """Yield snapshots in which every value changes."""
-    assert one.estimate
-    names = [key for key in (*SHOWN, *MOVED) if hasattr(one.estimate, key)]
+    assert base.estimate
+    names = [key for key in (*SHOWN, *SOURCE_FIELDS) if hasattr(base.estimate, key)]
     for i in range(round(seconds / period_s)):
-        elements = {key: e.model_copy(update={"value": float(i)}) for key, e in one.parameters.elements.items()}
+        elements = {key: e.model_copy(update={"value": float(i)}) for key, e in base.parameters.elements.items()}
         health = {"capacity": Parameter(value=float(i), std=float(i), valid=True, source="identified")}
-        parameters = one.parameters.model_copy(update={"elements": elements, "state_of_health": health})
-        estimate = one.estimate.model_copy(update=dict.fromkeys(names, i) | {"cells_v": [float(i)] * CELLS})
-        yield i * period_s, one._replace(estimate=estimate, parameters=parameters)
+        parameters = base.parameters.model_copy(update={"elements": elements, "state_of_health": health})
+        estimate = base.estimate.model_copy(update=dict.fromkeys(names, i) | {"cells_v": [float(i)] * CELLS})
+        yield i * period_s, base._replace(estimate=estimate, parameters=parameters)
 
 
-def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str, dict[str, object]]]:
+def home_assistant_messages(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str, dict[str, object]]]:
     """Yield time, topic and content of the messages to Home Assistant."""
     messages, sent = MessageBuilder("bms", "pack"), PublishedState()
     for now_s, each in stream:
@@ -97,44 +99,46 @@ def rows(
 ) -> list[float]:
     """Return the times at which Home Assistant's recorder writes a row, for changed states or attributes of entities."""
     last: dict[str, object] = {}
-    written = []
-    shown = {key for key, component in components.items() if component.get("enabled_by_default", True)}
-    for now_s, topic, payload in told(stream):
-        for key in shown & set(payload):
+    row_times_s = []
+    enabled = {key for key, component in components.items() if component.get("enabled_by_default", True)}
+    for now_s, topic, payload in home_assistant_messages(stream):
+        for key in enabled & set(payload):
             assert components[key]["state_topic"] == topic
             if key in last and last[key] != payload[key]:
-                written.append(now_s)
+                row_times_s.append(now_s)
             last[key] = payload[key]
-    assert shown <= set(last)
-    return written
+    assert enabled <= set(last)
+    return row_times_s
 
 
-@pytest.mark.parametrize("stream", [noisy, restless])
+@pytest.mark.parametrize("stream", [noisy_cell, all_changing])
 def test_home_assistant_records_at_most_20_rows_in_any_minute(
     stream: Callable[[float], Iterator[tuple[float, Snapshot]]],
 ) -> None:
     components = (
-        described(discovery(HOME, DiscoveryInputs(ONE.info, CELLS), ROOT, 0.0)) if stream is restless else COMPONENTS
+        components_of(discovery(SETTINGS, DiscoveryInputs(ONE.info, CELLS), ROOT, 0.0))
+        if stream is all_changing
+        else COMPONENTS
     )
-    written = np.array(rows(stream(900.0), components))
-    assert written.size > 100
-    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MAX_ROWS_PER_MIN
+    row_times_s = np.array(rows(stream(900.0), components))
+    assert row_times_s.size > 100
+    assert max(np.count_nonzero((row_times_s >= t) & (row_times_s < t + 60.0)) for t in row_times_s) <= MAX_ROWS_PER_MIN
 
 
-def test_fuel_cell_has_no_more_rows() -> None:
-    written = np.array(rows(restless(900.0, one=STACK), OF_STACK))
-    assert written.size > 100
-    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MAX_ROWS_PER_MIN
+def test_fuel_cell_causes_at_most_20_rows_in_any_minute() -> None:
+    row_times_s = np.array(rows(all_changing(900.0, base=STACK), STACK_COMPONENTS))
+    assert row_times_s.size > 100
+    assert max(np.count_nonzero((row_times_s >= t) & (row_times_s < t + 60.0)) for t in row_times_s) <= MAX_ROWS_PER_MIN
 
 
 def test_fuel_cell_has_its_own_entities() -> None:
-    values = next(payload for _, topic, payload in told(iter([(0.0, STACK)])))
-    numbers = {key for key, component in OF_STACK.items() if component["platform"] == "sensor"}
+    values = next(payload for _, topic, payload in home_assistant_messages(iter([(0.0, STACK)])))
+    numbers = {key for key, component in STACK_COMPONENTS.items() if component["platform"] == "sensor"}
     assert numbers == set(values)
     assert {key for key, value in values.items() if value is None} == {"temperature_c"}
     assert set(KEYS) <= numbers
     assert values["r_ohm"] == pytest.approx(0.1677, abs=1e-3)
-    assert OF_STACK["r_ohm"]["unit_of_measurement"] == "Ω"
+    assert STACK_COMPONENTS["r_ohm"]["unit_of_measurement"] == "Ω"
 
 
 def test_noise_causes_no_rows() -> None:
@@ -149,31 +153,31 @@ def test_noise_causes_no_rows() -> None:
 @pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.0, 4.0, 10.0])
 def test_values_never_expire_while_estimates_come(rate_hz: float) -> None:
     info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(HOME, DiscoveryInputs(info), ROOT, 0.0)["components"].values()
+    components = discovery(SETTINGS, DiscoveryInputs(info), ROOT, 0.0)["components"].values()
     expiry_s = min(c["expire_after"] for c in components if "expire_after" in c)
     rng = np.random.default_rng(3)
     late_s = [float(rng.uniform(0.0, 0.9 / rate_hz)) for _ in range(round(600 * rate_hz))]
     stream = ((i / rate_hz + late, ONE) for i, late in enumerate(late_s))
-    times_s = [now_s for now_s, topic, _ in told(stream) if topic == f"{ROOT}/home_assistant"]
+    times_s = [now_s for now_s, topic, _ in home_assistant_messages(stream) if topic == f"{ROOT}/home_assistant"]
     assert times_s[-1] > 550.0
     assert max(np.diff(times_s)) < expiry_s
 
 
 def test_values_expire_without_estimates() -> None:
     silent = ONE._replace(estimate=None)
-    times_s = [t for t, _, _ in told((float(i), silent if i else ONE) for i in range(60))]
+    times_s = [t for t, _, _ in home_assistant_messages((float(i), silent if i else ONE) for i in range(60))]
     assert times_s == [0.0]
 
 
 def test_rare_change_is_published_within_five_seconds() -> None:
     stream = ((float(i), with_values(current_a=0.0 if i < 43 else 3.0)) for i in range(60))
-    changed_s = next(t for t, _, payload in told(stream) if payload.get("current_a") == 3.0)
+    changed_s = next(t for t, _, payload in home_assistant_messages(stream) if payload.get("current_a") == 3.0)
     assert changed_s <= 48.0
 
 
 def test_values_are_rounded_to_their_resolution() -> None:
     values = with_values(voltage_v=3.7049999, soc_percent=56.7890123, remaining_energy_wh=1.23456789)
-    payload = next(p for _, _, p in told(iter([(0.0, values)])))
+    payload = next(p for _, _, p in home_assistant_messages(iter([(0.0, values)])))
     assert (payload["voltage_v"], payload["soc_percent"], payload["remaining_energy_wh"]) == (3.7, 56.8, 1.2)
     assert payload["temperature_c"] is None
 
@@ -191,7 +195,7 @@ def test_only_alarms_have_attributes() -> None:
 
 
 def test_observer_values_are_disabled_by_default() -> None:
-    raw = {
+    observer_values = {
         "delta_1",
         "delta_2",
         "adaptive_gain_k",
@@ -201,17 +205,17 @@ def test_observer_values_are_disabled_by_default() -> None:
         "sample_rate_hz",
         "r_ts_ohm",
     }
-    assert not SHOWN & raw
-    assert raw < set(COMPONENTS)
+    assert not SHOWN & observer_values
+    assert observer_values < set(COMPONENTS)
     assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_h", "r_s_ohm"} <= SHOWN
 
 
 def test_discovery_describes_every_entity_with_both_availabilities() -> None:
-    found = discovery(HOME, DiscoveryInputs(ONE.info), ROOT, 0.0)
-    assert (found["device"]["identifiers"], found["device"]["serial_number"]) == (["bms_pack"], "A1")
-    assert found["origin"]["name"] == "bms_estimator"
-    assert found["availability_mode"] == "all"
-    assert [a["topic"] for a in found["availability"]] == ["bms/pack/availability", "bms/pack/sensor/availability"]
+    message = discovery(SETTINGS, DiscoveryInputs(ONE.info), ROOT, 0.0)
+    assert (message["device"]["identifiers"], message["device"]["serial_number"]) == (["bms_pack"], "A1")
+    assert message["origin"]["name"] == "bms_estimator"
+    assert message["availability_mode"] == "all"
+    assert [a["topic"] for a in message["availability"]] == ["bms/pack/availability", "bms/pack/sensor/availability"]
     soc, current = COMPONENTS["soc_percent"], COMPONENTS["current_a"]
     assert (soc["device_class"], soc["unit_of_measurement"], soc["expire_after"]) == ("battery", "%", 30)
     assert "'positive': 'discharge'" in current["json_attributes_template"]
@@ -222,7 +226,7 @@ def test_discovery_describes_every_entity_with_both_availabilities() -> None:
 @pytest.mark.parametrize(("rate_hz", "sample_period_s", "expire_s"), [(0.1, 1.0, 30), (10.0, 1.0, 30), (1.0, 25.0, 75)])
 def test_values_expire_after_three_periods_or_30_s(rate_hz: float, sample_period_s: float, expire_s: int) -> None:
     info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(HOME, DiscoveryInputs(info), ROOT, sample_period_s)["components"].values()
+    components = discovery(SETTINGS, DiscoveryInputs(info), ROOT, sample_period_s)["components"].values()
     assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
 
 
@@ -230,11 +234,11 @@ def discoveries(*snapshots: Snapshot, commands: tuple[str, ...] = (), **settings
     """Return the discovery messages for ``snapshots``."""
     messages, sent = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(**settings)), PublishedState()
     messages.commands = commands
-    found = []
+    payloads = []
     for i, each in enumerate(snapshots):
         due, sent = messages.live_messages(sent, each, 10.0 * i)
-        found += [json.loads(m.payload or "null") for m in due if m.topic.endswith("/device/bms_pack/config")]
-    return found
+        payloads += [json.loads(m.payload or "null") for m in due if m.topic.endswith("/device/bms_pack/config")]
+    return payloads
 
 
 def test_cells_are_added_with_their_first_voltages_and_never_removed() -> None:
@@ -254,7 +258,7 @@ def test_cells_are_added_with_their_first_voltages_and_never_removed() -> None:
 
 def test_allowed_commands_have_controls() -> None:
     [none] = discoveries(ONE)
-    assert {c["platform"] for c in described(none).values()} == {"sensor"}
+    assert {c["platform"] for c in components_of(none).values()} == {"sensor"}
     [some] = discoveries(ONE, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate"))
     platforms = {key: c["platform"] for key, c in some["components"].items() if "command_topic" in c}
     assert platforms == {
@@ -269,8 +273,8 @@ def test_entities_of_an_earlier_configuration_are_removed() -> None:
     messages = MessageBuilder("bms", "pack", alarms=[name for name in ALARMS if name != "soc_low"])
     messages.commands = ("set_soc",)
     due, _ = messages.live_messages(PublishedState(), ONE, 0.0)
-    [found] = [json.loads(m.payload) for m in due if m.topic.endswith("/device/bms_pack/config")]
-    removed = {key: c["platform"] for key, c in found["components"].items() if key not in described(found)}
+    [message] = [json.loads(m.payload) for m in due if m.topic.endswith("/device/bms_pack/config")]
+    removed = {key: c["platform"] for key, c in message["components"].items() if key not in components_of(message)}
     assert removed == {
         "alarm_soc_low": "binary_sensor",
         "current_zero": "button",
@@ -291,8 +295,8 @@ def test_monitored_alarms_stay_available_while_the_sensor_is_silent() -> None:
         unit=None,
         text="",
     )
-    [found] = discoveries(ONE._replace(alarms=(alarm,)))
-    component = found["components"]["alarm_soc_low"]
+    [message] = discoveries(ONE._replace(alarms=(alarm,)))
+    component = message["components"]["alarm_soc_low"]
     assert (component["platform"], component["device_class"]) == ("binary_sensor", "battery")
     assert component["state_topic"] == "bms/pack/alarm/soc_low"
     of_service, of_alarm = component["availability"]
@@ -305,17 +309,20 @@ def test_ids_do_not_depend_on_names() -> None:
     cells = with_values(cells_v=[3.3])
     [english] = discoveries(cells)
     [german] = discoveries(cells, name="Hausbatterie", names={"voltage_v": "Klemmenspannung", "cell_v": "Zelle"})
-    parts, named = described(english), described(german)
-    assert {key for key, component in parts.items() if "name" not in component} == {
+    english_components, german_components = components_of(english), components_of(german)
+    assert {key for key, component in english_components.items() if "name" not in component} == {
         "voltage_v",
         "current_a",
         "power_w",
         "temperature_c",
         "soc_percent",
     }
-    assert [named[key]["name"] for key in ("voltage_v", "cell_1_v")] == ["Klemmenspannung", "Zelle 1"]
+    assert [german_components[key]["name"] for key in ("voltage_v", "cell_1_v")] == ["Klemmenspannung", "Zelle 1"]
     assert (german["device"]["name"], english["device"]["name"]) == ("Hausbatterie", "pack")
-    ids = [{component["default_entity_id"] for component in each.values()} for each in (parts, named)]
+    ids = [
+        {component["default_entity_id"] for component in each.values()}
+        for each in (english_components, german_components)
+    ]
     assert ids[0] == ids[1]
 
 
@@ -334,5 +341,5 @@ def test_current_sign_is_configurable() -> None:
 def test_disabled_discovery_removes_the_device() -> None:
     messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(enabled=False, discovery_prefix="ha"))
     due, _ = messages.live_messages(PublishedState(), ONE, 0.0)
-    told = [m for m in due if "home_assistant" in m.topic or not m.topic.startswith("bms/")]
-    assert [(m.topic, m.payload, m.retain) for m in told] == [("ha/device/bms_pack/config", b"", True)]
+    discovery_messages = [m for m in due if "home_assistant" in m.topic or not m.topic.startswith("bms/")]
+    assert [(m.topic, m.payload, m.retain) for m in discovery_messages] == [("ha/device/bms_pack/config", b"", True)]

@@ -14,7 +14,7 @@ from bms_estimator.sinks.mqtt.topics import schema
 from tests.sinks.snapshots import NOTHING_YET, NOW, ONE, snapshot
 
 MESSAGES = MessageBuilder("bms", "pack")
-BROKER = Path(__file__).parents[3] / "deploy/mosquitto/bms.conf"
+BROKER_CONFIG = Path(__file__).parents[3] / "deploy/mosquitto/bms.conf"
 DISCOVERY = "homeassistant/device/bms_pack/config"
 
 
@@ -23,7 +23,7 @@ def topics(messages: list[Message]) -> list[str]:
 
 
 def test_new_broker_receives_all_live_messages():
-    messages, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
+    messages, published = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     assert topics(messages) == [
         "parameters",
         "sensor/availability",
@@ -32,7 +32,7 @@ def test_new_broker_receives_all_live_messages():
         DISCOVERY,
         "home_assistant",
     ]
-    assert sent.snapshot is ONE
+    assert published.snapshot is ONE
 
 
 def test_retained_messages_have_qos_1_and_live_ones_qos_0():
@@ -53,53 +53,53 @@ def test_states_must_be_delivered_and_need_samples():
 def test_events_must_be_delivered_and_precede_the_state():
     event, *_, state = MESSAGES.must_deliver(None, ONE)
     assert (event.topic, event.qos, event.retain) == ("bms/pack/event", 1, False)
-    told = json.loads(event.payload)
-    assert (told["name"], told["time"]) == ("start", ONE.health.publish_time)
-    assert set(told) == set(schema()["event"]["properties"])
+    payload = json.loads(event.payload)
+    assert (payload["name"], payload["time"]) == ("start", ONE.health.publish_time)
+    assert set(payload) == set(schema()["event"]["properties"])
     assert state.topic == "bms/pack/state"
 
 
 def test_unchanged_messages_are_not_repeated():
-    _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
-    messages, _ = MESSAGES.live_messages(sent, ONE, NOW + 1.0)
+    _, published = MESSAGES.live_messages(PublishedState(), ONE, NOW)
+    messages, _ = MESSAGES.live_messages(published, ONE, NOW + 1.0)
     assert topics(messages) == []
 
 
 def test_new_health_is_published():
-    _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
-    messages, _ = MESSAGES.live_messages(sent, snapshot(), NOW + 1.0)
+    _, published = MESSAGES.live_messages(PublishedState(), ONE, NOW)
+    messages, _ = MESSAGES.live_messages(published, snapshot(), NOW + 1.0)
     assert topics(messages) == ["parameters", "health"]
 
 
 def test_discovery_changes_only_with_the_board():
-    _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
+    _, published = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     faster = ONE.info.model_copy(update={"board": {**ONE.info.board, "sample_rate_hz": "50"}})
-    messages, sent = MESSAGES.live_messages(sent, ONE._replace(info=faster), NOW + 1.0)
+    messages, published = MESSAGES.live_messages(published, ONE._replace(info=faster), NOW + 1.0)
     assert topics(messages) == ["info"]
     swapped = ONE.info.model_copy(update={"board": {**ONE.info.board, "serial": "B2"}})
-    messages, _ = MESSAGES.live_messages(sent, ONE._replace(info=swapped), NOW + 2.0)
+    messages, _ = MESSAGES.live_messages(published, ONE._replace(info=swapped), NOW + 2.0)
     assert topics(messages) == ["info", DISCOVERY]
 
 
 def test_parameters_are_published_from_the_first_sample_on():
-    messages, sent = MESSAGES.live_messages(PublishedState(), NOTHING_YET, NOW)
+    messages, published = MESSAGES.live_messages(PublishedState(), NOTHING_YET, NOW)
     assert not {"parameters", "home_assistant"} & set(topics(messages))
-    messages, _ = MESSAGES.live_messages(sent, ONE, NOW + 1.0)
+    messages, _ = MESSAGES.live_messages(published, ONE, NOW + 1.0)
     assert topics(messages)[0] == "parameters"
 
 
 def test_correct_availabilities_are_those_published_last():
     _, silent = MESSAGES.live_messages(PublishedState(), snapshot("no board"), NOW)
-    right = {m.topic: m.payload for m in MESSAGES.availability(silent)}
-    assert right == {"bms/pack/availability": b"online", "bms/pack/sensor/availability": b"offline"}
+    correct = {m.topic: m.payload for m in MESSAGES.availability(silent)}
+    assert correct == {"bms/pack/availability": b"online", "bms/pack/sensor/availability": b"offline"}
     assert topics(MESSAGES.availability(PublishedState())) == ["availability"]
 
 
 def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missing():
     state = json.loads(MESSAGES.must_deliver(ONE, ONE)[0].payload)
-    described = schema()["state"]["properties"]
-    assert set(state) == set(described) == set(schema()["state"]["required"])
-    assert all("description" in field for field in described.values())
+    schema_fields = schema()["state"]["properties"]
+    assert set(state) == set(schema_fields) == set(schema()["state"]["required"])
+    assert all("description" in field for field in schema_fields.values())
     assert state["temperature_c"] is None
     assert state["soc_percent"] == pytest.approx(50.0)
     assert state["crc_errors"] == 3
@@ -113,7 +113,7 @@ def test_every_payload_is_json_without_nan():
 
 
 def test_messages_are_far_below_the_size_limit_of_the_example():
-    limit = re.search(r"^message_size_limit (\d+)$", BROKER.read_text(), re.MULTILINE)
+    limit = re.search(r"^message_size_limit (\d+)$", BROKER_CONFIG.read_text(), re.MULTILINE)
     assert limit
     messages, _ = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     assert (
@@ -137,14 +137,14 @@ def test_changed_alarms_are_published_and_all_to_a_new_broker():
     other = quiet.model_copy(update={"name": "link_lost", "unit": "s", "limit": 10.0})
     raised = quiet.model_copy(update={"active": True, "since": ONE.info.started, "value": 0.09, "text": "charge"})
     before, after = ONE._replace(alarms=(quiet, other)), ONE._replace(alarms=(raised, other))
-    messages, sent = MESSAGES.live_messages(PublishedState(), before, NOW)
+    messages, published = MESSAGES.live_messages(PublishedState(), before, NOW)
     assert {"alarm/soc_low", "alarm/link_lost"} <= set(topics(messages))
-    assert MESSAGES.live_messages(sent, before, NOW)[0] == []
-    [message], sent = MESSAGES.live_messages(sent, after, NOW)
+    assert MESSAGES.live_messages(published, before, NOW)[0] == []
+    [message], published = MESSAGES.live_messages(published, after, NOW)
     assert (message.topic, message.qos, message.retain) == ("bms/pack/alarm/soc_low", 1, True)
-    told = json.loads(message.payload)
-    assert told == raised.model_dump()
-    assert set(told) == set(schema()["alarm"]["properties"])
+    payload = json.loads(message.payload)
+    assert payload == raised.model_dump()
+    assert set(payload) == set(schema()["alarm"]["properties"])
     assert [json.loads(m.payload)["name"] for m in MESSAGES.must_deliver(before, after)[:-1]] == ["alarm_raised"]
     assert [json.loads(m.payload)["name"] for m in MESSAGES.must_deliver(after, before)[:-1]] == ["alarm_cleared"]
 

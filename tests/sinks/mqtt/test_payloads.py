@@ -11,32 +11,32 @@ from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.requests import COMMANDS
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from tests.command_line import run
-from tests.sinks.mqtt.payload_record import broken, now, recorded
+from tests.sinks.mqtt.payload_record import current, find_broken, read_record
 from tests.sinks.snapshots import NOW, ONE, SOC_LOW
 
 DOCUMENT = document("bms")
-WRITE = "make payloads writes tests/sinks/mqtt/payloads.json anew"
+HOW_TO_WRITE = "make payloads writes tests/sinks/mqtt/payloads.json anew"
 
 
 def test_no_field_is_removed_or_changes_its_type_without_a_new_version() -> None:
-    before, after = recorded(), now()
-    lost = broken(before["fields"], after["fields"])
+    before, after = read_record(), current()
+    violations = find_broken(before["fields"], after["fields"])
     if after["payload_version"] == before["payload_version"]:
-        assert lost == [], "readers rely on these: raise PAYLOAD_VERSION in bms_estimator/model/payloads.py"
+        assert violations == [], "readers rely on these: raise PAYLOAD_VERSION in bms_estimator/model/payloads.py"
     assert after["payload_version"] >= before["payload_version"]
 
 
 def test_record_contains_all_fields() -> None:
-    before, after = recorded(), now()
-    assert after["payload_version"] == before["payload_version"], WRITE
-    assert sorted(set(after["fields"]) - set(before["fields"])) == [], WRITE
+    before, after = read_record(), current()
+    assert after["payload_version"] == before["payload_version"], HOW_TO_WRITE
+    assert sorted(set(after["fields"]) - set(before["fields"])) == [], HOW_TO_WRITE
 
 
 def test_removed_and_changed_fields_are_detected() -> None:
-    fields = now()["fields"]
-    assert broken(fields, fields | {"state.new": "number"}) == []
-    assert broken(fields, fields | {"state.voltage_v": "string"}) == ["state.voltage_v: was number, is string"]
-    assert broken(fields, {name: kind for name, kind in fields.items() if name != "parameters.a.*.std"}) == [
+    fields = current()["fields"]
+    assert find_broken(fields, fields | {"state.new": "number"}) == []
+    assert find_broken(fields, fields | {"state.voltage_v": "string"}) == ["state.voltage_v: was number, is string"]
+    assert find_broken(fields, {name: kind for name, kind in fields.items() if name != "parameters.a.*.std"}) == [
         "parameters.a.*.std: was null, number, is gone"
     ]
 
@@ -52,22 +52,29 @@ def test_the_version_is_published() -> None:
 
 
 def test_messages_have_qos_and_retain_of_the_topic_table() -> None:
-    messages, told = MessageBuilder("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
-    sent = {
+    messages, snapshot = MessageBuilder("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
+    messages_by_topic = {
         m.topic.removeprefix("bms/pack/"): m
-        for m in (*messages.must_deliver(None, told), *messages.live_messages(PublishedState(), told, NOW)[0])
+        for m in (*messages.must_deliver(None, snapshot), *messages.live_messages(PublishedState(), snapshot, NOW)[0])
     }
-    assert sent["alarm/soc_low"].qos == TOPICS["alarm"].qos
-    assert sent["alarm/soc_low"].retain
+    assert messages_by_topic["alarm/soc_low"].qos == TOPICS["alarm"].qos
+    assert messages_by_topic["alarm/soc_low"].retain
     for name in set(TOPICS) - {"alarm"}:
-        assert (sent[name].qos, sent[name].retain) == (TOPICS[name].qos, TOPICS[name].retain), name
-        TOPICS[name].model.model_validate_json(sent[name].payload)
+        assert (messages_by_topic[name].qos, messages_by_topic[name].retain) == (
+            TOPICS[name].qos,
+            TOPICS[name].retain,
+        ), name
+        TOPICS[name].model.model_validate_json(messages_by_topic[name].payload)
 
 
 def references(node: Any) -> list[str]:
     if isinstance(node, dict):
-        return [node["$ref"]] if "$ref" in node else [found for inner in node.values() for found in references(inner)]
-    return [found for inner in node for found in references(inner)] if isinstance(node, list) else []
+        return (
+            [node["$ref"]]
+            if "$ref" in node
+            else [reference for inner in node.values() for reference in references(inner)]
+        )
+    return [reference for inner in node for reference in references(inner)] if isinstance(node, list) else []
 
 
 def test_references_of_the_document_resolve() -> None:

@@ -20,10 +20,10 @@ from tests.patience import LONG_S
 from tests.sinks.service import STATE, Sink, assert_all_in_order, numbers, state, until
 from tests.sinks.snapshots import ONE, snapshot
 
-WRONG = "Not authorized (135): name or password wrong"
+NOT_AUTHORIZED = "Not authorized (135): name or password wrong"
 
 
-def started(folder: Path, extra: str) -> Broker:
+def start_broker(folder: Path, extra: str) -> Broker:
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     return Broker(folder, extra).start()
@@ -31,7 +31,7 @@ def started(folder: Path, extra: str) -> Broker:
 
 @pytest.fixture
 def locked_broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = started(tmp_path, "allow_anonymous false")
+    broker = start_broker(tmp_path, "allow_anonymous false")
     yield broker
     broker.stop()
 
@@ -49,7 +49,7 @@ async def test_wrong_password_is_reported_and_not_shown(
             async with MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, most=4)):
                 await until(lambda: delivery.trouble)
     assert [line["event"] for line in logs] == ["broker not reachable"]
-    assert logs[0]["reason"].startswith(WRONG)
+    assert logs[0]["reason"].startswith(NOT_AUTHORIZED)
     health = snapshot(delivery=delivery).health
     assert health.broker_trouble == logs[0]["reason"]
     assert "s3cret" not in f"{logs} {health}"
@@ -68,28 +68,28 @@ async def test_reason_of_a_disconnect_is_reported(broker: Broker, code: int, exp
     with structlog.testing.capture_logs() as logs:
         async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
             await live.wait("bms/pack/schema")
-            network.end(code)
+            network.send_disconnect(code)
             await until(lambda: sink.delivery.losses)
             assert logs[1]["event"] == "broker lost"
             assert sink.delivery.losses == 1
-            network.away = False
+            network.rejects_connections = False
             await until(lambda: len(live.all("bms/pack/schema")) == 2)
     assert logs[1]["reason"] == expected
 
 
 @pytest.fixture
-def narrow_broker(tmp_path: Path) -> Iterator[Broker]:
+def limited_broker(tmp_path: Path) -> Iterator[Broker]:
     """Start a broker with a maximum message size of 4 kB that handles one message at a time."""
-    broker = started(tmp_path, "allow_anonymous true\nmax_packet_size 4000\nmax_inflight_messages 1")
+    broker = start_broker(tmp_path, "allow_anonymous true\nmax_packet_size 4000\nmax_inflight_messages 1")
     yield broker
     broker.stop()
 
 
 async def test_message_above_the_size_limit_is_reported_and_not_sent(
-    narrow_broker: Broker,
+    limited_broker: Broker,
 ) -> None:
     with structlog.testing.capture_logs() as logs:
-        async with Listener(narrow_broker) as live, Sink(narrow_broker.url, most_kept=1000) as sink:
+        async with Listener(limited_broker) as live, Sink(limited_broker.url, max_queued=1000) as sink:
             for number in range(100):
                 sink.mqtt.publish(state(number))
             await until(lambda: sink.delivery.waiting == 0)
@@ -102,7 +102,7 @@ async def test_message_above_the_size_limit_is_reported_and_not_sent(
     }
 
 
-QUICK: Any = {"most_kept": 1000, "first_delay_s": 0.02}
+FAST_RETRY: Any = {"max_queued": 1000, "first_delay_s": 0.02}
 RETAINED = {
     "bms/pack/availability",
     "bms/pack/schema",
@@ -116,7 +116,7 @@ RETAINED = {
 @pytest.mark.parametrize("code", [131, 151])
 async def test_temporarily_rejected_states_are_delivered_later_in_order(broker: Broker, code: int) -> None:
     with structlog.testing.capture_logs() as logs:
-        async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, **QUICK) as sink:
+        async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, **FAST_RETRY) as sink:
             for number in range(50):
                 sink.mqtt.publish(state(number))
             await until(lambda: sink.delivery.waiting == 0)
@@ -133,7 +133,7 @@ async def test_temporarily_rejected_states_are_delivered_later_in_order(broker: 
 
 
 async def test_temporarily_rejected_retained_message_is_sent_again_after_a_delay(broker: Broker) -> None:
-    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
+    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, max_queued=1000) as sink:
         network.reject_code = 151
         sink.mqtt.publish(ONE)
         await until(lambda: set(sink.delivery.refused_topics) >= RETAINED)
@@ -155,13 +155,13 @@ async def test_rejected_retained_message_is_not_sent_with_each_snapshot(broker: 
             sink.mqtt.publish(snapshot())
             await until(lambda: network.rejected.count("bms/pack/health") > before)  # noqa: B023 - at once
         assert network.rejected.count("bms/pack/info") == network.rejected.count("bms/pack/schema") == 1
-        network.leave()  # otherwise messages in backoff would delay the shutdown
+        network.disconnect_network()  # otherwise messages in backoff would delay the shutdown
         await until(lambda: sink.delivery.losses)
 
 
 @pytest.mark.parametrize("code", [135, 153])
 async def test_permanently_rejected_state_is_dropped(broker: Broker, code: int) -> None:
-    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
+    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, max_queued=1000) as sink:
         await live.wait("bms/pack/schema")
         network.reject_code = code
         for number in range(50):
@@ -179,8 +179,8 @@ async def test_lost_connection_causes_only_our_log_lines(broker: Broker, capfd: 
                 before, losses = len(live.messages), sink.delivery.losses
                 sink.mqtt.publish(ONE)
                 await live.wait(STATE, skip=before)
-                network.leave()
+                network.disconnect_network()
                 await until(lambda: sink.delivery.losses > losses)  # noqa: B023 - at once
-                network.away = False
+                network.rejects_connections = False
     assert {line["event"] for line in logs} <= {"broker connected", "broker lost", "broker not reachable"}
     assert capfd.readouterr().err == ""

@@ -21,8 +21,13 @@ from bms_estimator.sinks.mqtt.requests import (
 )
 
 
-class Asked:
-    """Dispatcher with a clock set by the test, and handlers that record their calls."""
+class RecordingDispatcher:
+    """Dispatcher with a clock set by the test, and handlers that record their calls.
+
+    Attributes:
+        granted: Names of the requests that reached a handler.
+        now_s: Time of the clock [s].
+    """
 
     def __init__(self, *commands: Any) -> None:
         self.delivery, self.now_s, self.granted = DeliveryStats(), 0.0, list[str]()
@@ -64,87 +69,87 @@ class Asked:
     ],
 )
 async def test_request_gets_a_response(payload: bytes, status: str, transaction: object) -> None:
-    asked = Asked("publish_rate")
-    response = await asked("publish_rate", payload)
+    dispatcher = RecordingDispatcher("publish_rate")
+    response = await dispatcher("publish_rate", payload)
     assert set(response) == {"status", "data", "error", "transaction"}
     assert (response["status"], response["transaction"]) == (status, transaction)
     assert (response["data"] is None) == (status == "error")
     assert (response["error"] is None) == (status == "ok")
-    assert asked.delivery.requests == {"granted" if status == "ok" else "refused": 1}
+    assert dispatcher.delivery.requests == {"granted" if status == "ok" else "refused": 1}
 
 
 async def test_exception_of_a_handler_gives_an_error_response() -> None:
-    asked = Asked("publish_rate")
-    response = await asked("publish_rate", b'{"fail": true, "transaction": "t"}')
+    dispatcher = RecordingDispatcher("publish_rate")
+    response = await dispatcher("publish_rate", b'{"fail": true, "transaction": "t"}')
     assert (response["status"], response["transaction"]) == ("error", "t")
-    assert asked.delivery.requests == {"failed": 1}
+    assert dispatcher.delivery.requests == {"failed": 1}
 
 
 async def test_data_that_is_not_json_gives_an_error_response() -> None:
-    asked = Asked("publish_rate")
+    dispatcher = RecordingDispatcher("publish_rate")
 
-    async def broken(_: Mapping[str, Any]) -> Mapping[str, Any]:
+    async def return_nan(_: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"soc": float("nan")}
 
-    asked.requests.register("publish_rate", broken)
-    assert (await asked("publish_rate"))["status"] == "error"
+    dispatcher.requests.register("publish_rate", return_nan)
+    assert (await dispatcher("publish_rate"))["status"] == "error"
 
 
 @pytest.mark.parametrize("name", ["", "reboot", "State", "state/", "é", "x" * 65_000])
 async def test_unknown_name_is_counted_and_gets_no_response(name: str) -> None:
-    asked = Asked()
+    dispatcher = RecordingDispatcher()
     with structlog.testing.capture_logs() as logs:
-        assert await asked(name) is None
-    assert asked.delivery.requests == {"unknown": 1}
+        assert await dispatcher(name) is None
+    assert dispatcher.delivery.requests == {"unknown": 1}
     assert len(str(logs)) < 300
 
 
 async def test_payload_above_4_kb_is_rejected() -> None:
-    asked = Asked("publish_rate")
+    dispatcher = RecordingDispatcher("publish_rate")
     padded = b'{"x": 1}' + b" " * MAX_PAYLOAD_BYTES
-    assert (await asked("publish_rate", padded[:MAX_PAYLOAD_BYTES]))["status"] == "ok"
-    assert "4096 bytes" in (await asked("publish_rate", padded))["error"]
+    assert (await dispatcher("publish_rate", padded[:MAX_PAYLOAD_BYTES]))["status"] == "ok"
+    assert "4096 bytes" in (await dispatcher("publish_rate", padded))["error"]
 
 
-async def test_commands_need_a_permission() -> None:
+async def test_command_needs_a_permission_in_the_settings() -> None:
     for name in ("set_soc", "current_zero"):
-        asked = Asked()
-        assert "mqtt.commands" in (await asked(name))["error"]
-        assert asked.granted == []
-        asked = Asked(name)
-        await asked("set_soc")
-        await asked("current_zero")
-        assert asked.granted == [name]
+        dispatcher = RecordingDispatcher()
+        assert "mqtt.commands" in (await dispatcher(name))["error"]
+        assert dispatcher.granted == []
+        dispatcher = RecordingDispatcher(name)
+        await dispatcher("set_soc")
+        await dispatcher("current_zero")
+        assert dispatcher.granted == [name]
 
 
-async def test_commands_are_few_a_minute_and_do_not_wait_for_former_requests() -> None:
-    asked = Asked("set_soc")
+async def test_rate_of_commands_is_limited_and_former_requests_do_not_count() -> None:
+    dispatcher = RecordingDispatcher("set_soc")
     for _ in range(1000):
-        await asked("set_soc")
-        await asked("state")
-    assert asked.granted.count("set_soc") == REQUESTS_PER_MIN
-    assert asked.delivery.requests["refused"] == REQUESTS_PER_MIN
-    asked.now_s = 30.0
+        await dispatcher("set_soc")
+        await dispatcher("state")
+    assert dispatcher.granted.count("set_soc") == REQUESTS_PER_MIN
+    assert dispatcher.delivery.requests["refused"] == REQUESTS_PER_MIN
+    dispatcher.now_s = 30.0
     for _ in range(1000):
-        await asked("set_soc")
-    assert asked.granted.count("set_soc") == 1.5 * REQUESTS_PER_MIN
-    assert asked.delivery.requests["too_many"] == 3000 - len(asked.granted) - REQUESTS_PER_MIN
+        await dispatcher("set_soc")
+    assert dispatcher.granted.count("set_soc") == 1.5 * REQUESTS_PER_MIN
+    assert dispatcher.delivery.requests["too_many"] == 3000 - len(dispatcher.granted) - REQUESTS_PER_MIN
 
 
 async def test_each_burst_is_logged_once() -> None:
-    asked = Asked("set_soc")
+    dispatcher = RecordingDispatcher("set_soc")
     with structlog.testing.capture_logs() as logs:
         for _ in range(10_000):
-            await asked("current_zero")
-            await asked("nonsense")
+            await dispatcher("current_zero")
+            await dispatcher("nonsense")
         assert [line["kind"] for line in logs] == ["refused", "unknown", "too_many"]
-        asked.now_s = LOG_S
-        await asked("nonsense")
+        dispatcher.now_s = LOG_S
+        await dispatcher("nonsense")
     assert logs[-1]["so_far"] == 10_001
 
 
 @given(name=st.sampled_from(COMMANDS + FORMER_READS) | st.text(), payload=st.binary() | st.text().map(str.encode))
 async def test_no_request_raises(name: str, payload: bytes) -> None:
-    asked = Asked("set_soc", "current_zero")
-    await asked(name, payload)
-    assert sum(asked.delivery.requests.values()) == 1
+    dispatcher = RecordingDispatcher("set_soc", "current_zero")
+    await dispatcher(name, payload)
+    assert sum(dispatcher.delivery.requests.values()) == 1

@@ -1,3 +1,5 @@
+"""MQTT sink with a real broker: retained messages, availability, requests, rejections and TLS."""
+
 import asyncio
 import json
 import subprocess
@@ -33,21 +35,27 @@ from tests.patience import LONG_S
 from tests.sinks.service import Sink, until
 from tests.sinks.snapshots import ONE, snapshot
 
-MAX_KEPT = 4
-AT_START = len(events(None, ONE))
+MAX_QUEUED = 4
+"""Size of the sink's outbox [messages]."""
+EVENTS_AT_START = len(events(None, ONE))
+"""Number of events that the first snapshot causes."""
 RETAINED = ("info", "availability", "sensor/availability", "schema", "health")
 DISCOVERY = "homeassistant/device/bms_pack/config"
 OPTIONS = ConnectOptions("test", Message("bms/pack/availability", b"offline", 1, retain=True), lambda *_: None)
 DYNAMIC_SECURITY = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
 
 
-async def never(_: Connection) -> None:
+RECORDED_PAUSES = 12
+"""Number of pauses between attempts after which a reconnect loop is ended."""
+
+
+async def fail_if_connected(_: Connection) -> None:
     raise AssertionError("there is no broker")
 
 
 @pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])
 async def url(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[str]:
-    """URL of the broker, directly or through a proxy without MQTT 5."""
+    """Return the URL of a proxy that passes MQTT 5 or rejects it."""
     async with Proxy(broker.port, supports_5=request.param == "MQTT 5") as proxy:
         yield proxy.url
 
@@ -55,17 +63,17 @@ async def url(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[s
 async def test_topics_and_retained_flags_are_as_documented(broker: Broker, url: str) -> None:
     async with Listener(broker) as live, Sink(url) as sink:
         sink.mqtt.publish(ONE)
-        await live.wait("bms/pack/home_assistant")  # the last of all
+        await live.wait("bms/pack/home_assistant")  # is published last
         async with Listener(broker) as late:
             for topic in RETAINED:
                 await late.wait(f"bms/pack/{topic}")
             await late.wait(DISCOVERY)
-            kept = {name for name, _, retain in late.messages if retain}
-    assert kept == {f"bms/pack/{topic}" for topic in RETAINED} | {DISCOVERY}
+            retained_topics = {name for name, _, retain in late.messages if retain}
+    assert retained_topics == {f"bms/pack/{topic}" for topic in RETAINED} | {DISCOVERY}
     assert live.all("bms/pack/availability") == [b"online", b"offline"]
     assert live.all("bms/pack/sensor/availability") == [b"online", b"offline"]
-    seen = {name for name, _, _ in live.messages}
-    assert {"bms/pack/state", "bms/pack/parameters", "bms/pack/home_assistant"} <= seen
+    topics = {name for name, _, _ in live.messages}
+    assert {"bms/pack/state", "bms/pack/parameters", "bms/pack/home_assistant"} <= topics
     assert sink.delivery == DeliveryStats()
 
 
@@ -90,7 +98,7 @@ async def test_restarted_broker_is_served_and_drops_are_counted(tmp_path: Path) 
     async with Sink(broker.url) as sink:
         for _ in range(5):
             sink.mqtt.publish(ONE)
-        assert (sink.delivery.drops, sink.delivery.waiting) == (AT_START + 5 - MAX_KEPT, MAX_KEPT)
+        assert (sink.delivery.drops, sink.delivery.waiting) == (EVENTS_AT_START + 5 - MAX_QUEUED, MAX_QUEUED)
         for _ in range(2):  # without persistence, each restarted broker is empty
             broker.start()
             try:
@@ -105,11 +113,11 @@ async def test_restarted_broker_is_served_and_drops_are_counted(tmp_path: Path) 
 
 
 async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_path: Path) -> None:
-    broker = Broker(tmp_path)  # never started
+    broker = Broker(tmp_path)  # it is never started
     async with Sink(broker.url) as sink:
         for _ in range(1000):
             sink.mqtt.publish(ONE)
-    assert sink.delivery.drops == AT_START + 1000 - MAX_KEPT
+    assert sink.delivery.drops == EVENTS_AT_START + 1000 - MAX_QUEUED
 
 
 async def test_abandoned_connection_leaves_no_callbacks(broker: Broker) -> None:
@@ -126,14 +134,14 @@ async def test_abandoned_connection_leaves_no_callbacks(broker: Broker) -> None:
 async def test_lost_broker_is_retried_at_least_every_30_s(tmp_path: Path) -> None:
     pauses: list[float] = []
 
-    class Impatient(ReconnectLoop):
+    class RecordingLoop(ReconnectLoop):
         async def _pause(self, delay_s: float) -> None:
             pauses.append(delay_s)
-            if len(pauses) == 12:
+            if len(pauses) == RECORDED_PAUSES:
                 self.closing.set()
 
     settings = MqttSettings(url=Broker(tmp_path).url)
-    await Impatient(brokers(settings), OPTIONS, BrokerConnector(settings), never, DeliveryStats()).run()
+    await RecordingLoop(brokers(settings), OPTIONS, BrokerConnector(settings), fail_if_connected, DeliveryStats()).run()
     assert max(pauses) <= MAX_DELAY_S == 30.0
     assert pauses[0] <= 5.0 < pauses[3]
     assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"
@@ -143,7 +151,7 @@ async def test_availability_is_online_after_a_half_open_connection(broker: Broke
     async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
         sink.mqtt.publish(ONE)
         await live.wait(DISCOVERY)
-        network.cut()
+        network.close_clients()
         async with asyncio.timeout(LONG_S):
             await network.half_open_ended.wait()  # it would otherwise end after 1.5 keepalive intervals
         before = len(live.messages)
@@ -177,7 +185,7 @@ async def test_will_at_broker_shutdown_is_not_counted_as_a_correction(broker: Br
         async with Sink(broker.url) as sink:
             async with Listener(broker) as live:
                 sink.mqtt.publish(ONE)
-                await live.wait(f"bms/pack/{RETAINED[-1]}")  # the last of them all
+                await live.wait(f"bms/pack/{RETAINED[-1]}")  # is published last
             await asyncio.to_thread(broker.stop)
             await until(lambda: any(line["event"] == "broker not reachable" for line in logs))
             await asyncio.to_thread(broker.start)
@@ -191,15 +199,17 @@ async def test_corrections_of_an_availability_are_rate_limited(broker: Broker) -
     async with Listener(broker) as live, Sink(broker.url) as sink:
         sink.mqtt.publish(ONE)
         await live.wait(DISCOVERY)
-        began_s = loop.time()
+        begin_s = loop.time()
         for _ in range(200):
             await live.publish("bms/pack/availability", b"offline", qos=1, retain=True)
         await until(
-            lambda: (heard := live.all("bms/pack/availability")).count(b"offline") == 200 and heard[-1] == b"online"
+            lambda: (
+                (received := live.all("bms/pack/availability")).count(b"offline") == 200 and received[-1] == b"online"
+            )
         )
         async with Listener(broker) as late:
             assert await late.wait("bms/pack/availability") == b"online"
-    assert 1 <= sink.delivery.corrections <= 1 + (loop.time() - began_s) / CORRECTION_S
+    assert 1 <= sink.delivery.corrections <= 1 + (loop.time() - begin_s) / CORRECTION_S
 
 
 async def test_request_gets_a_response(broker: Broker, url: str) -> None:
@@ -211,7 +221,7 @@ async def test_request_gets_a_response(broker: Broker, url: str) -> None:
     assert response == {"status": "ok", "data": {"name": "publish_rate"}, "error": None, "transaction": 7}
 
 
-async def test_a_former_request_is_answered_with_the_topic_to_subscribe_to(broker: Broker, url: str) -> None:
+async def test_former_request_gets_an_error_that_names_the_topic_to_subscribe_to(broker: Broker, url: str) -> None:
     async with Listener(broker) as live, Sink(url):
         await live.wait("bms/pack/availability")
         await live.publish("bms/pack/request/state", qos=1)
@@ -226,7 +236,7 @@ async def test_retained_request_is_not_granted_on_connection(broker: Broker, url
             await live.wait("bms/pack/availability")
             await live.publish("bms/pack/request/publish_rate", b"{}", qos=1)
             await live.wait("bms/pack/response/publish_rate")
-    assert sink.asked == ["publish_rate"]
+    assert sink.requested == ["publish_rate"]
     assert sink.delivery.requests == {"retained": 1, "granted": 1}
 
 
@@ -236,7 +246,7 @@ async def test_retained_request_is_not_granted_while_connected(broker: Broker) -
         await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
         await live.publish("bms/pack/request/publish_rate", b"{}", qos=1)
         await live.wait("bms/pack/response/publish_rate")
-    assert sink.asked == ["publish_rate"]
+    assert sink.requested == ["publish_rate"]
     assert sink.delivery.requests == {"retained": 1, "granted": 1}
 
 
@@ -254,10 +264,10 @@ async def test_no_request_topic_ends_the_service(broker: Broker, url: str, name_
 
 
 async def test_flood_of_requests_is_counted_and_survived(broker: Broker, url: str) -> None:
-    gate = asyncio.Event()
+    may_respond = asyncio.Event()
 
     async def slow(_: Mapping[str, Any]) -> Mapping[str, Any]:
-        await gate.wait()
+        await may_respond.wait()
         return {}
 
     async with Listener(broker, "bms/pack/response/#") as live, Sink(url) as sink:
@@ -271,7 +281,7 @@ async def test_flood_of_requests_is_counted_and_survived(broker: Broker, url: st
             for _ in range(3 * MAX_WAITING):
                 await live.publish("bms/pack/request/none", b"x" * 4000, qos=1)
             await until(lambda: sink.delivery.requests["overflow"] > MAX_WAITING)
-            gate.set()
+            may_respond.set()
             await live.wait("bms/pack/response/current_zero")
         assert len(logs) < 10
         while not live.all("bms/pack/response/publish_rate"):  # the first requests may still be dropped
@@ -301,7 +311,7 @@ async def test_internal_error_publishes_offline_and_is_raised(broker: Broker) ->
     assert fault.value.split(AttributeError)[1] is None
 
 
-async def test_broker_of_the_demo_without_mqtt_5_is_served() -> None:
+async def test_sink_works_with_the_demo_broker_without_mqtt_5() -> None:
     async with DemoBroker() as broker, aiomqtt.Client("127.0.0.1", broker.port) as client, Sink(broker.url) as sink:
         await client.subscribe([("bms/pack/state", 0), ("bms/pack/response/publish_rate", 1)])
         sink.mqtt.publish(ONE)
@@ -338,9 +348,11 @@ async def test_denied_retained_topics_are_logged_once(
             sink.mqtt.publish(ONE)
             await until(lambda: len(sink.delivery.refused_topics) > len(RETAINED) + 2)
             sink.mqtt.publish(snapshot())
-    named = [line["topic"] for line in logs if line["log_level"] == "warning"]
-    assert sorted(named) == sorted([*(f"bms/pack/{topic}" for topic in (*RETAINED, "state", "event")), DISCOVERY])
-    assert sink.delivery.refused_topics == named
+    denied_topics = [line["topic"] for line in logs if line["log_level"] == "warning"]
+    assert sorted(denied_topics) == sorted(
+        [*(f"bms/pack/{topic}" for topic in (*RETAINED, "state", "event")), DISCOVERY]
+    )
+    assert sink.delivery.refused_topics == denied_topics
 
 
 async def test_late_echo_removes_the_denial(broker: Broker) -> None:
@@ -361,16 +373,16 @@ def refusing_broker(tmp_path: Path) -> Iterator[Broker]:
         {"acltype": "subscribePattern", "topic": "bms/pack/request/+", "priority": 1, "allow": False},
         {"acltype": "subscribePattern", "topic": "#", "priority": 0, "allow": True},
     ]
-    rights = {
+    acl = {
         "defaultACLAccess": {"publishClientSend": True, "publishClientReceive": True, "subscribe": True},
         "groups": [{"groupname": "all", "roles": [{"rolename": "most"}]}],
         "roles": [{"rolename": "most", "acls": acls}],
         "anonymousGroup": "all",
         "clients": [],
     }
-    (tmp_path / "rights.json").write_text(json.dumps(rights))
-    (tmp_path / "rights.json").chmod(0o600)
-    extra = f"allow_anonymous true\nplugin {DYNAMIC_SECURITY}\nplugin_opt_config_file {tmp_path / 'rights.json'}"
+    (tmp_path / "acl.json").write_text(json.dumps(acl))
+    (tmp_path / "acl.json").chmod(0o600)
+    extra = f"allow_anonymous true\nplugin {DYNAMIC_SECURITY}\nplugin_opt_config_file {tmp_path / 'acl.json'}"
     broker = Broker(tmp_path, extra).start()
     yield broker
     broker.stop()
@@ -402,8 +414,8 @@ def secure_broker(tmp_path: Path) -> Iterator[Broker]:
     )  # fmt: skip
     subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "meter", "s3cret"], check=True, capture_output=True)
     (tmp_path / "secret").write_text("s3cret\n")
-    locks = f"allow_anonymous false\npassword_file {passwords}\ncertfile {certificate}\nkeyfile {key}"
-    broker = Broker(tmp_path, locks).start()
+    security = f"allow_anonymous false\npassword_file {passwords}\ncertfile {certificate}\nkeyfile {key}"
+    broker = Broker(tmp_path, security).start()
     yield broker
     broker.stop()
 
@@ -420,7 +432,7 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
     async with (
         Listener(secure_broker, "bms/#", username="meter", password="s3cret", tls_params=tls) as live,
         MqttSink(
-            settings, "pack", RequestDispatcher(DeliveryStats()), DeliveryStats(), Outbox(None, most=MAX_KEPT)
+            settings, "pack", RequestDispatcher(DeliveryStats()), DeliveryStats(), Outbox(None, most=MAX_QUEUED)
         ) as mqtt,
     ):
         mqtt.publish(ONE)
@@ -428,7 +440,7 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
 
 
 @pytest.mark.parametrize(
-    ("changes", "named"),
+    ("changes", "error"),
     [
         ({"url": "mqtt://host:99999"}, "mqtt.url"),
         ({"url": f"mqtt://{'a' * 64}.local"}, "mqtt.url = mqtt://a+.local: .*too long"),
@@ -438,6 +450,6 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
         ({"url": "mqtts://host", "ca_file": Path("/nonexistent/ca.pem")}, "mqtt.ca_file = /nonexistent/ca.pem"),
     ],
 )
-def test_error_names_the_unusable_setting(changes: dict[str, Any], named: str) -> None:
-    with pytest.raises(UserError, match=named):
+def test_error_names_the_unusable_setting(changes: dict[str, Any], error: str) -> None:
+    with pytest.raises(UserError, match=error):
         check(MqttSettings(**changes))

@@ -82,12 +82,12 @@ def test_stale_values_have_a_reason_and_a_time() -> None:
     assert "pack: stale since 12:00:00Z: bytes come, but no valid frame pack: suspected: reversed sign" in stale
     assert "pack: offline since 22:13:20Z" in text_of(pack_view({"availability": "offline"}))
     assert "pack: silent since 22:13:20Z" in text_of(pack_view(), now_s=NOW + 11.0)
-    gone = text_of(pack_view(), outage=BrokerOutage(NOW - 60.0, "the connection broke"))
-    assert "no broker since 22:12:20Z: the connection broke" in gone
-    assert "live" not in stale + gone
+    no_broker = text_of(pack_view(), outage=BrokerOutage(NOW - 60.0, "the connection broke"))
+    assert "no broker since 22:12:20Z: the connection broke" in no_broker
+    assert "live" not in stale + no_broker
 
 
-def test_of_many_packs_those_with_alarms_come_first_and_the_rest_is_counted() -> None:
+def test_packs_with_alarms_are_shown_first_and_hidden_packs_are_counted() -> None:
     alarms = alarm("soc_low", "warning") | {f"alarm/{n}": {"active": True, "severity": "critical"} for n in range(5)}
     packs = [*(pack_view(device=f"p{n}") for n in range(29)), pack_view(alarms, "last")]
     lines = [line.rstrip() for line in lines_of(ViewState(NOW, packs, hint=HINT), 100, 24)]
@@ -102,8 +102,14 @@ def test_of_many_packs_those_with_alarms_come_first_and_the_rest_is_counted() ->
 )
 def test_no_payload_breaks_the_screen_or_controls_the_terminal(garbage: Any) -> None:
     topics = ["state", "health", "info", "parameters", "availability", "alarm/x"]
-    evil = {"text": "\x1b[2J\x07evil", "active": True, "severity": 7, "since": "\x1b[31m", "sensor_message": "\x1b]0;x"}
-    for payload in (garbage, evil, {"suspects": [garbage, "\x1b[2J"]}, {"voltage_v": 10**400}):
+    control_characters = {
+        "text": "\x1b[2J\x07evil",
+        "active": True,
+        "severity": 7,
+        "since": "\x1b[31m",
+        "sensor_message": "\x1b]0;x",
+    }
+    for payload in (garbage, control_characters, {"suspects": [garbage, "\x1b[2J"]}, {"voltage_v": 10**400}):
         pack = PackView("pack", dict.fromkeys(topics, payload), NOW)
         assert "".join(lines_of(ViewState(NOW, [pack, PackView("other", {}, NOW)]))).isprintable()
         for topic in topics:
@@ -111,7 +117,7 @@ def test_no_payload_breaks_the_screen_or_controls_the_terminal(garbage: Any) -> 
             assert line is None or line.isprintable()
 
 
-def test_a_screen_without_a_pack() -> None:
+def test_screen_without_a_pack_shows_the_hint() -> None:
     text = " ".join(lines_of(ViewState(NOW, hint=HINT)))
     assert "no pack has published anything yet" in text
     assert HINT in text
