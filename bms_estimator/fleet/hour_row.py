@@ -28,12 +28,12 @@ class Hour(Payload):
     dropped: int = Field(description="number of rejected samples")
     outliers: int = Field(description="number of voltages that failed the filter's innovation gate")
     searches: int = Field(
-        description="how often the filter was re-initialized because its SOC was inconsistent with the voltage"
+        description="number of re-initializations of the filter because its SOC was inconsistent with the voltage"
     )
     gaps: int = Field(description="number of gaps between samples")
     lost_blocks: int = Field(description="number of blocks that were never received")
     seen_s: float = Field(description="measured part of the hour [s]")
-    rest_s: float = Field(description="how long the pack had rested at the end of the hour [s]")
+    rest_s: float = Field(description="duration of the rest that lasts at the end of the hour [s]")
     charge_out_ah: float
     charge_in_ah: float
     energy_out_wh: float
@@ -79,6 +79,6 @@ class Hour(Payload):
     r_tl_std_ohm: float | None
     tau_tl_s: float | None
     tau_tl_std_s: float | None
-    delta_1: float | None = Field(description="SOC below which C_ts is negative (2.11)")
-    delta_2: float | None = Field(description="SOC below which C_tl is negative (2.12)")
+    delta_1: float | None = Field(description="SOC below which C_ts is negative, (2.11) of the thesis")
+    delta_2: float | None = Field(description="SOC below which C_tl is negative, (2.12) of the thesis")
     suspects: int = Field(description="bits of model.input_faults.InputFault")

@@ -8,7 +8,7 @@ from bms_estimator.model.config_file import NotNegative, Positive, Strict
 
 
 class ObserverSettings(Strict):
-    """The adaptive observer, Algorithm 1."""
+    """Adaptive observer, Algorithm 1 of the thesis; numbers in parentheses are equations of the thesis."""
 
     law: Literal["improved", "scheme-1", "scheme-2", "scheme-3", "learning"] = Field(
         default="improved",
@@ -51,7 +51,7 @@ class ObserverSettings(Strict):
 
 
 class IdentifierSettings(Strict):
-    """The identifier: SOC with its error, the cell's own parameters."""
+    """Identifier: joint Kalman filter for SOC, its error, and the cell's parameters."""
 
     enabled: bool = Field(default=True, description="false: SOC by coulomb counting, parameters by the observer's law")
     map_memory_h: Annotated[float, Field(ge=1)] = Field(

@@ -47,7 +47,7 @@ def _merged(column: str) -> str:
 
 
 _INSERT = (
-    f"INSERT INTO minute ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) "  # noqa: S608 - names of ours
+    f"INSERT INTO minute ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) "  # noqa: S608 - only constant names
     f"ON CONFLICT (time_s) DO UPDATE SET {', '.join(map(_merged, _COLUMNS[1:]))}"
 )
 

@@ -47,7 +47,7 @@ class HistoryFile:
         begin = "time_s" if step_s == MINUTE_S else "time_s / :step * :step"
         columns = f"{begin}, {_mean('voltage', 'v')}, {_mean('current', 'a')}, {_mean('temperature', 'c')}"
         grouped = (
-            f"SELECT {columns}, {_SUMMED}, max(time_s) AS last_s FROM minute "  # noqa: S608 - names of ours
+            f"SELECT {columns}, {_SUMMED}, max(time_s) AS last_s FROM minute "  # noqa: S608 - only constant names
             f"WHERE time_s >= :since AND time_s < :until GROUP BY {begin}"
         )
         query = f"SELECT g.*, m.soc, m.soc_std FROM ({grouped}) AS g JOIN minute AS m ON m.time_s = g.last_s ORDER BY 1"  # noqa: S608

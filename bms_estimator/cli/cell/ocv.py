@@ -122,7 +122,7 @@ class OcvResult:
     rms_inside_mv: float
     """RMS of points minus curve at SOC 0.05 to 0.95, away from the steep ends."""
     error_mv: list[float]
-    """Standard deviation of the table at SOC 0, 0.1 ... 1; empty for (2.10)."""
+    """Standard deviation of the table at SOC 0, 0.1 ... 1; empty for (2.10) of the thesis."""
     parameters: dict[str, dict[str, float | None]]
     """Values and standard deviations (None at a bound) of a16..a21; empty for a table."""
     sources: list[SourceResult]
@@ -150,7 +150,7 @@ def ocv(
             show_default=False,
         ),
     ] = None,
-    form: Annotated[Form, typer.Option(help="smooth table, or the polynomial (2.10)")] = Form.TABLE,
+    form: Annotated[Form, typer.Option(help="smooth table, or function (2.10) of the thesis")] = Form.TABLE,
     soc: Annotated[
         float, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample of the fullest captures")
     ] = 1.0,

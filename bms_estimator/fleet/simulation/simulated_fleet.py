@@ -3,9 +3,9 @@
 A block is a function of seed, pack and number. Therefore 100,000 packs need no storage, and any block can be resent. SOC is a
 closed-form function of time, so that estimates can be compared with the truth at any time.
 
-The SOC of a pack oscillates slowly, with a zero-mean current pulse each minute. The voltage follows from the shipped cell's OCV
-and elements (2.4), with two branches of fixed time constants. Capacity and resistances differ from the values in the table of
-packs, because real packs age and vary.
+The SOC of a pack oscillates slowly, with a zero-mean current pulse each minute. The voltage follows from the shipped
+cell's OCV and elements, (2.4) of the thesis, with two RC branches of fixed time constants. Capacity and resistances differ
+from the values in the table of packs, because real packs age and vary.
 """
 
 import math

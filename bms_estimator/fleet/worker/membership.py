@@ -15,7 +15,12 @@ from bms_estimator.fleet.heartbeat import DEAD_S
 
 
 def assign_partitions(partitions: int, workers: Collection[str]) -> list[str]:
-    """Return the worker of each partition; ``workers`` must not be empty."""
+    """Return the worker of each partition.
+
+    Args:
+        partitions: Number of partitions.
+        workers: Names of the live workers; not empty.
+    """
     max_partitions = math.ceil(partitions / len(workers))
     counts = Counter[str]()
     owners = []
