@@ -1,4 +1,4 @@
-"""Attack with idle connections on the HTTP listeners of programs that may open 1,024 files, as most systems have it."""
+"""Attack with idle connections on the HTTP listeners of programs with the usual limit of 1,024 open files."""
 
 import asyncio
 import contextlib
@@ -19,9 +19,9 @@ from tests.page.house import Service, start_program
 from tests.patience import LONG_S
 
 DESCRIPTORS = 1024
-"""Soft limit that most systems give to a process."""
+"""Soft limit of open files of a process on most systems."""
 IDLE = DESCRIPTORS
-"""Idle connections to each listener: as many as the process may have descriptors."""
+"""Number of idle connections to each listener, which equals the limit of descriptors."""
 ATTACK = """
 import resource, socket, sys
 hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -30,7 +30,7 @@ idle = [socket.create_connection(("127.0.0.1", int(port))) for port in sys.argv[
 print("open", flush=True)
 sys.stdin.read()
 """
-"""A process of its own, so that its descriptors are not those of the server. Arguments: connections, ports."""
+"""Program of the attacker, a separate process with its own descriptors. Arguments: number of connections, ports."""
 BOARD = {"voltage": 13.276, "current": 2.5, "temperature": 21.5, "cells": [3.311, 3.325, 3.318, 3.322]}
 PACK = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
 
@@ -56,7 +56,7 @@ def few_descriptors() -> Iterator[None]:
 
 
 @contextlib.asynccontextmanager
-async def attacked(*ports: int) -> AsyncIterator[None]:
+async def hold_idle_connections(*ports: int) -> AsyncIterator[None]:
     """Hold ``IDLE`` connections to each port."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
@@ -78,32 +78,37 @@ async def attacked(*ports: int) -> AsyncIterator[None]:
 
 
 async def attack_service(folder: Path, broker: Broker) -> Outcome:
-    """Attack page and Prometheus exporter of the real service; return once it has saved checkpoints and found the broker again."""
+    """Attack page and Prometheus exporter of the real service.
+
+    Return after the service has saved checkpoints and reconnected to the restarted broker.
+    """
     port, exporter = free_port(), free_port()
-    more = f'checkpoint_s = 1\n[prometheus]\nlisten = "127.0.0.1:{exporter}"\n'
-    service = Service(folder, broker, port, lambda _: BOARD, pack=PACK, more=more)
+    extra_toml = f'checkpoint_s = 1\n[prometheus]\nlisten = "127.0.0.1:{exporter}"\n'
+    service = Service(folder, broker, port, lambda _: BOARD, pack=PACK, extra_toml=extra_toml)
     async with service:
         async with Listener(broker) as live:
             await live.wait_json("bms/attic/state")
-        async with attacked(port, exporter):
-            await _checkpoint_saved(folder)
+        async with hold_idle_connections(port, exporter):
+            await _wait_for_checkpoint(folder)
             broker.stop()
             broker.start()
             async with Listener(broker) as live:
                 await live.wait_json("bms/attic/state")
-            await _checkpoint_saved(folder)
-            return await _outcome(folder, port, f"http://127.0.0.1:{port}/", f"http://127.0.0.1:{exporter}/metrics")
+            await _wait_for_checkpoint(folder)
+            return await _measure_outcome(
+                folder, port, f"http://127.0.0.1:{port}/", f"http://127.0.0.1:{exporter}/metrics"
+            )
 
 
 async def attack_dashboard(folder: Path, broker: Broker) -> Outcome:
-    """Attack the real ``dashboard``; return once its page shows that it has found the broker again."""
+    """Attack the real ``dashboard``. Return after its page shows that it has reconnected to the broker."""
     port = free_port()
     arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
     return await _attack_page(folder, port, ("dashboard", *arguments), broker.stop, broker.start)
 
 
 async def attack_fleet_page(folder: Path, engine: NatsCluster) -> Outcome:
-    """Attack the real ``fleet page``; return once it has found the NATS server again."""
+    """Attack the real ``fleet page``. Return after it has reconnected to the NATS server."""
     port = free_port()
     arguments = ("--server", engine.url, "--listen", f"127.0.0.1:{port}", "--no-browser")
     return await _attack_page(
@@ -117,40 +122,40 @@ async def _attack_page(
     process = await start_program(folder, *program, port=port)
     url = f"http://127.0.0.1:{port}/"
     try:
-        await _link_is(url, up=True)
-        async with attacked(port):
+        await _wait_for_link(url, up=True)
+        async with hold_idle_connections(port):
             stop()
-            await _link_is(url, up=False)
+            await _wait_for_link(url, up=False)
             start()
-            await _link_is(url, up=True)
-            return await _outcome(folder, port, url)
+            await _wait_for_link(url, up=True)
+            return await _measure_outcome(folder, port, url)
     finally:
         process.terminate()
         await process.wait()
 
 
-async def _link_is(url: str, *, up: bool) -> None:
+async def _wait_for_link(url: str, *, up: bool) -> None:
     """Read the page's stream until it reports the link to be up or down."""
     async with asyncio.timeout(LONG_S), aiohttp.ClientSession() as session, session.get(f"{url}events") as response:
         async for line in response.content:
-            found = json.loads(line[6:]) if line.startswith(b"data: ") else {}
-            if found.get("link", {}).get("up") is up:
+            event = json.loads(line[6:]) if line.startswith(b"data: ") else {}
+            if event.get("link", {}).get("up") is up:
                 return
 
 
-async def _checkpoint_saved(folder: Path) -> None:
+async def _wait_for_checkpoint(folder: Path) -> None:
     """Wait for a checkpoint that is newer than the present one."""
     async with asyncio.timeout(LONG_S):
-        before = _saved(folder)
-        while _saved(folder) <= before:  # noqa: ASYNC110 - a file has no event
+        before = _checkpoint_time_s(folder)
+        while _checkpoint_time_s(folder) <= before:  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.05)
 
 
-def _saved(folder: Path) -> float:
+def _checkpoint_time_s(folder: Path) -> float:
     return max((path.stat().st_mtime for path in folder.glob("attic-*.npz")), default=0.0)
 
 
-async def _outcome(folder: Path, port: int, *urls: str) -> Outcome:
+async def _measure_outcome(folder: Path, port: int, *urls: str) -> Outcome:
     answers = list[int]()
     async with aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(LONG_S)) as session:
         for url in urls:

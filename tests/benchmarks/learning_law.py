@@ -1,11 +1,11 @@
-"""Value of the learning law, simulated: ``make learning``. The tables of docs/theory/observer.md.
+"""Simulations of the learning law for the tables of docs/theory/observer.md: ``make learning``.
 
-The thesis's cell under steps of random height and length, a sample each second, bounds a quarter to four times the
-file's; the file is off by a factor 2 in R_s, R_ts, tau_ts, R_tl, tau_tl: sixteen of the 32 combinations, in which every
-pair is off in each of its four ways equally often. Median over the starts of the largest error, of R_s and both RC
-products and of all five.
+The thesis's cell has a load of steps of random height and length, sampled each second. In the cell file R_s, R_ts, tau_ts,
+R_tl and tau_tl are wrong by a factor of 2 up or down. Sixteen of the 32 combinations are used, in which every pair of
+parameters has each of its four combinations equally often. Bounds are a quarter and four times the values of the file. The
+tables contain the median over the files of the largest error of R_s and both RC products, and of all five parameters.
 
-What N is worth to the printed law on real captures is read from ``../shared/data``, where that is there.
+The effect of N on the printed law is measured on the real captures of ``../shared/data``, if they exist.
 """
 
 import itertools
@@ -48,16 +48,20 @@ from tests.estimator.random_steps import (
 
 STARTS = [factors for factors in itertools.product((0.5, 2.0), repeat=5) if factors.count(2.0) % 2 == 0]
 HOURS = (0.5, 1.0, 3.0, 10.0)
+"""Times at which errors are printed [h]."""
 NOISES_V = (0.0, 1e-3, 5e-3)
 CONVERGING = [0, 2, 4]
+"""Indices of R_s and both RC products, which every informative load determines."""
 INFINITE_DEAD_ZONE_V = 9.0
 """Dead zone that no error exceeds [V]."""
 K_BOUND = learning_law.MAX_RATE_HZ / RATE_HZ
 OBSERVER_SETTINGS = ("dead_zone_v", "k0")
 LEAK = 1e-4
-"""Gain of the law without a memory. It diverges at ten times this value."""
+"""Gain of the leakage in the law without a memory, which diverges at ten times this value."""
 HIGH_OHM = 10.0
+"""Factor of the resistances of a cell on which k has a visible effect."""
 SOC_ERROR = 0.05
+"""Error of the counted SOC."""
 NO_N: dict[str, Any] = {"nussbaum": "k2-cos", "k0": 0.0, "dead_zone_v": INFINITE_DEAD_ZONE_V}
 """Settings of N(k) = k^2 cos k with constant k = 0."""
 NO_LOCK_DETECTION = {"lock_error_v": 100.0}
@@ -65,15 +69,18 @@ CAPTURES = ("cell5_relaxation_c2", "cell1_random_steps", "cell1_dst")
 Run = Callable[[Any, Any, Any, Any], int]
 
 
-def learned(
+def learning_errors(
     block: SampleBlock,
     soc: float = FIRST_SOC,
     run: Run = step.run,
     settings: Mapping[str, float] | None = None,
     ohms: float = 1.0,
 ) -> np.ndarray:
-    """Return the relative errors after each of ``HOURS`` from each start, for a cell with ``ohms`` times the resistances; shape (starts, hours, 5)."""
-    found = np.empty((len(STARTS), len(HOURS), 5))
+    """Return the relative errors after each of ``HOURS`` from each start.
+
+    The cell has ``ohms`` times the resistances. Shape (starts, hours, 5).
+    """
+    errors_by_start = np.empty((len(STARTS), len(HOURS), 5))
     trace = np.zeros(block.size, dtype=TRACE)
     for n, factors in enumerate(STARTS):
         r_s, r_ts, tau_ts, r_tl, tau_tl = factors
@@ -84,38 +91,41 @@ def learned(
         for h, hours in enumerate(HOURS):
             until = int(3600 * hours)
             run(estimator.record, estimator.settings_record, block[before:until], trace)
-            found[n, h], before = relative_errors(estimator, factors), until
-    return found
+            errors_by_start[n, h], before = relative_errors(estimator, factors), until
+    return errors_by_start
 
 
-def percent(found: np.ndarray) -> list[str]:
-    """Return for each hour the median over the starts of the largest error of R_s and both RC products, and of all five [%]."""
-    converging = 100.0 * np.median(found[:, :, CONVERGING].max(axis=2), axis=0)
-    every = 100.0 * np.median(found.max(axis=2), axis=0)
+def percent(errors_by_start: np.ndarray) -> list[str]:
+    """Return for each hour the medians over the starts as text [%].
+
+    They are of the largest error of R_s and both RC products, and of the largest error of all five parameters.
+    """
+    converging = 100.0 * np.median(errors_by_start[:, :, CONVERGING].max(axis=2), axis=0)
+    every = 100.0 * np.median(errors_by_start.max(axis=2), axis=0)
     return [f"{one:.1f} / {other:.1f}" for one, other in zip(converging, every, strict=True)]
 
 
-def printed(block: SampleBlock, *, gain: float | None) -> tuple[str, str]:
+def run_printed_law(block: SampleBlock, *, gain: float | None) -> tuple[str, str]:
     """Return the results of the printed law: largest error of R_s and both RC products [%], and RMS of e [mV]."""
-    found, e = [], []
+    errors_by_start, e = [], []
     for factors in STARTS:
-        estimator = of_printed_law(file_off_by(*factors))
+        estimator = make_printed_law(file_off_by(*factors))
         estimator.run(block[:1])
         if gain is not None:
             estimator.state["gain"] = gain
             estimator.settings["dead_zone_v"] = INFINITE_DEAD_ZONE_V
         e.append(estimator.run(block[1:])["tracking_error_v"])
-        found.append(max(products(estimator)))
-    return f"{100.0 * np.median(found):.1f}", f"{1e3 * float(np.sqrt(np.mean(np.square(e)))):.2f}"
+        errors_by_start.append(max(converging_errors(estimator)))
+    return f"{100.0 * np.median(errors_by_start):.1f}", f"{1e3 * float(np.sqrt(np.mean(np.square(e)))):.2f}"
 
 
-def of_printed_law(file: CellModel) -> Estimator:
-    """Return an estimator with Algorithm 1 without gain reset and lock detection, so that N is unchanged."""
+def make_printed_law(file: CellModel) -> Estimator:
+    """Return an estimator with Algorithm 1 of the thesis without gain reset and lock detection, which would change N."""
     settings = ObserverSettings(rearm_gain=None, lock_error_v=100.0)
     return Estimator(file, settings, identifier=None, initial_soc=FIRST_SOC, voltage_resolution_v=RESOLUTION_V)
 
 
-def products(estimator: Estimator) -> tuple[float, float, float]:
+def converging_errors(estimator: Estimator) -> tuple[float, float, float]:
     """Return the relative errors of R_s, R_ts C_ts and R_tl C_tl at SOC 0.5."""
     a, true = estimator.state[0]["a"], TRUTH.a
     of = (
@@ -127,56 +137,56 @@ def products(estimator: Estimator) -> tuple[float, float, float]:
     return r_s, short, long
 
 
-def put_in(kernel: Any, **others: Any) -> Any:
-    """Recompile a kernel with other functions under the names of those that it calls."""
-    plain = kernel.py_func
-    return njit(types.FunctionType(plain.__code__, plain.__globals__ | others, plain.__name__))
+def recompile_with(kernel: Any, **others: Any) -> Any:
+    """Recompile a kernel with replacements of functions that it calls."""
+    original = kernel.py_func
+    return njit(types.FunctionType(original.__code__, original.__globals__ | others, original.__name__))
 
 
 def run_with(**others: Any) -> Run:
     """Return the kernels' ``run`` with replaced parts of the learning law."""
-    law = put_in(learning_law.learning_step, **others)
-    run: Run = put_in(step.run, step=put_in(step.step, learning_step=law))
+    law = recompile_with(learning_law.learning_step, **others)
+    run: Run = recompile_with(step.run, step=recompile_with(step.step, learning_step=law))
     return run
 
 
 @njit
-def step_alone(m: Record, q: Record, share: float) -> None:
+def take_step_without_states(m: Record, q: Record, share: float) -> None:
     """Change theta without correcting states and offset."""
-    way = 0.0
+    squared_step = 0.0
     for j in range(q.count):
-        way += m.step[j] * m.step[j]
+        squared_step += m.step[j] * m.step[j]
         m.theta[j] = min(max(m.theta[j] + share * m.step[j], q.lower[j]), q.upper[j])
-    learning_law.discount_information(m, q, share * way / (q.reach * q.reach))
+    learning_law.discount_information(m, q, share * squared_step / (q.reach * q.reach))
 
 
 @njit
-def gradient(m: Record, q: Record) -> bool:
-    """Compute the gradient on the memory divided by its trace, in place of Newton's step."""
-    total = 0.0
+def find_gradient(m: Record, q: Record) -> bool:
+    """Compute the gradient on the memory divided by the trace of the memory, instead of Newton's step."""
+    trace_of_information = 0.0
     for j in range(q.count):
-        total += m.information[j, j] + q.leak_v2s[j]
+        trace_of_information += m.information[j, j] + q.leak_v2s[j]
     for j in range(q.count):
         m.step[j] = m.pull[j] + q.leak_v2s[j] * (q.middle[j] - m.theta[j])
         for i in range(q.count):
             m.step[j] -= m.information[max(i, j), min(i, j)] * m.theta[i]
-        m.step[j] /= total
+        m.step[j] /= trace_of_information
     return True
 
 
 @njit
-def remember_nothing(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """Use only the present sample: normalized product of sensitivity and e."""
-    told = 0.0
+def remember_last_sample(m: Record, q: Record, dt_s: float, e: float) -> None:
+    """Use only the present sample: the normalized product of sensitivity and e."""
+    psi_squared = 0.0
     for j in range(q.count):
-        told += m.psi[j] * m.psi[j]
+        psi_squared += m.psi[j] * m.psi[j]
     for j in range(q.count):
-        m.pull[j] = m.psi[j] * e / (told + q.told_v * q.told_v)
+        m.pull[j] = m.psi[j] * e / (psi_squared + q.told_v * q.told_v)
 
 
 @njit
-def along_pull(m: Record, q: Record) -> bool:
-    """Compute the step for ``remember_nothing``: theta' = gamma k (psi e / (eps2^2 + psi^2) - LEAK (theta - theta_m))."""
+def step_along_pull(m: Record, q: Record) -> bool:
+    """Compute the step for ``remember_last_sample``: theta' = gamma k (psi e / (eps2^2 + psi^2) - LEAK (theta - theta_m))."""
     for j in range(q.count):
         m.step[j] = m.pull[j] - LEAK * (m.theta[j] - q.middle[j])
     return True
@@ -184,7 +194,7 @@ def along_pull(m: Record, q: Record) -> bool:
 
 @njit
 def inject_as_printed(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """Inject u = -N e into both RC pairs (3.2), (3.3) with N = N(0) = 1/s, with its sensitivities."""
+    """Inject u = -N e into both RC pairs, by (3.2) and (3.3) of the thesis with N = N(0) = 1/s, with its sensitivities."""
     share = 2.0 * integral_of_exponential(-2.0, dt_s)
     for branch in range(2):
         m.x[branch] -= 0.5 * share * e
@@ -192,15 +202,15 @@ def inject_as_printed(m: Record, q: Record, dt_s: float, e: float) -> None:
             m.dx[branch, j] += 0.5 * share * m.psi[j]
 
 
-NO_MEMORY = {"remember": remember_nothing, "find_step": along_pull}
+NO_MEMORY = {"remember": remember_last_sample, "find_step": step_along_pull}
 NO_INJECTION = {"offset_s": math.inf}
 PARTS: dict[str, dict[str, Any]] = {
     "all": {},
     "no memory: gradient of e^2, normalised": {"others": NO_MEMORY},
     "no memory, no injection": {"others": NO_MEMORY, "settings": NO_INJECTION},
     "a memory of 1 s": {"settings": {"memory_s": 1.0}},
-    "gradient on the memory, not Newton's step": {"others": {"find_step": gradient}},
-    "the states do not move with theta": {"others": {"take_step": step_alone}},
+    "gradient on the memory, not Newton's step": {"others": {"find_step": find_gradient}},
+    "the states do not move with theta": {"others": {"take_step": take_step_without_states}},
     "memory does not fade as theta moves": {"settings": {"reach": 1e9}},
     "no leakage": {"settings": {"leak_v2s": 1e-14}},
     "no injection": {"settings": NO_INJECTION},
@@ -216,81 +226,90 @@ PARTS: dict[str, dict[str, Any]] = {
 
 def ablation(blocks: Mapping[str, tuple[SampleBlock, float]]) -> Iterator[tuple[str, ...]]:
     """Yield a row for each removed part: errors at 1 h and 10 h for each block."""
-    for name, changed in PARTS.items():
-        run = run_with(**changed["others"]) if "others" in changed else step.run
+    for name, changes in PARTS.items():
+        run = run_with(**changes["others"]) if "others" in changes else step.run
         cells = []
         for block, soc in blocks.values():
-            at = percent(learned(block, soc, run, changed.get("settings")))
-            cells += [at[1], at[3]]
+            texts = percent(learning_errors(block, soc, run, changes.get("settings")))
+            cells += [texts[1], texts[3]]
         yield name, *cells
 
 
-def gains() -> Iterator[tuple[str, ...]]:
-    """Yield the effect of k on a cell with ten times the resistances, whose errors are ten times as large."""
+def effect_of_k() -> Iterator[tuple[str, ...]]:
+    """Yield the effect of k on a cell with ten times the resistances, whose voltage errors are ten times as large."""
     block = random_steps(3.0, 1e-3, cell=file_off_by(HIGH_OHM, HIGH_OHM, 1.0, HIGH_OHM, 1.0))
-    for period_s, still in itertools.product((60.0, 1000.0), (False, True)):
-        settings = {"rate": 1.0 / period_s} | ({"dead_zone_v": INFINITE_DEAD_ZONE_V} if still else {})
-        found = 100.0 * np.median(learned(block, settings=settings, ohms=HIGH_OHM)[:, :3, 0], axis=0)
-        yield f"1/{period_s:g} s", "1" if still else "as it grows", *(f"{one:.1f}" for one in found)
+    for period_s, within_dead_zone in itertools.product((60.0, 1000.0), (False, True)):
+        settings = {"rate": 1.0 / period_s} | ({"dead_zone_v": INFINITE_DEAD_ZONE_V} if within_dead_zone else {})
+        errors_by_start = 100.0 * np.median(learning_errors(block, settings=settings, ohms=HIGH_OHM)[:, :3, 0], axis=0)
+        yield (
+            f"1/{period_s:g} s",
+            "1" if within_dead_zone else "as it grows",
+            *(f"{one:.1f}" for one in errors_by_start),
+        )
 
 
-def each_element(block: SampleBlock) -> Iterator[tuple[str, ...]]:
+def errors_by_element(block: SampleBlock) -> Iterator[tuple[str, ...]]:
     """Yield the median error of each element [%] with a counted SOC that is too low."""
-    found = 100.0 * np.median(learned(block, FIRST_SOC - SOC_ERROR), axis=0)
-    for hours, of_five in zip(HOURS, found, strict=True):
-        yield f"{hours:g} h", *(f"{one:.1f}" for one in of_five)
+    errors_by_start = 100.0 * np.median(learning_errors(block, FIRST_SOC - SOC_ERROR), axis=0)
+    for hours, element_errors in zip(HOURS, errors_by_start, strict=True):
+        yield f"{hours:g} h", *(f"{one:.1f}" for one in element_errors)
 
 
-def without_n() -> Iterator[tuple[str, ...]]:
-    """Yield for each real capture, with the identifier, how much a1..a15 with N = 0 differ from those with N(k)."""
+def compare_with_zero_gain() -> Iterator[tuple[str, ...]]:
+    """Yield for each real capture, with the identifier, the difference of a1..a15 with N = 0 from those with N(k)."""
     for name in CAPTURES:
         path = SHARED_DATA / "ncr18650" / f"{name}.csv.gz"
         if not path.is_file():
             yield name, "", "", "", f"not there: {path}"
             continue
         rows = load_capture(path).rows
-        as_printed, with_n = ended(rows, {})
-        for watch, settings in (("as it is", NO_N), ("off", NO_N | NO_LOCK_DETECTION)):
-            estimator, trace = ended(rows, settings)
-            same = all(np.array_equal(trace[f], with_n[f], equal_nan=True) for f in ("soc", "soc_std", "innovation_v"))
-            same &= estimator.record["elements"].tobytes() == as_printed.record["elements"].tobytes()
-            off = np.abs(estimator.state[0]["a"][1:16] / as_printed.state[0]["a"][1:16] - 1.0)
+        as_printed, with_n = run_capture(rows, {})
+        for lock_detection, settings in (("as it is", NO_N), ("off", NO_N | NO_LOCK_DETECTION)):
+            estimator, trace = run_capture(rows, settings)
+            is_equal = all(
+                np.array_equal(trace[f], with_n[f], equal_nan=True) for f in ("soc", "soc_std", "innovation_v")
+            )
+            is_equal &= estimator.record["elements"].tobytes() == as_printed.record["elements"].tobytes()
+            deviation = np.abs(estimator.state[0]["a"][1:16] / as_printed.state[0]["a"][1:16] - 1.0)
             yield (
                 name,
-                watch,
+                lock_detection,
                 str(estimator.state["lock_losses"][0]),
-                f"{100.0 * off.max():.2g}",
-                "the same to the last bit" if same else "not the same",
+                f"{100.0 * deviation.max():.2g}",
+                "the same to the last bit" if is_equal else "not the same",
             )
 
 
-def ended(rows: SampleBlock, observer: Mapping[str, Any]) -> tuple[Estimator, SampleBlock]:
+def run_capture(rows: SampleBlock, observer: Mapping[str, Any]) -> tuple[Estimator, SampleBlock]:
     """Return the estimator after a capture, and its trace."""
     estimator = Estimator(load_cell("ncr18650"), ObserverSettings.model_validate(observer))
     return estimator, estimator.run(rows).copy()
 
 
-def guarantees() -> Iterator[tuple[str, str]]:
+def measure_guarantees() -> Iterator[tuple[str, str]]:
     """Yield a row for each guarantee of docs/theory/observer.md except convergence."""
-    noisy = learner(TRUTH)
-    q, theta = noisy.settings_record[0]["learning"], noisy.record[0]["learning"]["theta"]
+    with_noise = learner(TRUTH)
+    q, theta = with_noise.settings_record[0]["learning"], with_noise.record[0]["learning"]["theta"]
     inside, estimate_v = True, []
     for part in np.array_split(random_steps(3.0, 0.2), 100):
-        estimate_v += list(noisy.run(part)["voltage_estimate_v"])
+        estimate_v += list(with_noise.run(part)["voltage_estimate_v"])
         inside &= bool((q["lower"] <= theta).all() and (theta <= q["upper"]).all())
     yield (
         "200 mV of noise, 3 h: theta within its bounds; y^ [V]",
         f"{inside}; {min(estimate_v):.2f}..{max(estimate_v):.2f}",
     )
-    noisy = learner(TRUTH)
-    noisy.run(random_steps(10.0, 0.05))
-    yield "50 mV of noise, 10 h: k", f"{noisy.state['k'][0]:g}"
-    still = learner(TRUTH)
-    still.run(random_steps(2.0, 0.1 * RESOLUTION_V))
-    yield "noise within the dead zone, 2 h: k", f"{still.state['k'][0]:g}"
-    beyond = learner(file_off_by(8.0, 1.0, 1.0, 1.0, 1.0))
-    beyond.run(random_steps(3.0, 1e-3))
-    yield "file's R_s eight times the true, bounds from a quarter: R_s over the file's", f"{ratio_of_r_s(beyond):.3f}"
+    with_noise = learner(TRUTH)
+    with_noise.run(random_steps(10.0, 0.05))
+    yield "50 mV of noise, 10 h: k", f"{with_noise.state['k'][0]:g}"
+    within_dead_zone = learner(TRUTH)
+    within_dead_zone.run(random_steps(2.0, 0.1 * RESOLUTION_V))
+    yield "noise within the dead zone, 2 h: k", f"{within_dead_zone.state['k'][0]:g}"
+    beyond_bounds = learner(file_off_by(8.0, 1.0, 1.0, 1.0, 1.0))
+    beyond_bounds.run(random_steps(3.0, 1e-3))
+    yield (
+        "file's R_s eight times the true, bounds from a quarter: R_s over the file's",
+        f"{ratio_of_r_s(beyond_bounds):.3f}",
+    )
     factors = (2.0, 0.5, 1.0, 2.0, 0.5)
     constant = learner(file_off_by(*factors))
     constant.run(measured(np.full(4 * 7200, 0.1 * RATED_A), 1e-3, np.random.default_rng(1)))
@@ -298,7 +317,7 @@ def guarantees() -> Iterator[tuple[str, str]]:
         "4 h of constant current: errors [%]",
         " ".join(f"{100.0 * e:.0f}" for e in relative_errors(constant, factors)),
     )
-    for minutes, error in jump():
+    for minutes, error in measure_resistance_step():
         yield f"R_s jumps to 1.5 times after 3 h: its error {minutes} min later [%]", f"{100.0 * error:.1f}"
 
 
@@ -307,32 +326,32 @@ def ratio_of_r_s(estimator: Estimator) -> float:
     return float(np.exp(estimator.record[0]["learning"]["theta"][0]))
 
 
-def jump() -> Iterator[tuple[int, float]]:
+def measure_resistance_step() -> Iterator[tuple[int, float]]:
     """Yield times after a step of R_s to 1.5 times [min], and the errors then."""
-    grown = 1.5
+    factor = 1.5
     current_a = held_currents(6.0, np.random.default_rng(2))
     block, after = (
-        measured(current_a, 1e-3, np.random.default_rng(3), cell) for cell in (TRUTH, file_off_by(grown, 1, 1, 1, 1))
+        measured(current_a, 1e-3, np.random.default_rng(3), cell) for cell in (TRUTH, file_off_by(factor, 1, 1, 1, 1))
     )
-    at = 3 * 3600
-    block["voltage_v"][at:] = after["voltage_v"][at:]
+    first = 3 * 3600
+    block["voltage_v"][first:] = after["voltage_v"][first:]
     estimator = learner(TRUTH)
-    estimator.run(block[:at])
+    estimator.run(block[:first])
     for minutes in (10, 30, 60):
         until = 3 * 3600 + 60 * minutes
-        estimator.run(block[at:until])
-        at = until
-        yield minutes, abs(ratio_of_r_s(estimator) / grown - 1.0)
+        estimator.run(block[first:until])
+        first = until
+        yield minutes, abs(ratio_of_r_s(estimator) / factor - 1.0)
 
 
 def table(title: str, columns: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> None:
     """Print a table row by row."""
-    shown = Table(title=title)
+    printed_table = Table(title=title)
     for column in columns:
-        shown.add_column(column)
+        printed_table.add_column(column)
     for row in rows:
-        shown.add_row(*row)
-    Console(width=150).print(shown)
+        printed_table.add_row(*row)
+    Console(width=150).print(printed_table)
 
 
 def main() -> None:
@@ -340,13 +359,13 @@ def main() -> None:
     table(
         "errors [%]: R_s and RC products / all five",
         ("noise", *(f"{hours:g} h" for hours in HOURS)),
-        ((f"{1e3 * noise_v:g} mV", *percent(learned(block))) for noise_v, block in blocks.items()),
+        ((f"{1e3 * noise_v:g} mV", *percent(learning_errors(block))) for noise_v, block in blocks.items()),
     )
     table(
         "the printed law, 10 h",
         ("noise", "N(k)", "R_s and RC products [%]", "e, RMS [mV]"),
         (
-            (f"{1e3 * noise_v:g} mV", name, *printed(blocks[noise_v], gain=gain))
+            (f"{1e3 * noise_v:g} mV", name, *run_printed_law(blocks[noise_v], gain=gain))
             for noise_v in NOISES_V
             for name, gain in (("as printed", None), ("== 0", 0.0))
         ),
@@ -365,15 +384,15 @@ def main() -> None:
     table(
         "what k is worth: error of R_s [%], ten times the resistances, 1 mV",
         ("gamma", "k", *(f"{hours:g} h" for hours in HOURS[:3])),
-        gains(),
+        effect_of_k(),
     )
-    table("SOC 0.05 too low, 1 mV: error of each [%]", ("", *NAMES), each_element(blocks[1e-3]))
+    table("SOC 0.05 too low, 1 mV: error of each [%]", ("", *NAMES), errors_by_element(blocks[1e-3]))
     table(
         "the printed law with N == 0 on real captures, against N(k)",
         ("capture", "lock watch", "losses of lock", "worst of a1..a15 off by [%]", "SOC, std, elements, innovation"),
-        without_n(),
+        compare_with_zero_gain(),
     )
-    table("what holds under any load", ("", "measured"), guarantees())
+    table("what holds under any load", ("", "measured"), measure_guarantees())
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Short simulated captures of typical loads and conditions, identical on every machine.
 
-The estimator starts in mid-load with an SOC 0.2 too low or 0.2 too high. The cell file's ladder is fitted to the true
-impedance at the file's temperatures. The file has errors of the size that it declares: an OCV error of some millivolts and
-some SOC, resistances of another cell of the make, a capacity error of a percent.
+The estimator starts in mid-load with an SOC 0.2 too low or 0.2 too high. The ladder of the cell file is fitted to the true
+impedance at the temperatures of the file. The file has errors of the size that it declares: an OCV error of some millivolts
+and some SOC, resistances of another cell of the same type, and a capacity error of one percent.
 """
 
 from dataclasses import dataclass, replace
@@ -48,13 +48,20 @@ OCV_NODES = np.concatenate([np.arange(0, 40, 4), np.arange(40, 401, 10)])
 RAD_S = 1.0 / np.geomspace(0.1, 4000.0, 40)
 """Frequencies at which the ladder is fitted to the impedance [1/s]."""
 WEAK_SHARE = np.array([0.7, 0.3, 0.3, 0.4, 0.5, 0.5, 0.5])
-"""Error of the resistances at 25 C when the cell file has no other temperature."""
-R_STD, SHAPE_STD = 0.1, 0.05
-"""Resistances of the cell file over the true ones, std of the logarithm: of all together, and of each at each SOC."""
-OCV_STD_V, OCV_STD_SOC, OCV_LENGTH_SOC = {"nmc": 0.004, "lfp": 0.002}, 0.007, 0.15
-"""Error of its OCV: std [V], std along SOC, and how far these stay the same."""
+"""Fractions of the resistances at 25 C with weak temperature dependence, if the cell file has no other temperature."""
+R_STD = 0.1
+"""Std of ln of a common factor of all resistances of the cell file."""
+SHAPE_STD = 0.05
+"""Std of ln of an additional factor of each resistance at each SOC."""
+OCV_STD_V = {"nmc": 0.004, "lfp": 0.002}
+"""Std of the voltage error of the cell file's OCV [V]."""
+OCV_STD_SOC = 0.007
+"""Std of the error of the cell file's OCV along the SOC axis."""
+OCV_LENGTH_SOC = 0.15
+"""Correlation length of both errors [SOC]."""
 STEADY_C, PER_HOUR_S = 0.5, 3600
 VOLT_STEP, AMPERE_STEP, KELVIN_STEP = 1e-3, 1e-3, 0.1
+"""Resolution of the sensors [V], [A] and [K]."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +88,9 @@ class Case:
     gain: float = 1.0
     offset_a: float = 0.0
     capacity: float = 1.01
-    """Capacity in the cell file over the true one."""
+    """Capacity in the cell file divided by the true capacity."""
     curve_error: float = 1.0
-    """Error of the OCV in the cell file over that of a typical one. It limits the accuracy of a learned capacity."""
+    """Error of the cell file's OCV divided by a typical error. It limits the accuracy of a learned capacity."""
     weak_cell: float = 1.0
     """Below 1: six cells in series, one with this fraction of the capacity of the others."""
     sensed: bool = True
@@ -173,7 +180,7 @@ def load_a(case: Case, seconds: int) -> Floats:
 
 def capture(case: Case, current_a: Floats | None = None) -> Capture:
     """Simulate a capture of one case; under ``current_a`` at ``rate_hz`` [A] if given."""
-    assert not (case.sensed and case.warms_k), "the sensor shows the room"
+    assert not (case.sensed and case.warms_k), "a sensor would have the temperature of the room"
     rng = np.random.default_rng(1000 + case.seed)
     if current_a is None:
         current_a = np.repeat(load_a(case, round(PER_HOUR_S * (case.unseen_h + case.hours))), round(case.rate_hz))
@@ -186,19 +193,21 @@ def capture(case: Case, current_a: Floats | None = None) -> Capture:
         t = replace(case.truth, capacity_ah=case.truth.capacity_ah * (case.weak_cell if n == 0 else 1.0))
         curves = t.ocv_v, t.per_kelvin_v, t.hysteresis_v, t.ohm
         branch = 1.0 if case.soc == 1.0 else -1.0
-        volt, true = simulate(dt_s, current_a, temperature_c, case.soc, branch, t.capacity_ah, *curves, case.warms_k)
-        voltage_v, soc = voltage_v + volt, np.minimum(soc, true)
+        cell_v, cell_soc = simulate(
+            dt_s, current_a, temperature_c, case.soc, branch, t.capacity_ah, *curves, case.warms_k
+        )
+        voltage_v, soc = voltage_v + cell_v, np.minimum(soc, cell_soc)
     begin = int(np.searchsorted(time_s, PER_HOUR_S * case.unseen_h))
     empty = (soc < 0.02) | (voltage_v < 2.5 * cells if case.truth is OXIDE else voltage_v < 2.0)
     end = int(np.argmax(empty)) if empty.any() else time_s.size
     samples = np.zeros(time_s.size, dtype=SAMPLE)
     samples["time_s"] = time_s
-    seen_a = case.gain * current_a + case.offset_a + rng.normal(0.0, 2e-3, time_s.size)
-    samples["current_a"] = np.round(seen_a / AMPERE_STEP) * AMPERE_STEP
-    seen_v = voltage_v + rng.normal(0.0, 5e-4 * np.sqrt(cells), time_s.size)
-    samples["voltage_v"] = np.round(seen_v / VOLT_STEP) * VOLT_STEP
-    seen_c = temperature_c + rng.normal(0.0, 0.1, time_s.size)
-    samples["temperature_c"] = np.round(seen_c / KELVIN_STEP) * KELVIN_STEP if case.sensed else np.nan
+    measured_a = case.gain * current_a + case.offset_a + rng.normal(0.0, 2e-3, time_s.size)
+    samples["current_a"] = np.round(measured_a / AMPERE_STEP) * AMPERE_STEP
+    measured_v = voltage_v + rng.normal(0.0, 5e-4 * np.sqrt(cells), time_s.size)
+    samples["voltage_v"] = np.round(measured_v / VOLT_STEP) * VOLT_STEP
+    measured_c = temperature_c + rng.normal(0.0, 0.1, time_s.size)
+    samples["temperature_c"] = np.round(measured_c / KELVIN_STEP) * KELVIN_STEP if case.sensed else np.nan
     return Capture(samples[begin:end], soc[begin:end], cell_file(case).pack(cells, 1))
 
 
@@ -211,12 +220,12 @@ def cell_file(case: Case) -> CellModel:
     rng = np.random.default_rng(2000 + case.seed)
     slope_v = np.gradient(case.truth.ocv_v, GRID)
     std_v, std_soc_v = case.curve_error * OCV_STD_V[kind], case.curve_error * OCV_STD_SOC * slope_v
-    wrong_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
-    told_v = rising((case.truth.ocv_v + wrong_v)[OCV_NODES])
+    ocv_error_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
+    file_ocv_v = rising((case.truth.ocv_v + ocv_error_v)[OCV_NODES])
     hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # constant over SOC, an error within the std of `ocv`
     table = {
         "soc": GRID[OCV_NODES],
-        "ocv_v": told_v + 1e-6 * np.arange(OCV_NODES.size),
+        "ocv_v": file_ocv_v + 1e-6 * np.arange(OCV_NODES.size),
         "error_v": np.hypot(np.hypot(std_v, std_soc_v)[OCV_NODES], REST_SHARE_STD * hysteresis_v),
         "hysteresis_v": np.full(OCV_NODES.size, hysteresis_v),
     }
@@ -235,20 +244,20 @@ def ladder(truth: Truth, temperatures_c: tuple[float, ...], rng: np.random.Gener
     """Return the ladder of another cell, fitted to the true impedance at each SOC by relative non-negative least
     squares."""
     branches = 1.0 / (1.0 + 1j * RAD_S[:, None] * np.array([0.0, *TAU_S]))
-    another = np.exp(R_STD * rng.standard_normal())
+    common_factor = np.exp(R_STD * rng.standard_normal())
     weak_ohm, strong_ohm = [], []
     for node in NODES:
-        rows, aims = [], []
+        rows, normalized_impedances = [], []
         for t in temperatures_c:
             aim = impedance(truth, node, t, RAD_S, STEADY_C * truth.capacity_ah)
             parts = [arrhenius(energy_j, t) * branches for energy_j in (WEAK_J, STRONG_J)]
             rows.append((branches if len(temperatures_c) == 1 else np.hstack(parts)) / np.abs(aim)[:, None])
-            aims.append(aim / np.abs(aim))
-        matrix, aim = np.concatenate(rows), np.concatenate(aims)
+            normalized_impedances.append(aim / np.abs(aim))
+        matrix, aim = np.concatenate(rows), np.concatenate(normalized_impedances)
         ohm, _ = nnls(np.concatenate([matrix.real, matrix.imag]), np.concatenate([aim.real, aim.imag]))
         if len(temperatures_c) == 1:
             ohm = np.concatenate([WEAK_SHARE * ohm, (1.0 - WEAK_SHARE) * ohm])
-        weak, strong = ohm.reshape(2, -1) * another * np.exp(SHAPE_STD * rng.standard_normal(1 + len(TAU_S)))
+        weak, strong = ohm.reshape(2, -1) * common_factor * np.exp(SHAPE_STD * rng.standard_normal(1 + len(TAU_S)))
         weak_ohm.append(weak)
         strong_ohm.append(strong)
     return Ladder(

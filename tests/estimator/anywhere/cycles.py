@@ -1,4 +1,4 @@
-"""Full cycles and charges from empty: first day of a cell with known chemistry and capacity only.
+"""Full cycles and charges from empty: first day of a cell of which only chemistry and capacity are known.
 
 The estimator has the generic cell file and no initial SOC. The true cell has the OCV of a measured cell (LG M50, NCR18650,
 Leaf, the LFP test cell) or a random OCV with errors up to 1.5 std (LCO, LTO). Its resistances are 0.7 to 3 times those of
@@ -31,7 +31,7 @@ EMPTY_SOC = 0.02
 REST_S = 900
 """Rest between two phases [s]."""
 TAIL_S = 4 * 3600
-"""Longest drive after the charge [s]."""
+"""Maximum duration of the drive after the charge [s]."""
 MAX_CHARGE_S = 8 * 3600
 
 
@@ -41,7 +41,7 @@ class Cycle:
 
     chemistry: Literal["nmc", "nca", "lfp", "lmo", "lco", "lto"]
     begin: Literal["discharge", "charge"]
-    """True: a discharge at 1C to empty comes first; False: the charge, from empty."""
+    """First phase: a discharge at 1 C to empty, or the charge of an empty cell."""
     resistance: float
     soc: float
     """SOC at the first sample, from rest."""
@@ -66,7 +66,7 @@ DISCHARGES = ((0.7, 0.41), (1.0, 0.7), (1.5, 0.41), (2.0, 0.55), (3.0, 0.41), (3
 CHARGES = ((0.7, 0.03, 1.0), (1.0, 0.05, 0.3), (2.0, 0.02, 0.5), (3.0, 0.05, 1.0))
 """Resistance, initial SOC and current [C] of the charges from empty."""
 THREE_TIMES_PHOSPHATE = Cycle("lfp", "discharge", 1.815, 0.41)
-"""A cell with three times the resistances of ``PHOSPHATE``, for its capacity."""
+"""Cycle of a cell with three times the resistances of ``PHOSPHATE``, in proportion to its capacity."""
 WORST_STDS = 1.5
 """Maximum error of a random true curve, in std of the generic one."""
 CHEMISTRIES = ("nmc", "nca", "lfp", "lmo", "lco", "lto")

@@ -13,7 +13,7 @@ from bms_estimator.model.sample import SampleBlock
 
 BLOCK_S = 600.0
 """Duration over which innovations are summed: model errors of this duration disturb the SOC."""
-WHOLE = 0.5
+MIN_UPDATES_OF_BLOCK = 0.5
 """Minimum number of updates of a block, as a fraction of the fullest block."""
 
 
@@ -33,22 +33,22 @@ class Run:
         """Return the mean of (sum of innovations)^2 / (sum of their variances S) over blocks of ten minutes, from
         ``after_s`` on."""
         elapsed_s = self.time_s - self.time_s[0] - after_s
-        judged = self.updated & (elapsed_s >= 0.0)
-        block = (elapsed_s[judged] / BLOCK_S).astype(int)
-        total_v, total_v2 = (np.bincount(block, x[judged]) for x in (self.innovation_v, self.variance_v2))
+        scored = self.updated & (elapsed_s >= 0.0)
+        block = (elapsed_s[scored] / BLOCK_S).astype(int)
+        total_v, total_v2 = (np.bincount(block, x[scored]) for x in (self.innovation_v, self.variance_v2))
         count = np.bincount(block)
-        whole = count >= WHOLE * count.max()
-        return float(np.mean(total_v[whole] ** 2 / total_v2[whole]))
+        is_whole = count >= MIN_UPDATES_OF_BLOCK * count.max()
+        return float(np.mean(total_v[is_whole] ** 2 / total_v2[is_whole]))
 
 
 def run_of(estimator: Estimator, samples: SampleBlock) -> Run:
     """Run the estimator over all samples."""
     f, p = estimator.record["filter"], estimator.settings_record[0]["filter"]
     soc, innovation_v, variance_v2 = (f[n] for n in ("soc", "innovation_v", "innovation_variance"))
-    gathered = f["window"]["samples"]
-    out = np.zeros((samples.size, 5))
+    samples_of_window = f["window"]["samples"]
+    rows = np.zeros((samples.size, 5))
     for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
         verdict = estimator.step(time_s, current_a, voltage_v, status, temperature_c)
-        updated = verdict is SampleOutcome.ACCEPTED and gathered[0] == 0
-        out[n] = soc[0], weakest_cell_soc_std(f[0], p), innovation_v[0], variance_v2[0], updated
-    return Run(samples["time_s"], *out[:, :4].T, updated=out[:, 4] == 1.0)
+        updated = verdict is SampleOutcome.ACCEPTED and samples_of_window[0] == 0
+        rows[n] = soc[0], weakest_cell_soc_std(f[0], p), innovation_v[0], variance_v2[0], updated
+    return Run(samples["time_s"], *rows[:, :4].T, updated=rows[:, 4] == 1.0)

@@ -7,14 +7,14 @@ import numpy as np
 from bms_estimator.model.arrays import Floats
 
 MAX_S = 60.0
-"""Maximum weight of a pause between two samples [s]."""
+"""Maximum weight of the time between two samples [s]."""
 LOWEST_SOC = 0.05
 MIN_ROWS = 10
 
 
 @dataclass(frozen=True)
 class Score:
-    """Scores of one run, weighted by time. All but ``nees`` in percent of SOC, or of the time."""
+    """Scores of one run, weighted by time. All except ``nees`` are in percent of SOC or of the time."""
 
     rmse: float
     bias: float
@@ -23,8 +23,10 @@ class Score:
     std: float
     """Mean of soc_std [%]."""
     score: float
-    """Interval score of soc +- 2 soc_std as a 95 % interval: width plus 40 times the distance of the true SOC outside
-    (Gneiting and Raftery 2007, eq. 43)."""
+    """Interval score of soc +- 2 soc_std as a 95 % interval, by Gneiting and Raftery (2007), equation 43.
+
+    It is the width plus 40 times the distance of a true SOC outside.
+    """
     nees: float
     """Mean of (error / soc_std)^2; 1 for a correct std."""
 

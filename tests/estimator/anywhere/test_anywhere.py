@@ -71,23 +71,23 @@ def test_the_summary_is_as_checked_in(table) -> None:
     expected = read()
     assert {(r.case, r.wrong) for r in table} == set(expected)
     changes = [
-        f"{r.case} {r.wrong:+.1f} {name}: {now:.3f}, was {was:.2f}"
+        f"{r.case} {r.wrong:+.1f} {name}: {value:.3f}, was {expected_value:.2f}"
         for r in table
-        for name, now, was in zip(HEAD[2:], numbers(r), expected[r.case, r.wrong], strict=True)
-        if not abs(now - was) <= LAST_DIGITS
+        for name, value, expected_value in zip(HEAD[2:], numbers(r), expected[r.case, r.wrong], strict=True)
+        if not abs(value - expected_value) <= LAST_DIGITS
     ]
     assert not changes, "\n".join(["python -m tests.estimator.anywhere writes the summary anew", *changes])
 
 
 @pytest.mark.parametrize("case", LIMITS)
 def test_the_soc_error_coverage_and_std_are_within_their_limits(table, case: str) -> None:
-    most, cover, std = LIMITS[case]
-    both = [r.score for r in table if r.case == case]
-    assert len(both) == 2
-    for score in both:
-        assert most is None or score.rmse <= most
-        assert score.cover >= cover
-        assert score.std <= std
+    max_rmse, min_cover, max_std = LIMITS[case]
+    scores = [r.score for r in table if r.case == case]
+    assert len(scores) == 2
+    for score in scores:
+        assert max_rmse is None or score.rmse <= max_rmse
+        assert score.cover >= min_cover
+        assert score.std <= max_std
 
 
 @pytest.mark.parametrize("case", ["capacity +20%", "capacity -20%"])

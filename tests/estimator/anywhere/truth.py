@@ -32,8 +32,10 @@ GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 TAPER_C = 0.05
 """Current at which a charger ends its charge [C]."""
 LOOPS_SOC, FAST_LOOP = (0.015, 0.15), 0.6
-"""Charge constants of the fast and the slow hysteresis [SOC], and share of the fast one. Both are stop operators (Prandtl),
-so that regeneration moves the hysteresis only by its own charge."""
+"""Charge constants of the fast and the slow hysteresis [SOC], and fraction of the fast one.
+
+Both are stop operators (Prandtl), so that regeneration moves the hysteresis only by its own charge.
+"""
 
 
 @dataclass(frozen=True)
@@ -73,10 +75,11 @@ def simulate(
     low_v=-math.inf,
     high_v=math.inf,
 ):
-    """Terminal voltage [V] and SOC at each sample, from rest; the current holds until the next sample.
+    """Return terminal voltage [V] and SOC at each sample, from rest. A current is constant until the next sample.
 
-    A loss of 1 W warms the cell by ``warms_k`` above ``room_c``, in the end. A charger holds ``high_v`` [V] and stops at C/20;
-    a protection ends the discharge below ``low_v`` [V]. ``current_a`` [A] is written: the current that flowed.
+    A constant loss of 1 W finally warms the cell by ``warms_k`` above ``room_c``. A charger limits the voltage to ``high_v`` [V]
+    and stops at C/20. A protection ends the discharge below ``low_v`` [V]. The function writes the current that flowed to
+    ``current_a`` [A].
     """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
     x, fast, slow, rise_k = np.zeros(len(TAU_S)), branch, branch, 0.0

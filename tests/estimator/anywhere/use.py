@@ -5,6 +5,7 @@ import numpy as np
 from bms_estimator.model.arrays import Floats
 
 LEVEL_S = 20.0
+"""Mean duration of a level of the current [s]."""
 DAY_S = 86400
 
 
@@ -16,7 +17,7 @@ def drive(rng: np.random.Generator, one_c: float, mean_c: float, seconds: int) -
 
 
 def charge(one_c: float, rate_c: float, soc: float) -> Floats:
-    """Return the charge current by ``soc``."""
+    """Return the current at ``rate_c`` that increases the SOC by ``soc`` [A]."""
     return np.full(round(3600.0 * soc / rate_c), -rate_c * one_c)
 
 
