@@ -101,7 +101,7 @@ def test_t_int_is_after_the_settling_of_the_parameters():
     a[:, 4] += 10.0 * np.exp(-TIME_S / 20.0)
     window = find_window(a=a)
     assert window.t_int_s == pytest.approx(20.0 * np.log(1e4), abs=1.5)  # within 0.1 % of the median
-    assert "every a_i is within 0.1 % of its median" in window.start_reason
+    assert "every later a_i is within 0.1 % of its median" in window.start_reason
 
 
 def test_an_error_that_never_settles_leaves_no_window():
