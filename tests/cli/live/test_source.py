@@ -47,7 +47,7 @@ def test_port_option_is_rejected_without_a_serial_source(command, options, pack,
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('profile = "opendtu"', "source.url: missing, and there is no [mqtt] whose broker could be meant"),
+        ('profile = "opendtu"', "source.url: missing, and there is no section [mqtt] with a broker to use instead"),
         ('profile = "opendtu"\nurl = "mqtt://a"\npassword_file = "/none"', "password_file = /none: cannot be read"),
         ('profile = "opendtu"\nurl = "http://a"', "source.url = 'http://a': must be mqtt://host:port"),
         ('profile = "open"', "source.profile = 'open': "),
