@@ -93,7 +93,7 @@ def test_wrong_sign_is_detected(capsys, capture):
         ("lto", "rests, at 3.322..4.160 V, are beyond the curve of the cell, 1.500..2.700 V: check the cell file"),
         (
             "lfp",
-            "0.02 of SOC apart, the charge between them is 0.90 of the declared capacity: is the curve this cell's",
+            "0.02 of SOC apart, the charge between them is 0.90 of the declared capacity: check the curve of the cell file",
         ),
         ("lmo", "anchors disagree by 5.3 times their expected errors: check the curve of the cell file"),
     ],
