@@ -1,4 +1,4 @@
-"""``alarms``: its result for a capture; ``config check`` of limits."""
+"""``alarms``: raised alarms of a capture. ``config``: check and display of the limits."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ def pack(tmp_path: Path) -> Path:
     return file
 
 
-def test_lists_raised_alarms_with_times_and_values(
+def test_raised_alarms_are_listed_with_their_times(
     tmp_path: Path, pack: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = [Line(30), Line(10, voltage_v=8.6), Line(30), Line(20, temperature_c=61.0), Line(80)]
@@ -25,14 +25,14 @@ def test_lists_raised_alarms_with_times_and_values(
         file.write("over_temperature = {delay_s = 5}\nhook = [{run = ['/none/such']}]\n")
     code, out, _ = run(capsys, "alarms", capture, "--pack", pack, "--json")
     assert code == 0
-    found = json.loads(out)
-    times = {each["alarm"]: (each["raised_s"], each["ended_s"], each["latched"]) for each in found["raised"]}
+    result = json.loads(out)
+    times = {each["alarm"]: (each["raised_s"], each["ended_s"], each["latched"]) for each in result["raised"]}
     assert times == {
         "pack_over_voltage": (pytest.approx(32.0), None, True),
         "over_temperature": (pytest.approx(75.0), pytest.approx(150.0), False),
     }
-    assert found["unmeasured"] == ["cell_over_voltage", "cell_under_voltage", "cell_imbalance"]
-    assert "discharge_over_current" in found["quiet"]
+    assert result["unmeasured"] == ["cell_over_voltage", "cell_under_voltage", "cell_imbalance"]
+    assert "discharge_over_current" in result["quiet"]
     code, out, _ = run(capsys, "alarms", capture, "--pack", pack)
     assert code == 0
     assert "over_temperature" in out
@@ -59,8 +59,8 @@ def test_check_reports_invalid_limits(
 ) -> None:
     with pack.open("a") as file:
         file.write(alarms)
-    ended, out, err = run(capsys, "config", "check", pack)
-    assert ended == code
+    exit_code, out, err = run(capsys, "config", "check", pack)
+    assert exit_code == code
     assert message in err
     assert ("good" in out) == (code == 0)
 

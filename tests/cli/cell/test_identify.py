@@ -1,3 +1,5 @@
+"""``identify`` and ``validate``: identified cell files, their validation, and errors of unusable captures."""
+
 import json
 
 import numpy as np
@@ -33,21 +35,21 @@ def tables(tmp_path_factory):
 def test_identify_writes_a_cell_that_validates_on_another_capture(tables, tmp_path, capsys):
     out = tmp_path / "mine.toml"
     code, text, _ = run(capsys, "identify", tables / "steps0.csv", "--cell", "ncr18650", "--out", out, "--json")
-    found = json.loads(text)
+    result = json.loads(text)
     assert code == 0
-    assert found["elements"][1]["soc"] == 0.5
-    assert {"r_s_ohm", "r_s_ohm_std", "r_tl_ohm"} <= set(found["elements"][1])
-    assert found["temperature_c"] == [25.0, 25.0]
-    assert found["captures"][0]["initial_soc"] == pytest.approx(0.98, abs=0.005)
-    assert found["captures"][0]["temperature_c"] is None
-    assert found["captures"][0]["held_back"] is False
-    assert found["score_after_percent"] <= 1.05 * found["score_before_percent"]
-    assert {"left_out", "ocv_correction_rms_mv", "error_mv", "seconds"} <= set(found)
+    assert result["elements"][1]["soc"] == 0.5
+    assert {"r_s_ohm", "r_s_ohm_std", "r_tl_ohm"} <= set(result["elements"][1])
+    assert result["temperature_c"] == [25.0, 25.0]
+    assert result["captures"][0]["initial_soc"] == pytest.approx(0.98, abs=0.005)
+    assert result["captures"][0]["temperature_c"] is None
+    assert result["captures"][0]["held_back"] is False
+    assert result["score_after_percent"] <= 1.05 * result["score_before_percent"]
+    assert {"left_out", "ocv_correction_rms_mv", "error_mv", "seconds"} <= set(result)
 
     cell = load_cell(out)
     assert cell.cell.name == "mine"
     assert cell.ladder.temperature_c == (25.0, 25.0)
-    assert r_s(0.5, cell.a) == pytest.approx(found["elements"][1]["r_s_ohm"], rel=0.1)
+    assert r_s(0.5, cell.a) == pytest.approx(result["elements"][1]["r_s_ohm"], rel=0.1)
     code, text, err = run(capsys, "validate", tables / "steps7.csv", "--cell", out, "--json")
     validated = json.loads(text)
     assert (code, err) == (0, "")
