@@ -64,7 +64,7 @@ def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
     arrival_s = 100.0
     header = make_header(settings().sensor)
     writer = CaptureWriter(path, header)
-    writer.write(arrival_s, b"\n")
+    writer.write(arrival_s, b"\n")  # the decoder skips all bytes up to the first end of a line
     for line in lines:
         for _ in range(round(line.seconds / period_s)):
             if not line.silent:

@@ -139,7 +139,7 @@ def open_circuit(f: Record, p: Record, e: Record, current_a: float, voltage_v: f
     x = f.mean[f.best]
     e_o = voltage_v + e.ohm[0] * (current_a - x[OFFSET])
     for k in range(BRANCHES):
-        # x_a: current through the resistor of a pair; X: its estimated deviation
+        # x_a: filtered current of a pair since switch-on; X: estimated remainder, due to the load before switch-on
         e_o += e.ohm[1 + k] * (f.x_a[k] + x[X + k])
     e_o -= f.hysteresis * on_grid(x[SOC], p.hysteresis_v) * x[HYST] + ocv_correction(p, x, x[SOC])
     return e_o - (f.temperature_c - REFERENCE_C) * on_grid(x[SOC], p.per_kelvin_v)

@@ -181,7 +181,7 @@ class SampleAssembler:
     def _remove(self, quantity: str, cell: int | None) -> None:
         """Remove the stored value of a quantity.
 
-        For ``cells``, remove the voltage of ``cell``, or of all cells if ``cell`` is None.
+        For ``cells``, remove the voltage of ``cell``, or of all cells without ``cell``.
         """
         self._values.pop(quantity, None)
         self._unused.pop(quantity, None)

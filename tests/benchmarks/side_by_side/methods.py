@@ -175,7 +175,7 @@ class Observed(Elements):
     def _restart_from_learned(self, soc: float) -> Estimator:
         self._estimator.record[:] = self._saved
         self._estimator.set_soc(soc)
-        self._estimator.resume(np.inf)  # the time between the capture of the learning and the next one is unknown
+        self._estimator.resume(np.inf)  # the time since the learned capture is unknown
         return self._estimator
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:

@@ -101,6 +101,7 @@ def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
 
 @pytest.mark.parametrize("fit", [fit_chen_mora, fit_table])
 def test_too_few_points_or_too_small_a_span_are_rejected_with_their_numbers(fit):
+    """Both fits use ``check_points``, whose minimum is the number of parameters of (2.10)."""
     with pytest.raises(UserError, match=r"5 points of the open-circuit voltage; \(2.10\) has 6 parameters"):
         fit(make_points(np.linspace(0.0, 1.0, 5), np.linspace(3.4, 4.1, 5)))
     with pytest.raises(UserError, match=r"points span SOC 0.50 to 0.70 only"):

@@ -70,7 +70,7 @@ async def tcp_device(
     """Run a device behind a gateway at 127.0.0.1. The gateway rejects requests to other units."""
     others = Registers()
     others.refusal = ExcCodes.GATEWAY_NO_RESPONSE
-    devices = [registers.device(unit), others.device(0)]
+    devices = [registers.device(unit), others.device(0)]  # pymodbus uses device 0 for all undefined units
     server = ModbusTcpServer(devices, framer=framer, address=("127.0.0.1", port))
     await server.serve_forever(background=True)
     try:
