@@ -44,8 +44,9 @@ def test_an_estimator_identifies_by_default():
     assert not bms_estimator.Estimator(cell, identifier=None).identifying
 
 
-def test_a_table_in_memory_is_a_capture_with_the_errors_of_a_file(data):
+def test_load_capture_accepts_a_table_and_rejects_it_like_a_file(data):
     capture = bms_estimator.load_capture(data / "lgm50" / "rate_0p5c_25c.csv.gz")
+    # the test of the documentation imports pandas if it is installed; otherwise a dict is the table
     from_table = bms_estimator.load_capture(capture.to_pandas() if "pandas" in sys.modules else dict(capture))
     assert np.array_equal(from_table.rows, capture.rows)
     bdf = {

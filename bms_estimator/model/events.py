@@ -52,14 +52,16 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
     health = snapshot.health
     if before is None:
         started = _EventText("start", f"checkpoint: {health.checkpoint}")
+        # at the start ``health.unseen_s`` is the gap between the runs; None: no gap, or an unknown length
         found = [started, *_unseen(health.unseen_s or 0.0), *_sensor(None, health)]
-        found += [*_suspicions([], health.suspects), *_checkpoint("", health)]
+        found += [*_input_faults([], health.suspects), *_checkpoint("", health)]
     elif before.health is health:
         found = []
     else:
         was = before.health
+        # the total counts all gaps since the previous snapshot; ``health.unseen_s`` is only the last gap
         unseen = _unseen(health.total.unseen_s - was.total.unseen_s)
-        found = [*unseen, *_sensor(was, health), *_suspicions(was.suspects, health.suspects)]
+        found = [*unseen, *_sensor(was, health), *_input_faults(was.suspects, health.suspects)]
         found += _checkpoint(was.checkpoint, health)
     of_health = [Event(time=health.publish_time, name=name, text=text) for name, text in found]
     seen = snapshot.estimate.publish_time if snapshot.estimate else health.publish_time
@@ -106,8 +108,8 @@ def _sensor(was: Health | None, health: Health) -> Iterator[_EventText]:
         yield _EventText("sensor_offline", health.sensor_message or "")
 
 
-def _suspicions(was: list[str], now: list[str]) -> Iterator[_EventText]:
-    """Yield diagnostics that began and ended. The numbers in a diagnostic may change without an event."""
+def _input_faults(was: list[str], now: list[str]) -> Iterator[_EventText]:
+    """Yield input faults that began and ended. The numbers in a fault's text may change without an event."""
     before, after = ({_kind(sentence): sentence for sentence in sentences} for sentences in (was, now))
     for kind, sentence in after.items():
         if kind not in before:
@@ -118,8 +120,8 @@ def _suspicions(was: list[str], now: list[str]) -> Iterator[_EventText]:
 
 
 def _kind(sentence: str) -> str:
-    """Return the constant part of a diagnostic's text."""
-    return next((suspect.text for suspect in InputFault if sentence.endswith(suspect.text)), sentence)
+    """Return the constant part of an input fault's text."""
+    return next((fault.text for fault in InputFault if sentence.endswith(fault.text)), sentence)
 
 
 def _checkpoint(was: str, health: Health) -> Iterator[_EventText]:

@@ -62,6 +62,7 @@ class DeniedTopics:
                 delay_s = self._backoff.next_s()
                 self._resend_timer = asyncio.get_running_loop().call_later(delay_s, self._resend)
             return
+        # An accepted message does not allow a denied topic: the denial may concern reading
         if message.topic in self._temporarily_denied:
             del self._temporarily_denied[message.topic]
             self._update_stats()

@@ -12,8 +12,9 @@ CREDENTIALS = Path("/run/credentials")
 class SystemdNotifier:
     """Sender of states to the socket of ``NOTIFY_SOCKET``. It does nothing without the variable.
 
-    One process may serve several packs, but is a single service for systemd. A state is therefore sent when all packs have
-    reported it since it was last sent: the service is ready with its last pack, and alive while all packs are.
+    One process may serve several packs, but is a single service for systemd. A state is therefore sent when
+    every pack has reported it. Afterwards every pack must report it again. As a result the service is ready when the last
+    pack is ready, and the watchdog is triggered only while all packs are alive.
 
     Args:
         packs: Names of the packs.
@@ -35,7 +36,7 @@ class SystemdNotifier:
 
     def ready(self, pack: str) -> None:
         """Report that the pack's loop runs."""
-        self._send_with_last(pack, "READY=1", f"\n{self._status}")
+        self._send_once_all_reported(pack, "READY=1", f"\n{self._status}")
 
     def status(self, pack: str, text: str) -> None:
         """Set the pack's status text for ``systemctl status``."""
@@ -44,18 +45,18 @@ class SystemdNotifier:
 
     def alive(self, pack: str) -> None:
         """Report that the pack's loop is alive."""
-        self._send_with_last(pack, "WATCHDOG=1")
+        self._send_once_all_reported(pack, "WATCHDOG=1")
 
     def stopping(self, pack: str) -> None:
         """Report that the pack's loop has ended."""
-        self._send_with_last(pack, "STOPPING=1")
+        self._send_once_all_reported(pack, "STOPPING=1")
 
     @property
     def _status(self) -> str:
         packs = (f"{pack}: {text}" if text else pack for pack, text in sorted(self._texts.items()))
         return f"STATUS={self._activity} {', '.join(packs)}"
 
-    def _send_with_last(self, pack: str, state: str, more: str = "") -> None:
+    def _send_once_all_reported(self, pack: str, state: str, more: str = "") -> None:
         awaited = self._awaited.setdefault(state, set(self._packs))
         awaited.discard(pack)
         if not awaited:
@@ -81,6 +82,9 @@ def credential(name: Path) -> Path:
 
 
 def is_for_the_service(name: Path) -> bool:
-    """Return True for a systemd credential, by name or path, that is not readable here but may be for the service."""
+    """Return True if ``name`` is the name or path of a systemd credential that this process cannot read.
+
+    The service may be able to read it.
+    """
     named = not name.is_absolute() or name.is_relative_to(CREDENTIALS)
     return named and not os.access(credential(name), os.R_OK)

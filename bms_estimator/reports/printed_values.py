@@ -58,9 +58,9 @@ TABLE_3 = (
 TABLE_3_ERROR = (0, 2.13, 0, 10.3, 0.34, 0, 0.0822, 4.755, 0.0879, 0.00991, 2.289, 0.0134, 0, 2.575, 0)
 """Errors of a1..a15, scheme 2 [%]."""
 TABLE_3_SHIFT = 0.6182
-"""Common change of the parameters that scheme 2 does not pull back."""
+"""Change of each parameter outside ``SMALL`` in scheme 2. All these parameters change by one value."""
 SMALL = (1, 3, 6, 13, 15)
-"""Indices of the small parameters, the set q of the thesis. Schemes 2 and 3 pull them back."""
+"""Indices of the small parameters, the set q of the thesis. Scheme 2 returns them to their initial values, scheme 3 to limits."""
 
 TABLE_4 = {
     1: (0.30, 0.25, 0.2946, 0.3208, 8.16),
@@ -87,11 +87,11 @@ BOUNDS = {
     11: (50.0, 5.0, 50.0, 50.0),
     12: (5000.0, 3000.0, 10.0, 20.0),
 }
-"""Upper bound, lower bound, lambda_x and lambda_y of Tables 5 and 10 by index, as printed (a8: E4)."""
+"""Upper bound, lower bound, lambda_x and lambda_y of Tables 5 and 10 by index, as printed (a8: erratum 4)."""
 A8_WEIGHTS = (10.0, 20.0)
 """Weights that belong to the printed estimates of a8 (erratum 4)."""
 A5 = 150.0
-"""a5 of Table 10, printed as 30 (E5)."""
+"""a5 of Table 10, printed as 30 (erratum 5)."""
 
 TABLE_5 = {
     1: (180.0, 0.5555, 0.3208, 42.25),
@@ -171,12 +171,15 @@ INFERRED_WEIGHTS = {
     "5": {7: (196.0, 182.0), 8: (15.0, 30.0), 10: (20.0, 20.0), 11: (150.0, 150.0), 12: (50.0, 100.0)},
     "10": {4: (70.0, 50.0), 7: (70.0, 65.0), 8: A8_WEIGHTS},
 }
-"""Weights by table and index that give the printed estimate, if the printed weights do not (E4, E24, E32)."""
+"""Weights by table and index that give the printed estimate, if the printed weights do not (errata 4, 24, 32)."""
 START_MEAN_S = {"5": 328.3, "10": 36_000.0}
 """Durations from the first sample over which the means (3.19) equal the printed estimates of Tables 5 and 10 [s]."""
 FREE_PARAMETERS = {"5": 8, "10": 7}
-"""Number of parameters fitted to the estimates of Tables 5 and 10: the time ``START_MEAN_S``, the sum of each pair in
-``INFERRED_WEIGHTS``, and its ratio unless that is printed (a10 to a12 of Table 5)."""
+"""Number of parameters fitted to the estimates of Tables 5 and 10.
+
+The fitted parameters are the time ``START_MEAN_S``, the sum of each pair in ``INFERRED_WEIGHTS``, and the ratio of each pair
+whose ratio differs from the printed one: 1 + 5 + 2 for Table 5, 1 + 3 + 3 for Table 10.
+"""
 DECIMALS_5 = {1: 4, 2: 4, 3: 4, 4: 4, 5: 4, 6: 4, 7: 4, 8: 4, 9: 2, 10: 1, 11: 4, 12: 1}
 """Decimals of the estimates of Table 5."""
 
@@ -194,8 +197,12 @@ def initial(table: str, index: int) -> float:
 
 
 def mean_from_start(table: str, index: int) -> float:
-    """Return the mean (3.19) of (3.18) over the first ``START_MEAN_S`` of Table 5 or 10 at e = 0: integral of (4.5)."""
+    """Return the mean (3.19) of a_i(t) over the first ``START_MEAN_S`` of Table 5 or 10 at e = 0.
+
+    At e = 0, a_i(t) is the exponential (4.5) from the initial value to the limit.
+    """
     b = bounds(table, index)
+    # the factor 1 - e^(-rate T) of the mean is 1, because rate T is above 10^4
     return b.limit + (initial(table, index) - b.limit) / (b.rate * START_MEAN_S[table])
 
 

@@ -47,14 +47,16 @@ class BrokerSettings(Strict):
     username: str | None = None
     password_file: Path | None = Field(
         default=None,
-        description="file with the password; a name without folder: a systemd credential",
+        description="file with the password; a name without a folder is a systemd credential",
     )
     ca_file: Path | None = Field(default=None, description="certificate authority for mqtts; default: the system's")
     cert_file: Path | None = Field(
-        default=None, description="client certificate for mqtts, PEM, if the broker requires one; as password_file"
+        default=None,
+        description="PEM file with the client certificate for mqtts, if the broker requires one; a name without a folder is a systemd credential",
     )
     key_file: Path | None = Field(
-        default=None, description="key of cert_file, PEM, not encrypted; default: in cert_file; as password_file"
+        default=None,
+        description="PEM file with the unencrypted key of cert_file; default: cert_file; a name without a folder is a systemd credential",
     )
 
     @property

@@ -46,7 +46,7 @@ class ServerSettings(Strict):
     )
     sync_s: Annotated[float, Field(ge=0, le=3600)] = Field(
         default=10.0,
-        description="interval between fsyncs, whose data a power cut may lose if no other node has them; 0: fsync each message",
+        description="interval between fsyncs; a power cut may lose later messages unless another node has them; 0: fsync each message",
     )
 
     @model_validator(mode="after")
@@ -60,11 +60,14 @@ class TlsSettings(Strict):
     """Certificates for all ports but the monitor's, PEM."""
 
     cert_file: Path = Field(
-        description="server certificate with its intermediate certificates; a name without folder: a systemd credential"
+        description="server certificate with its intermediate certificates; a name without a folder is a systemd credential"
     )
-    key_file: Path = Field(description="private key of cert_file, not encrypted; as cert_file")
+    key_file: Path = Field(
+        description="unencrypted private key of cert_file; a name without a folder is a systemd credential"
+    )
     ca_file: Path | None = Field(
-        default=None, description="authority of the nodes' certificates in a cluster; as cert_file"
+        default=None,
+        description="authority of the nodes' certificates in a cluster; a name without a folder is a systemd credential",
     )
 
 
@@ -81,7 +84,8 @@ class TenantSettings(Strict):
         default=None, description="maximum size of all streams of the tenant, including replicas; default: no limit"
     )
     revoked: dict[DeviceName, AwareDatetime] = Field(
-        default={}, description="times by pack before which its tokens are rejected, for example after a theft"
+        default={},
+        description="time for each pack; tokens of the pack that were issued earlier are rejected, for example after a theft",
     )
 
 
@@ -119,6 +123,6 @@ class FleetSettings(Strict):
 
 
 def reachable(listen: str) -> Listen:
-    """Return the address at which a program on this machine reaches the listener."""
+    """Return the address at which clients on this machine connect to the listener."""
     host, port = parse_listen(listen)
     return Listen({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), port)  # noqa: S104 - the server's address

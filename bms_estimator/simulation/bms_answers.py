@@ -67,7 +67,7 @@ def _daly_status(measured: Measured) -> bytes:
 
 def _daly_cells(measured: Measured) -> bytes:
     steps = [_u16(v, 1000) for v in measured.cells_v] + [0, 0]
-    frames = range(math.ceil(len(measured.cells_v) / daly.CELLS_A_FRAME))
+    frames = range(math.ceil(len(measured.cells_v) / daly.CELLS_PER_FRAME))
     return b"".join(_daly(daly.CELLS, struct.pack(">B3H", i + 1, *steps[3 * i : 3 * i + 3])) for i in frames)
 
 

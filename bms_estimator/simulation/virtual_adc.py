@@ -14,7 +14,7 @@ CLOCK_HZ = 16_000_000
 AUX_PER_S = 100
 """NTC and bandgap readings of the firmware per second, if the sample rate allows."""
 AUX_MAX = 63
-"""Maximum number of NTC or bandgap readings in one window."""
+"""Maximum number of NTC or bandgap readings in one window, because the firmware sends their sum in 16 bits."""
 SLOTS_PER_S = 8000
 """Conversions of the firmware per second, alternately of voltage and current."""
 RATIOMETRIC_V = 5.0

@@ -1,12 +1,16 @@
-"""Fraction of SOCs within 2 std by later estimates (`fleet ask honest`) and by the true SOC, for docs/fleet/questions.md.
+"""Interval coverage of SOC estimates, relative to later estimates and to the true SOC, for docs/fleet/questions.md.
 
-The captures last hours. Therefore six minutes replace an hour. The estimator starts as in `make anywhere`, and each run is a
-pack. Columns of the table:
+An estimate is covered if it differs by at most 2 std from the reference. The reference of `fleet ask honest` is a later
+estimate with a smaller std.
 
-- hindsight: fraction within 2 std by `honest`
-- truth, there: fraction within 2 std by the true SOC, of the estimates that have a more certain later one
-- truth, all: fraction within 2 std by the true SOC, of all estimates
-- offset: mean of error over std of the estimates of "truth, there", a common error that later estimates cannot show
+The captures last only a few hours. Therefore a slot of six minutes replaces an hour of the fleet. The estimator starts at
+the points of a capture at which `make anywhere` starts. Each run counts as a pack. Columns of the table:
+
+- judged: number of estimates that `honest` compares
+- hindsight: fraction of these estimates that a later estimate covers
+- truth, there: fraction that the true SOC covers, of the estimates that have a more certain later one
+- truth, all: fraction that the true SOC covers, of all estimates
+- offset: mean of error over std of the estimates of "truth, there". Later estimates have the same error, and cannot show it
 """
 
 import sys
@@ -31,6 +35,9 @@ from bms_estimator.settings.pack import PackSettings
 from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
 
 SLOT_S = 360.0
+"""Duration of a slot [s]."""
+MIN_SEEN_FRACTION = 0.97
+"""Minimum fraction of a slot with samples. A slot may lack 11 s; an hour of the fleet may lack 10 s."""
 LATER = (1, 3, 6, 12, 24)
 """Distances of the later estimates with which `honest` compares [slots]."""
 STORE_ID = 10**9
@@ -39,7 +46,7 @@ STORE_ID = 10**9
 
 def limits(slot_s: float = SLOT_S) -> Limits:
     """Return the limits with slots in place of hours."""
-    return replace(LIMITS, least_seen_s=0.97 * slot_s)
+    return replace(LIMITS, least_seen_s=MIN_SEEN_FRACTION * slot_s)
 
 
 class SlotEstimate(NamedTuple):
@@ -105,7 +112,9 @@ def slots(
         if first == end:
             continue
         begin(sums, estimator.record[0])
-        add(sums, estimator.run(samples[first:end]), Block(STORE_ID, 1, 1, 0.0, samples[first:end]), estimator)
+        # ``add`` uses only store and samples of a block
+        block = Block(store=STORE_ID, number=1, oldest=1, arrival_s=0.0, samples=samples[first:end])
+        add(sums, estimator.run(block.samples), block, estimator)
         hour = row(PackSettings(name=pack, cell=cell.cell.name[:30]), slot, sums, estimator)
         if hour.soc is not None and hour.soc_mean_std:
             estimates.append(SlotEstimate(hour, hour.soc - float(truth[end - 1])))

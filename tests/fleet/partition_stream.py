@@ -17,10 +17,12 @@ SAMPLES = 20
 
 
 def table(pack: str):
+    """Return settings and cell of a pack; None for an unknown pack."""
     return None if pack.startswith("unknown") else (SETTINGS, CELL)
 
 
 def one_block(samples: SampleBlock, number: int, store: int = STORE_ID_NS, oldest: int = 1) -> bytes:
+    # some tests send samples without a finite time
     arrival_s = store / 1e9 + float(np.nan_to_num(samples["time_s"][-1]))
     return encode(Block(store=store, number=number, oldest=oldest, arrival_s=arrival_s, samples=samples))
 

@@ -110,7 +110,7 @@ def test_later_version_and_unknown_protocol_are_reported(tmp_path: Path) -> None
     with pytest.raises(UserError, match=r"new\.bms: version 2, this program reads version 1"):
         read_header(path)
     path = write_header(path, json.dumps({"version": 1, "mode": "modbus", "more": [1]}).encode())
-    with pytest.raises(UserError, match=r"new\.bms: recorded from mode 'modbus'"):
+    with pytest.raises(UserError, match=r"new\.bms: recorded with mode 'modbus'"):
         open_capture(path)
 
 

@@ -73,9 +73,11 @@ async def test_no_charge_is_counted_over_a_gap(path):
     assert sum(row.seen_s for row in rows(path)) == 2.0
 
 
-async def test_source_with_a_period_of_one_minute_has_no_gaps(path):
+async def test_source_with_a_period_of_one_minute_has_no_gaps_after_the_first_interval(path):
     await record(path, [at(60.0 * i, 6.0) for i in range(11)])
-    assert sum(row.charge_out_ah for row in rows(path)) == pytest.approx(0.9)  # the first interval counts as a gap
+    assert sum(row.charge_out_ah for row in rows(path)) == pytest.approx(
+        0.9
+    )  # the first interval counts as a gap: no previous interval shows the period
 
 
 async def test_restarted_service_merges_rows_of_one_minute(path):
@@ -88,7 +90,7 @@ async def test_restarted_service_merges_rows_of_one_minute(path):
     await record(path, snapshots[25:])
     [row], [expected] = rows(path), rows(path.with_name("whole.sqlite"))
     lost_ah = 2.5 / 3600  # charge of the second between the two runs
-    # means are weighted by all publications of a run, also by those without a temperature
+    # The mean of each run has its number of publications as weight, although half of them have no temperature
     assert row.temperature_c == pytest.approx(expected.temperature_c, abs=0.5)
     assert row._replace(temperature_c=None) == pytest.approx(
         expected._replace(
@@ -169,6 +171,7 @@ async def test_rows_wait_while_the_disk_fails(path):
     path.mkdir()
     (path / "file").touch()
     async with Database(path, retry_s=0.0) as database, History(database, days=366) as history:
+        # otherwise the folder at the path would be renamed
         database._file._quarantine_symlink = leave_in_place  # type: ignore[method-assign]
         history.publish(at(0.0))
         history.publish(at(60.0))
@@ -215,6 +218,7 @@ async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path):
         database.remaining = 2
         for second in range(0, 190, 10):
             history.publish(at(float(second)))
+            # each ended minute is one transaction, and two of them report a failure
             async with asyncio.timeout(LONG_S):
                 while database.remaining > max(2 - second // 60, 0):  # noqa: ASYNC110 - it has no event
                     await asyncio.sleep(0.001)
@@ -242,6 +246,7 @@ async def test_failed_vacuum_does_not_undo_a_transaction(path, monkeypatch):
 
     monkeypatch.setattr(database_module, "_trim", fail)
     async with Database(path, retry_s=0.0) as database:
+        # ``and None``: a cursor must not leave the thread of the database
         await database.call(lambda connection: connection.execute("DELETE FROM minute") and None)
         assert not database.reason
 

@@ -24,7 +24,7 @@ PACK = load_cell("nmc", 10.0).pack(2, 1)
 
 
 class Line(NamedTuple):
-    """Readings that the board prints for a number of seconds."""
+    """Constant readings that the board prints once per period for a number of seconds."""
 
     seconds: float
     voltage_v: float = 7.4
@@ -54,7 +54,7 @@ class ReplayResult:
         return [(round(change.at_s, 3), change.alarm.active) for change in changes]
 
     def watched(self, name: str) -> list[tuple[float, bool]]:
-        """Return the times at which an alarm could be watched again (True) and no longer (False), in seconds of the capture."""
+        """Return the times at which an alarm became watched (True) or unwatched (False), in seconds of the capture."""
         changes = [change for change in self.changes if change.alarm.name == name and change.field == "watched"]
         return [(round(change.at_s, 3), change.alarm.watched) for change in changes]
 
@@ -64,7 +64,7 @@ def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
     arrival_s = 100.0
     header = make_header(settings().sensor)
     writer = CaptureWriter(path, header)
-    writer.write(arrival_s, b"\n")
+    writer.write(arrival_s, b"\n")  # the decoder skips all bytes up to the first end of a line
     for line in lines:
         for _ in range(round(line.seconds / period_s)):
             if not line.silent:

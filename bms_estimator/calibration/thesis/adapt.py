@@ -35,7 +35,7 @@ class AdaptedCapture:
         voltage_rms_v: RMS error of the voltage, open loop, above SOC 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN for a capture that is too short.
         score_after: Interval score with the adapted cell [%].
-        held_back: True if ``score_after`` is of a cell adapted without this capture.
+        held_back: True if ``score_after`` is that of a cell adapted to the other captures only.
     """
 
     name: str
@@ -78,18 +78,22 @@ def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = N
     Raises:
         UserError: A capture contradicts the cell, a1..a15 cannot be estimated, or replays get worse.
     """
-    loads = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
-    socs = [initial_soc(load, cell) if soc is None else soc for load in loads]
+    cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
+    socs = [initial_soc(load, cell) if soc is None else soc for load in cleaned]
     found = [
-        line for load, start in zip(loads, socs, strict=True) for line in capture_contradictions(load, cell, start)
+        line
+        for load, start_soc in zip(cleaned, socs, strict=True)
+        for line in capture_contradictions(load, cell, start_soc)
     ]
     if found:
         raise UserError("\n".join(found))
+    # the model is run over all samples without glitches; ``clean_capture`` removes further samples
     starts = [
-        Start(remove_glitches(capture.rows, capture.name), start) for capture, start in zip(captures, socs, strict=True)
+        Start(remove_glitches(capture.rows, capture.name), start_soc)
+        for capture, start_soc in zip(captures, socs, strict=True)
     ]
     steps, adapted = _adapted_cell(cell, starts)
-    scored = tuple(_scored_capture(cell, adapted, loads, starts, j) for j in range(len(starts)))
+    scored = tuple(_scored_capture(cell, adapted, cleaned, starts, j) for j in range(len(starts)))
     before, after = (_geometric_mean([getattr(c, name) for c in scored]) for name in ("score_before", "score_after"))
     if after > EQUAL_SCORE_RATIO * before:
         raise UserError(
@@ -115,6 +119,7 @@ def _with_elements(cell: CellModel, steps: AdaptedElements, starts: Sequence[Sta
         update[name] = section.model_copy(update=dict(zip(keys, a[first : first + 3].tolist(), strict=True)))
     update["r_s"] = Resistance.model_validate(steps.r_s.element.model_dump())
     new = cell.model_copy(update=update | {"adaptation": {}, "ladder": None})
+    # each resistance is the sum of a part with weak and a part with strong temperature dependence
     ohm, weak = ladder_of_branches(new).T, weak_share(SOC_GRID)
     errors = np.concatenate([predict(new, s.samples, s.soc, lowest_soc=LOWEST_SOC).error_v for s in starts])
     ladder = Ladder(
@@ -129,12 +134,12 @@ def _with_elements(cell: CellModel, steps: AdaptedElements, starts: Sequence[Sta
 
 
 def _scored_capture(
-    cell: CellModel, adapted: CellModel, loads: list[CleanCapture], starts: list[Start], j: int
+    cell: CellModel, adapted: CellModel, cleaned: list[CleanCapture], starts: list[Start], j: int
 ) -> AdaptedCapture:
     """Return the scores of capture ``j``, by a cell adapted to the other captures if there are any."""
-    load, start = loads[j], starts[j]
+    load, start = cleaned[j], starts[j]
     others = [s for k, s in enumerate(starts) if k != j]
-    held_out = _adapted_cell(cell, others)[1] if others else adapted
+    adapted_to_others = _adapted_cell(cell, others)[1] if others else adapted
     soc = start.soc - load.discharged_ah / cell.cell.capacity_ah
     error_v = predict(adapted, start.samples, start.soc, lowest_soc=LOWEST_SOC).error_v
     return AdaptedCapture(
@@ -142,13 +147,13 @@ def _scored_capture(
         initial_soc=start.soc,
         voltage_rms_v=float(np.sqrt(np.mean(error_v**2))),
         score_before=interval_score(cell, load, soc),
-        score_after=interval_score(held_out, load, soc),
+        score_after=interval_score(adapted_to_others, load, soc),
         held_back=bool(others),
     )
 
 
 def _temperatures(starts: Sequence[Start]) -> tuple[float, float]:
-    """Return the lowest and highest temperature of the captures [C]; ``ROOM_C`` without a sensor."""
+    """Return the lowest and highest temperature of the captures [C]; the range ``ROOM_C`` without a sensor."""
     temperature_c = np.concatenate([s.samples["temperature_c"] for s in starts])
     known = temperature_c[np.isfinite(temperature_c)]
     return (float(known.min()), float(known.max())) if known.size else ROOM_C

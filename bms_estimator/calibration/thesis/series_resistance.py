@@ -2,12 +2,14 @@
 
 Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
 
-The thesis prints (4.2) with the opposite sign. Solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive. x2 and
-x3 are those of the model with frozen a1..a12. The observer's x2 and x3 would absorb i R_s, because (4.1) drives the
-estimated voltage to y.
+The thesis prints (4.2) with the opposite sign. Solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive:
+E_o is the open-circuit voltage, y the terminal voltage, i the current. x2 and x3, the voltages of both RC pairs, are simulated
+with frozen a1..a12. The observer's x2 and x3 cannot be used: they would contain i R_s, because the observer's output (4.1)
+follows y.
 
 (4.2) as printed divides by the current: an error of the open-circuit voltage of 10 mV becomes 65 mohm at C/20 and 2 mohm
-at 1.5C. A plain mean over the currents has equal weights for both values (erratum 19). Here R_s is fitted to i R_s by least squares, so
+at 1.5C. The thesis averages over the currents with equal weights, so that the value at C/20 has the weight of the value at 1.5C
+(erratum 19). Here R_s is fitted to i R_s by least squares, so
 that each value of (4.2) has its squared current as weight.
 """
 
@@ -26,7 +28,7 @@ from bms_estimator.model.errors import UserError
 LOWEST_SOC = 0.1
 """SOC below which (4.2) is not fitted, because real elements deviate from (2.5)-(2.9) there."""
 EXPONENTS = np.geomspace(2.0, 200.0, 200)
-"""Candidate exponents a14."""
+"""Candidate exponents a14. Over SOC an exponential with 2 is nearly a straight line; one with 200 decays within 0.02."""
 MIN_DETERMINANT = 1e-300
 """Lower limit of the determinant of the normal equations, against division by zero."""
 MIN_BINS = 5
@@ -40,7 +42,7 @@ class SeriesResistance:
     Attributes:
         soc: Mean SOC of the bin's samples, 0..1.
         r_s_ohm: R_s (4.2) of the bin, by least squares on the voltage [ohm].
-        weight: Mean of the current squared over the bin, summed over the loads [A^2].
+        weight: Mean of the squared current in the bin [A^2]; after ``mean_of`` the sum of these means over the captures.
     """
 
     soc: Floats
@@ -120,7 +122,7 @@ def _bins(soc: Floats) -> NDArray[np.int64]:
 
 
 def summed(record: np.void) -> SeriesResistance:
-    """Return R_s over SOC by the sums in an estimator's state, at the middle of each bin.
+    """Return R_s over SOC, at the middle of each bin, from the sums in an estimator's state.
 
     Args:
         record: Record of dtype ESTIMATOR_STATE.
@@ -133,6 +135,10 @@ def summed(record: np.void) -> SeriesResistance:
 
 def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> SeriesResistanceFit:
     """Fit (2.9) by non-negative weighted linear least squares for each of ``EXPONENTS``; return the best fit.
+
+    Args:
+        curve: R_s over SOC.
+        lowest_soc: SOC below which bins are omitted; 0 if the curve has no such bins.
 
     Raises:
         UserError: Too few SOC bins with data.
@@ -160,6 +166,7 @@ def _best_fit(soc: Floats, r_s: Floats, weight: Floats) -> tuple[float, float, f
     dd, d1, dr = decay**2 @ weight, decay @ weight, decay @ (weight * r_s)
     one, r1 = weight.sum(), (weight * r_s).sum()
     determinant = np.maximum(dd * one - d1**2, MIN_DETERMINANT)
+    # the minimum lies inside a13, a15 > 0, or at a13 = 0 (flat), or at a15 = 0 (falling to 0)
     inside = (dr * one - d1 * r1) / determinant, (dd * r1 - d1 * dr) / determinant
     flat = np.zeros_like(dd), np.full_like(dd, max(r1 / one, 0.0))
     falling = np.maximum(dr / dd, 0.0), np.zeros_like(dd)

@@ -28,7 +28,10 @@ def page(
         typer.Option(help="folder that `fleet collect` writes, for trends", show_default=False),
     ] = None,
     token_file: Annotated[Path | None, typer.Option(help="file with the access token", show_default=False)] = None,
-    host: Annotated[list[str] | None, typer.Option(help="further host name of the page", show_default=False)] = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option(help="host name of the page in addition to that of --listen; repeatable", show_default=False),
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
 ) -> None:
     """Serve the page of all packs of a fleet, until SIGINT or SIGTERM."""
@@ -38,9 +41,9 @@ def page(
         asyncio.run(_serve(nats_feed.Server(server, creds, ca), settings, folder, browser=browser))
 
 
-async def _serve(server: nats_feed.Server, settings: PageSettings, hours: Path | None, *, browser: bool) -> None:
+async def _serve(server: nats_feed.Server, settings: PageSettings, folder: Path | None, *, browser: bool) -> None:
     stop = stop_on_signal()
-    async with fleet_page(server, settings, hours) as url:
+    async with fleet_page(server, settings, folder) as url:
         typer.echo(f"page of the fleet: {url}")
         if browser:
             open_browser(url)

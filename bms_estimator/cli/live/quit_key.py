@@ -1,4 +1,4 @@
-"""Reader of the key q of a terminal, which quits the program without Enter."""
+"""Quit the program when the key q is pressed in its terminal, without Enter."""
 
 import asyncio
 import contextlib

@@ -43,11 +43,13 @@ def simulate(
     rate_hz: Annotated[
         int, typer.Option(parser=whole(1, 1000), help="sample rate until the host requests another [Hz]")
     ] = RATE_HZ_AT_RESET,
-    text: Annotated[bool, typer.Option("--text", help="print text lines")] = False,
+    text: Annotated[
+        bool, typer.Option("--text", help="send text lines from the board instead of binary frames")
+    ] = False,
     protocol: Annotated[
         str | None,
         typer.Option(
-            help=f"simulate another device of sensor.protocol: {', '.join(DEVICES)}; jk-pb: a jk with newer frames",
+            help=f"simulate a device with this sensor.protocol: {', '.join(DEVICES)}; jk-pb is a JK-BMS with newer frames",
             show_default=False,
         ),
     ] = None,
@@ -78,6 +80,7 @@ def simulate(
     board: VirtualBoard | SimulatedMeter | SimulatedNode
     if mqtt is not None:
         configure_logs()
+        # ``with_broker`` sets mqtt; the default only satisfies the type checker
         broker = with_broker(Settings(), mqtt).mqtt or MqttSettings()
         cells = model.cell.series_count
         board = SimulatedNode(pack, cells=cells, mqtt=broker, prefix=prefix, speed=speed, seed=seed)
@@ -118,5 +121,5 @@ async def _serve(board: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: 
     """Serve until ``seconds`` are over, or SIGINT or SIGTERM."""
     stop = stop_on_signal()
     with board:
-        typer.echo(board.path)
+        typer.echo(board.path)  # the pseudo-terminal, or topics and brokers of the ESPHome node
         await until_first_ends(stop.wait(), board.run(seconds))

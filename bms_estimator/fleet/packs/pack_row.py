@@ -31,7 +31,10 @@ _COUNT = Field(ge=1, le=10_000)
 
 
 class PackSpec(Strict):
-    """Values that packs of one kind share: those of the sections ``[pack]`` and ``[sensor]`` of a settings file."""
+    """Values that packs of one kind share: those of the sections ``[pack]`` and ``[sensor]`` of a settings file.
+
+    A cell-file object is the object that a cell file describes: a cell, a module or a block.
+    """
 
     cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
         description="generic chemistry lfp, nmc, nca, lco, lmo or lto (with capacity_ah), shipped cell, or cell file "
@@ -64,7 +67,7 @@ class PackRow(PackSpec):
 
     @property
     def kind(self) -> PackSpec:
-        """Row without the name."""
+        """Specification of the pack: the row without the name."""
         return PackSpec.model_validate(self.model_dump(exclude={"pack"}, exclude_unset=True))
 
 
@@ -73,7 +76,7 @@ COLUMNS = ("pack", *PackSpec.model_fields)
 
 
 def encode_row(kind: PackSpec) -> bytes:
-    """Encode a pack's row for the server. Equal rows give equal bytes."""
+    """Encode the specification of a pack for the server. Equal specifications give equal bytes."""
     return kind.model_dump_json(exclude_defaults=True).encode()
 
 

@@ -66,6 +66,7 @@ async def work(options: Options, stop: asyncio.Event) -> None:
     """
     notifier = SystemdNotifier([options.name])
     starting = asyncio.ensure_future(_start(options, notifier))
+    # a stop cancels only ``wait``, so that ``starting.done()`` shows below if the worker was created
     await until_first_ends(asyncio.wait([starting]), stop.wait())
     if not starting.done():
         await end(starting)
@@ -86,15 +87,15 @@ async def _start(options: Options, notifier: SystemdNotifier) -> "Worker":
         try:
             return await _create_worker(nc, options, notifier)
         except (*RETRYABLE_ERRORS, UserError) as error:
-            _check(nc, options)
+            _raise_if_closed(nc, options)
             if (text := error_text(error)) != last_reason:
                 log.warning("waiting for the server", reason=text)
             last_reason = text
         await asyncio.sleep(RETRY_S)
 
 
-def _check(nc: Client, options: Options) -> None:
-    """Check that the connection is open or will be restored.
+def _raise_if_closed(nc: Client, options: Options) -> None:
+    """Raise an error if the connection is closed and will not be restored.
 
     Raises:
         UserError: The server has closed the connection permanently.
@@ -153,7 +154,9 @@ class Worker:
         self._renewed_s = time.monotonic()
         self._blocks = self._samples = self._faults = 0  # of released partitions
         self._leaving = False
-        self._step_lock = asyncio.Lock()
+        self._step_lock = (
+            asyncio.Lock()
+        )  # blocks are estimated one at a time; the event loop sends heartbeats between them
         self._release_slots = asyncio.Semaphore(MAX_RELEASES)
         self._reported_unknown: set[str] = set()
 
@@ -171,9 +174,9 @@ class Worker:
         log.info("ready", worker=self._options.name, partitions=self._partitions)
         await until_first_ends(
             _repeat(HEARTBEAT_S, self._send_heartbeat),
-            _repeat(RENEW_S, self._renew),
+            _repeat(RENEW_S, self._update_leases),
             _repeat(CHECK_S, self._save),
-            _repeat(CHECK_S, self._send_hours),
+            _repeat(CHECK_S, self._send_hourly_summaries),
             self._bucket.follow(self._changed.put_nowait),
             self._apply_table_changes(),
         )
@@ -188,6 +191,7 @@ class Worker:
             )
         for number in list(self._lease_tasks):
             self._start_release(number)
+        # pinned consumers that are still to be released expire without requests
         renewing = asyncio.ensure_future(_repeat(RENEW_S, self._send_requests))
         await asyncio.gather(*self._releases.values())
         await end(renewing)
@@ -238,9 +242,9 @@ class Worker:
             await self._nc.publish(subjects.unknown(pack), reason.encode())
         self._reported_unknown = unknown
 
-    async def _renew(self) -> None:
+    async def _update_leases(self) -> None:
         """Claim assigned partitions, release the others, and request more messages."""
-        _check(self._nc, self._options)
+        _raise_if_closed(self._nc, self._options)
         now_s = time.monotonic()
         if not self._nc.is_connected or now_s > self._renewed_s + DEAD_S / 2.0:
             self._members.extend_all(now_s)  # no heartbeat could be received
@@ -264,6 +268,7 @@ class Worker:
                 await lease.consumer.renew()
 
     def _start_lease(self, number: int, now_s: float) -> None:
+        # while any partition is busy, deferred packs that have exceeded their CPU budget must wait
         lease = PartitionLease(
             self._nc,
             number,
@@ -298,7 +303,7 @@ class Worker:
                 lease.due_s = now_s + self._options.checkpoint_s
                 await self._try(lease, lease.save)
 
-    async def _send_hours(self) -> None:
+    async def _send_hourly_summaries(self) -> None:
         for lease in self._leases:
             if lease.hours and self._nc.is_connected:
                 await self._try(lease, lease.send_hours)
@@ -322,23 +327,24 @@ class Worker:
                     entry[0].settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
-        leases = [lease for lease in self._leases if lease.is_owned]
+        owned_leases = [lease for lease in self._leases if lease.is_owned]
         counters, unknown = Counter[str](), list[str]()
-        for lease in leases:
+        for lease in owned_leases:
             if lease.partition:
                 counters.update(lease.partition.counters)
                 unknown += lease.partition.unknown
-        lags = [lease.lag_s for lease in leases if lease.lag_s is not None]
-        for lease in leases:
-            lease.lag_s = None
+        lags = [lease.lag_s for lease in owned_leases if lease.lag_s is not None]
+        for lease in owned_leases:
+            lease.lag_s = None  # a heartbeat has the largest lag since the previous heartbeat
         usage = resource.getrusage(resource.RUSAGE_SELF)
-        ages = [time.time() - checkpoint.made_s for lease in leases if (checkpoint := lease.last_checkpoint)]
+        ages = [time.time() - checkpoint.made_s for lease in owned_leases if (checkpoint := lease.last_checkpoint)]
         return Heartbeat(
             id=self._options.name,
             started_s=self._started_s,
             leaving=self._leaving,
-            partitions=tuple(lease.number for lease in leases),
+            partitions=tuple(lease.number for lease in owned_leases),
             packs=counters["packs"],
+            # totals over all leases: they must not fall when a partition is no longer owned
             blocks=self._blocks + sum(lease.blocks for lease in self._leases),
             samples=self._samples + sum(lease.samples for lease in self._leases),
             faults=self._faults + sum(lease.faults for lease in self._leases),

@@ -200,5 +200,8 @@ def delta(exponent: float, offset: float, amplitude: float) -> float:
 
 @njit(cache=True)
 def crossing(soc: float, offset: float, amplitude: float) -> float:
-    """Return the bound of a8 or a11 at ``soc``: the right side of the condition in Lemma 4.1.1 of the thesis, as in its Fig. 19."""
+    """Return the exponent a8 (or a11) above which C_ts (or C_tl) is positive at ``soc``: Lemma 4.1.1 and Fig. 19 of the thesis.
+
+    ``offset`` and ``amplitude`` are those of ``delta``.
+    """
     return -math.log(offset / amplitude) / soc

@@ -3,13 +3,19 @@
 from bms_estimator.numba_cache import njit
 
 SLOW_S = 2.0
-"""Time between samples above which the current counts as deviating from a straight line [s]."""
+"""Interval between samples above which the current counts as a ramp, and its charge as uncertain [s].
+
+The current may deviate from a straight line between the samples.
+"""
 
 GAP_RATIO = 3.0
 """Minimum ratio of a gap to the previous step, so that slow sampling does not count as gaps."""
 
 UNMEASURED_S = 60.0
-"""Maximum step over which the current counts as measured [s]; for slower sources ``PERIODS`` of their periods."""
+"""Maximum step over which the current counts as measured [s].
+
+A source whose period exceeds ``UNMEASURED_S`` / ``PERIODS`` has a maximum of ``PERIODS`` periods.
+"""
 PERIODS = 2.5
 """Maximum regular step in sample periods, because a regular source may be late or lose a sample."""
 MAX_FLOW_S = 3600.0
@@ -33,7 +39,9 @@ def interpolated_current(dt_s: float, before_a: float, now_a: float, unmeasured_
 
 @njit(cache=True)
 def ramp_correction(change_a: float, taus: float, decay: float) -> float:
-    """Return the difference of an RC pair's filtered current between a linear ramp and its mean current [A].
+    """Return the correction for a ramp of the current through the resistor of an RC pair at the end of a step [A].
+
+    The correction is the difference between the current for a linear ramp and the current for the constant mean of the ramp.
 
     Args:
         change_a: Change of the current between the samples [A].

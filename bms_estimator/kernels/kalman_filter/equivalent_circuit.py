@@ -32,7 +32,7 @@ SHORT_S = 60.0
 SHORT = sum(tau_s < SHORT_S for tau_s in TAU_S)
 """Number of the ladder's RC pairs that belong to R_ts."""
 SHAPE_STD = 0.03
-"""Relative std of the file's series resistance at one SOC and temperature, after scaling to the cell."""
+"""Relative std of the cell file's series resistance over SOC and temperature after multiplication by one scale factor."""
 MAX_STEP_S = 2.0
 """Maximum time between two samples that show a current step [s]."""
 IDENTIFIED_FRACTION = 0.5
@@ -55,12 +55,14 @@ EQUIVALENT = np.dtype(
 def write_equivalent_circuit(f: Record, p: Record, e: Record) -> None:
     """Write the resistances and two RC pairs at SOC and temperature of the likeliest hypothesis to ``e``."""
     x, cov = f.mean[f.best], f.covariance[f.best]
+    # each resistance is the sum of a part with weak and a part with strong temperature dependence
     resistances(x[SOC], p.weak_ohm, p.strong_ohm, f.weak, f.strong, e.ohm)
     file_ohm, others = e.ohm[0], math.exp(x[LN_R])
     e.ohm[0] *= math.exp(x[LN_R0])
     for k in range(1, RESISTANCES):
         e.ohm[k] *= others
     ratio, variance = ln_r_s_ratio(f, p)
+    # Measurements do not determine the part of this rise that belongs to R_s: its half, with its half as std
     half_ohm = 0.5 * branch_rise_within_sample(f, e)
     e.value[R_S] = file_ohm * math.exp(ratio) + half_ohm
     e.ln_variance[R_S] = variance + (half_ohm / e.value[R_S]) ** 2
@@ -110,6 +112,7 @@ def branch_rise_within_sample(f: Record, e: Record) -> float:
     Measurements cannot divide this rise between R_s and the RC pairs.
     """
     ohm = 0.0
+    # ``decay_s`` is the interval of the last samples
     for k in range(BRANCHES):
         ohm += e.ohm[1 + k] * (1.0 - math.exp(-min(f.decay_s, MAX_STEP_S) / TAUS[k]))
     return ohm
@@ -117,7 +120,7 @@ def branch_rise_within_sample(f: Record, e: Record) -> float:
 
 @njit(cache=True)
 def scale_is_identified(f: Record, p: Record, j: int) -> bool:
-    """Return True if data have determined the scale of the resistances, state ``j``, LN_R0 or LN_R."""
+    """Return True if data have determined the scale of the resistances in state ``j``: LN_R0 for R_0, LN_R for the others."""
     return f.covariance[f.best, j, j] < IDENTIFIED_FRACTION * resistance_std(f, p) ** 2
 
 
@@ -129,13 +132,14 @@ def r_s_identified_by_steps(f: Record, p: Record) -> bool:
 
 @njit(cache=True)
 def open_circuit(f: Record, p: Record, e: Record, current_a: float, voltage_v: float) -> float:
-    """Return E_o on the cell file's curve at 25 C by the measured voltage, (2.4) of the thesis [V].
+    """Return the OCV at 25 C that follows from the measured voltage by (2.4) of the thesis [V].
 
     Overpotential, hysteresis, learned correction and temperature dependence of the OCV are subtracted.
     """
     x = f.mean[f.best]
     e_o = voltage_v + e.ohm[0] * (current_a - x[OFFSET])
     for k in range(BRANCHES):
+        # x_a: filtered current of a pair since switch-on; X: estimated remainder, due to the load before switch-on
         e_o += e.ohm[1 + k] * (f.x_a[k] + x[X + k])
     e_o -= f.hysteresis * on_grid(x[SOC], p.hysteresis_v) * x[HYST] + ocv_correction(p, x, x[SOC])
     return e_o - (f.temperature_c - REFERENCE_C) * on_grid(x[SOC], p.per_kelvin_v)

@@ -17,6 +17,7 @@ class Nussbaum(IntEnum):
     LN_COS_SQRT_LN = 3  # N3 = ln k cos sqrt(ln k), k > 1
 
 
+# constants of the compiled function, plain integers as the record's field ``nussbaum``
 _K2_COS = int(Nussbaum.K2_COS)
 _K_COS_SQRT = int(Nussbaum.K_COS_SQRT)
 _LN_COS_SQRT_LN = int(Nussbaum.LN_COS_SQRT_LN)
@@ -37,6 +38,6 @@ def nussbaum_gain(k: float, p: Record) -> float:
     elif p.nussbaum == _LN_COS_SQRT_LN:
         log_k = math.log(max(k, 1.0))
         gain = log_k * math.cos(math.sqrt(log_k))
-    else:
+    else:  # lambda k^a = (gain_scale k)^a, because gain_scale is lambda^(1/a)
         gain = mittag_leffler(p.gain_scale * k, p.alpha, p.ml_series, p.ml_decay, p.ml_decay_slope)
     return min(max(gain, -p.gain_limit), p.gain_limit)

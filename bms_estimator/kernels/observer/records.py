@@ -18,7 +18,7 @@ OBSERVER_SETTINGS = np.dtype(
         ("target", "f8", PARAMETERS),  # (lx au + ly al) / (lx + ly), limit of Lemma 4.1.3
         ("rate", "f8", PARAMETERS),  # lx + ly of (3.18), lambda of (3.17) [1/s]
         ("drive", "f8", PARAMETERS),  # 1: e^2 drives the parameter; 0: the parameter is constant
-        ("output_r_s", "f8"),  # not a resistance: 1 selects the output (3.14) with u R_s, 0 the output (4.1)
+        ("output_r_s", "f8"),  # 1: the output contains u R_s (3.14); 0: the output is (4.1)
         ("nussbaum", "i8"),  # kernels.observer.nussbaum.Nussbaum
         ("alpha", "f8"),  # a of (3.10), in (2, 3]
         ("gain_scale", "f8"),  # lambda^(1/a) of (3.10) [1/(V^2 s)]
@@ -27,7 +27,8 @@ OBSERVER_SETTINGS = np.dtype(
         ("ml_decay_slope", "f8", TABLE_POINTS),
         ("k0", "f8"),  # k(t0) [V^2 s]
         ("gain_limit", "f8"),  # clamp of |N|
-        ("rearm_gain", "f8"),  # while in lock, a gain N below this value resets k to k0; -inf, or above N(k0): no reset
+        # In lock, k is reset to k0 when N(k) falls below ``rearm_gain``. There is no reset if it is -inf or at least N(k0).
+        ("rearm_gain", "f8"),
         ("dead_zone_v", "f8"),  # e_dead of erratum 2 [V]; 0 gives the printed (3.13)
         ("epsilon_v", "f8"),  # eps2 of Algorithm 1 [V]
         ("lock_error_v", "f8"),  # |e| beyond which the observer does not track [V]
@@ -37,7 +38,8 @@ OBSERVER_SETTINGS = np.dtype(
         ("voltage_min_v", "f8"),  # minimum voltage of an accepted sample [V]
         ("voltage_max_v", "f8"),  # maximum voltage of an accepted sample [V]
         ("current_max_a", "f8"),  # maximum magnitude of the current of an accepted sample [A]
-        ("gap_s", "f8"),  # minimum duration of a gap, unless the previous step was about as long [s]
+        # A longer step is a gap, unless it is at most GAP_RATIO times the previous step [s]
+        ("gap_s", "f8"),
         ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
     ],
     align=True,
@@ -53,7 +55,7 @@ OBSERVER_STATE = np.dtype(
         ("v_ts", "f8"),  # x2 [V]
         ("v_tl", "f8"),  # x3 [V]
         ("k", "f8"),  # adaptive gain state (3.13) [V^2 s]
-        ("gain", "f8"),  # N(k); gamma k [1/s] of the learning law
+        ("gain", "f8"),  # N(k) of a Nussbaum law, or gamma k of the learning law [1/s]
         ("a", "f8", PARAMETERS),  # a1..a15 (3.16)-(3.18)
         ("target", "f8", PARAMETERS),  # limit of (3.18); the identifier changes it
         ("decay", "f8", PARAMETERS),  # e^(-rate dt) for ``decay_dt_s``
@@ -63,7 +65,7 @@ OBSERVER_STATE = np.dtype(
         ("voltage_estimate_v", "f8"),  # y^ after the sample corrected the states (4.1)
         ("delta_1", "f8"),  # (2.11)
         ("delta_2", "f8"),  # (2.12)
-        ("unlocked_s", "f8"),  # time with |e| beyond (in lock) or within (out of lock) lock_error_v [s]
+        ("unlocked_s", "f8"),  # time for which |e| has contradicted ``lock``, in or out of lock [s]
         ("started", "i8"),  # 1: initialized by a first sample
         ("lock", "i8"),  # 1 while the observer tracks
         ("adapting", "i8"),  # 1 while the parameters adapt; 0 at an SOC below the stability floor

@@ -34,7 +34,7 @@ ZERO_CURRENT = 30000
 """Value at 0 A [0.1 A]."""
 ZERO_C = 40
 """Value at 0 degC [degC]. The value 0 means an absent probe."""
-CELLS_A_FRAME, PROBES_A_FRAME = 3, 7
+CELLS_PER_FRAME, PROBES_PER_FRAME = 3, 7
 """Number of values in a frame of cells, and in a frame of probes."""
 MAX_FRAMES = 16
 """Maximum number of frames of cells or probes."""
@@ -46,7 +46,7 @@ def with_checksum(frame: bytes) -> bytes:
 
 
 def request(host: int, command: int) -> bytes:
-    """Build the request for ``command``; changes nothing."""
+    """Build the request for ``command``. The commands used here only read from the BMS."""
     return with_checksum(bytes((START, host, command, DATA_BYTES)) + bytes(DATA_BYTES))
 
 
@@ -54,7 +54,7 @@ class DalyProtocol(PolledProtocol):
     """Protocol of a Daly BMS. Each poll cycle requests cells, probes and pack, and the number of cells until it is known.
 
     Args:
-        current_sign: Direction of positive current; by its documentation discharge.
+        current_sign: Direction of positive current. Daly's documentation states discharge.
         address: Address of the BMS on a shared line; None: the first that responds.
     """
 
@@ -114,9 +114,12 @@ class DalyProtocol(PolledProtocol):
 
     def _pack(self, arrival_s: float, data: bytes) -> Reading:
         decivolts, _, deciamperes, _ = struct.unpack(">4H", data)
-        cells_v = self._joined(self._cells_v, CELLS_A_FRAME, self._cells) if arrival_s - self._cells_s < FRESH_S else []
+        cells_v = (
+            self._joined(self._cells_v, CELLS_PER_FRAME, self._cells) if arrival_s - self._cells_s < FRESH_S else []
+        )
         has_recent_probes = arrival_s - self._probes_s < FRESH_S
-        probes_c = self._joined(self._probes_c, PROBES_A_FRAME, self._probes) if has_recent_probes else []
+        probes_c = self._joined(self._probes_c, PROBES_PER_FRAME, self._probes) if has_recent_probes else []
+        # each cell voltage is part of one sample only; temperatures are repeated for up to ``FRESH_S``
         self._cells_v, self._has_sample = {}, True
         present_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
         return Reading(decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, self._mean_c(present_c), tuple(cells_v))
@@ -127,7 +130,8 @@ class DalyProtocol(PolledProtocol):
         Args:
             frames: Frames by number.
             values_per_frame: Number of values in one frame.
-            count: Number of values; None: unknown, so that trailing zeros are omitted.
+            count: Number of values; None: unknown. Trailing values that are NaN or at most 0 are then omitted, because unused
+                positions of a frame have such values.
         """
         if not frames:
             return []
@@ -153,5 +157,8 @@ DEVICE = Device(
     ),
     has_binary_frames=True,
 )
-"""One frame has voltage and current in steps of 0.1 V and 0.1 A. Users found its parameter DfilterCur at 2 A and at 2.5 A
-(github.com/softwarecrash/Daly2MQTT, issue 171; github.com/fl4p/batmon-ha, issue 144)."""
+"""Registration of the protocol. Voltage and current have steps of 0.1 V and 0.1 A.
+
+The BMS reports 0 A below its parameter DfilterCur. Users found values of 2 A and 2.5 A (github.com/softwarecrash/Daly2MQTT,
+issue 171; github.com/fl4p/batmon-ha, issue 144).
+"""

@@ -11,7 +11,7 @@ from bms_estimator.protocols.firmware.messages import MODULUS
 SCALING = np.dtype(
     [
         ("known", "i8"),  # 1 once a hello was received
-        ("full_scale", "f8"),  # conversions at the reference: 2^bits
+        ("full_scale", "f8"),  # number of steps of the converter: 2^bits
         ("divider", "f8"),  # pack voltage over voltage at the pin
         ("volts_per_ampere", "f8"),  # slope of the current sensor [V/A]
         ("ratiometric", "i8"),  # 1: volts_per_ampere holds at 5 V, and is proportional to the reference
@@ -21,11 +21,11 @@ SCALING = np.dtype(
         ("ntc_r25_ohm", "f8"),  # resistance of the NTC at 25 degC [ohm]
         ("ntc_beta_k", "f8"),  # beta of the NTC [K]
         ("ntc_fitted", "i8"),  # 1: the board has an NTC
-        ("bandgap_mean", "f8"),  # filtered conversions of the bandgap
-        ("bandgap_weight", "f8"),  # number of bandgap conversions since the reset
+        ("bandgap_mean", "f8"),  # filtered mean of the bandgap readings, in steps of the converter
+        ("bandgap_weight", "f8"),  # number of bandgap readings since the reset
         ("bandgap_us", "i8"),  # board_us of the last bandgap reading
-        ("ntc_mean", "f8"),  # filtered conversions of the NTC
-        ("ntc_weight", "f8"),  # number of NTC conversions since the reset
+        ("ntc_mean", "f8"),  # filtered mean of the NTC readings, in steps of the converter
+        ("ntc_weight", "f8"),  # number of NTC readings since the reset
         ("ntc_us", "i8"),  # board_us of the last NTC reading
     ],
     align=True,
@@ -37,7 +37,7 @@ _BANDGAP_US = 5_120_000
 At 100 readings per second it covers 512 readings, so that 0.5 LSB of noise becomes 0.02 LSB in the mean.
 """
 _NTC_US = 640_000
-"""Time constant of the NTC's mean [us]."""
+"""Time constant of the NTC's mean [us]. At 100 readings per second it covers 64 readings."""
 _CLOCK_MASK = MODULUS - 1
 _RAIL = 0.01  # an NTC within this fraction of either end of the range is open or shorted
 _RATIOMETRIC_V = 5.0  # supply at which the data sheet of a ratiometric sensor gives its slope

@@ -65,6 +65,7 @@ class PrometheusSink(Collector):
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         """Answer a scrape on any path, in the format of its Accept header."""
+        # the connection has no deadline while its request is handled
         with CONNECTIONS.serving(request.transport):
             if request.method not in {"GET", "HEAD"}:
                 return web.Response(status=405, headers={"Allow": "GET, HEAD"})

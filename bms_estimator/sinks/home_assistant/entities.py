@@ -1,7 +1,7 @@
 """Numeric entities of a pack in Home Assistant.
 
-Home Assistant's recorder stores a row for each change of each entity. Its values therefore have a separate topic, on
-which they are rounded and published rarely (``entity_values``). Entities for research are disabled by default.
+Home Assistant's recorder stores a row for each change of each entity. The values of entities therefore have
+a separate topic, on which they are rounded and published rarely (``entity_values``). Entities for research are disabled by default.
 """
 
 from bms_estimator.model.payloads import Estimate, Info
@@ -10,20 +10,23 @@ from bms_estimator.model.quantity import Entity, field_entities, raw_entity
 ESTIMATE = field_entities(Estimate, "all")
 """Entities of every pack."""
 CHARGE_STATE = field_entities(Estimate, "batteries") | {
-    "soc_std_percent": Entity("State of charge, standard deviation", "%", 1, 0.2, is_primary=True),
-    "time_to_empty_h": Entity("Time to empty", "h", 2, 0.05, "duration", is_primary=True),
-    "time_to_full_h": Entity("Time to full", "h", 2, 0.05, "duration", is_primary=True),
-    "soh_percent": Entity("State of health", "%", 1, 0.2),
-    "soh_std_percent": Entity("State of health, standard deviation", "%", 1, 0.2),
+    "soc_std_percent": Entity("State of charge, standard deviation", "%", decimals=1, step=0.2, is_primary=True),
+    "time_to_empty_h": Entity("Time to empty", "h", decimals=2, step=0.05, device_class="duration", is_primary=True),
+    "time_to_full_h": Entity("Time to full", "h", decimals=2, step=0.05, device_class="duration", is_primary=True),
+    "soh_percent": Entity("State of health", "%", decimals=1, step=0.2),
+    "soh_std_percent": Entity("State of health, standard deviation", "%", decimals=1, step=0.2),
 }
-"""Entities of a battery that a fuel cell does not have. The entities with their own values here are in another unit than
-the payloads."""
+"""Entities of a battery that a fuel cell does not have.
+
+``field_entities`` cannot make the entities listed here, because their units differ from those of the payloads.
+"""
 CELL_VOLTAGES = field_entities(Estimate, "with cell voltages")
 """Entities of packs with measured cell voltages."""
 CELL = "cell_v"
 """Key in ``[home_assistant.names]`` that renames the voltages of all single cells; each name ends in the number."""
 ELEMENTS = {
-    "r_s_ohm": Entity("R_s", "Ω", 4, 0.0005),
+    "r_s_ohm": Entity("R_s", "Ω", decimals=4, step=0.0005),
+    # ``raw_entity``: internal value, disabled by default; its minimum change is one unit of the last decimal
     "r_ts_ohm": raw_entity("R_ts", "Ω", 4),
     "r_tl_ohm": raw_entity("R_tl", "Ω", 4),
     "c_ts_farad": raw_entity("C_ts", "F", 0),
@@ -31,7 +34,7 @@ ELEMENTS = {
 }
 """Entities of a battery's learned parameters, by element of ``ParameterReport``."""
 STACK = {
-    "r_ohm": Entity("Resistance", "Ω", 4, 0.0005),
+    "r_ohm": Entity("Resistance", "Ω", decimals=4, step=0.0005),
     "tafel_slope_v": raw_entity("Tafel slope", "V", 4),
     "exchange_current_a": raw_entity("Exchange current", "A", 9),
     "c_dl_farad": raw_entity("Double layer capacitance", "F", 4),

@@ -47,7 +47,7 @@ MAX_READ_BYTES = 1 << 20
 """Maximum length of the bytes in a record."""
 CHUNK_BYTES = 1 << 20
 """Size of the parts in which a capture is read [bytes]."""
-_HEAD = struct.Struct("<dI")
+_RECORD_HEAD = struct.Struct("<dI")
 _LENGTH = struct.Struct("<I")
 _CRC = struct.Struct("<H")
 _MAX_HEADER_BYTES = 1 << 20
@@ -76,11 +76,11 @@ class CaptureHeader:
     """Address of the recorded pack, if the line had several."""
 
 
-_VERSIONED, _HEADER = TypeAdapter(_HeaderVersion), TypeAdapter(CaptureHeader)
+_VERSION_ADAPTER, _HEADER_ADAPTER = TypeAdapter(_HeaderVersion), TypeAdapter(CaptureHeader)
 
 
 def make_header(sensor: SensorSettings, source: PolledSource | None = None) -> CaptureHeader:
-    """Return the header of a capture, of the serial device or of ``source`` if there is one."""
+    """Return the header of a capture of ``source``; None: of the serial device of ``sensor``."""
     if source is not None:
         return CaptureHeader(sensor.protocol, source.described, 0, sensor.current_sign)
     return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign, address=sensor.address)
@@ -98,8 +98,8 @@ def read_sensor_settings(path: Path) -> SensorSettings:
         return SensorSettings.model_validate(fields)
     except ValidationError:
         raise UserError(
-            f"{path}: recorded from mode {header.mode!r}, current_sign {header.current_sign!r}: "
-            "this program does not support one of them"
+            f"{path}: recorded with mode {header.mode!r} and current_sign {header.current_sign!r}: "
+            "this program does not support at least one of them"
         ) from None
 
 
@@ -158,7 +158,7 @@ class CaptureWriter:
         """
         if len(data) > MAX_READ_BYTES:
             raise ValueError(f"a read of {len(data)} bytes: a record holds at most {MAX_READ_BYTES}")
-        record = _HEAD.pack(arrival_s, len(data)) + data
+        record = _RECORD_HEAD.pack(arrival_s, len(data)) + data
         self._append(record + _CRC.pack(binascii.crc_hqx(record, 0xFFFF)))
 
     def sync(self) -> None:
@@ -237,7 +237,7 @@ def read_capture(path: Path) -> Iterator[CaptureBatch]:
                 yield batch
             if batch.damaged:
                 return
-        if rest:
+        if rest:  # the record is known to be incomplete only at the end of the file, after the last batch
             yield dataclasses.replace(_split(np.frombuffer(b"", dtype=np.uint8))[0], unread_bytes=len(rest))
 
 
@@ -286,10 +286,10 @@ def _checked_header(path: Path, text: bytes) -> CaptureHeader:
         UserError: The JSON is not a valid header, or has a later version; the message names the file and the error.
     """
     try:
-        header = _VERSIONED.validate_json(text)
+        header = _VERSION_ADAPTER.validate_json(text)
         if header.version != VERSION:
             raise UserError(f"{path}: version {header.version}, this program reads version {VERSION}")
-        return _HEADER.validate_json(text)
+        return _HEADER_ADAPTER.validate_json(text)
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
         field_path = "".join(f"{key}: " for key in detail["loc"])

@@ -138,7 +138,7 @@ class SampleAssembler:
                 self._faults[binding.quantity] = f"{binding.quantity}: {topic}: {error}"
             else:
                 self._faults.pop(binding.quantity, None)
-                conflict |= self._has_conflict(binding, now_s)
+                conflict |= self._update_conflict(binding, now_s)
         self._counters["publisher_errors"] += conflict
 
     def line(self, now_s: float) -> bytes:
@@ -179,7 +179,10 @@ class SampleAssembler:
             self._cells[cell] = _TimestampedValue(read_value(payload, binding.location, binding.path), now_s)
 
     def _remove(self, quantity: str, cell: int | None) -> None:
-        """Remove the stored value of a quantity; for cells that of ``cell``, by default of all cells."""
+        """Remove the stored value of a quantity.
+
+        For ``cells``, remove the voltage of ``cell``, or of all cells without ``cell``.
+        """
         self._values.pop(quantity, None)
         self._unused.pop(quantity, None)
         if quantity == "cells":
@@ -187,8 +190,8 @@ class SampleAssembler:
             for each in removed:
                 self._cells.pop(each, None)
 
-    def _has_conflict(self, binding: _TopicBinding, now_s: float) -> bool:
-        """Return True if two publishers write to this topic, by its latest value."""
+    def _update_conflict(self, binding: _TopicBinding, now_s: float) -> bool:
+        """Add the latest value of a topic to its conflict detector. Return True if two publishers write to the topic."""
         key = binding.quantity, binding.topic
         detector = self._detectors.get(key)
         if detector is None or not detector.add(self._values[binding.quantity].value, now_s):

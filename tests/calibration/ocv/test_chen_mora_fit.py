@@ -16,9 +16,9 @@ from tests.calibration.simulated_relaxation import relaxation
 GRID = np.linspace(0.0, 1.0, 501)
 
 
-def make_points(soc, ocv_v, std_v=1e-3, **ends):
+def make_points(soc, ocv_v, std_v=1e-3):
     soc = np.asarray(soc, dtype=float)
-    return Points(soc, np.asarray(ocv_v, dtype=float), np.full(soc.size, std_v), **ends)
+    return Points(soc, np.asarray(ocv_v, dtype=float), np.full(soc.size, std_v))
 
 
 @pytest.mark.parametrize("a", [TABLE_1, TABLE_8], ids=["Table 1", "Table 8"])
@@ -48,8 +48,8 @@ def test_standard_errors_equal_the_scatter_of_the_fits():
     assert np.mean([rms_v(fit.residual_v) for fit in fits]) == pytest.approx(1e-3, rel=0.1)
 
 
-def test_points_that_end_above_the_knee_give_a_positive_voltage_at_soc_0():
-    """Without points below SOC 0.07 the amplitude of the exponential is limited by the highest point."""
+def test_points_that_end_above_the_knee_give_a_voltage_near_or_above_0_at_soc_0():
+    """Points above SOC 0.07 do not determine the amplitude of the exponential. The fit bounds it by the highest voltage."""
     soc = np.linspace(0.07, 1.0, 19)
     ocv_v = 3.2 + 0.1 * soc
     ocv_v[0] -= 0.15
@@ -101,6 +101,7 @@ def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
 
 @pytest.mark.parametrize("fit", [fit_chen_mora, fit_table])
 def test_too_few_points_or_too_small_a_span_are_rejected_with_their_numbers(fit):
+    """Both fits use ``check_points``, whose minimum is the number of parameters of (2.10)."""
     with pytest.raises(UserError, match=r"5 points of the open-circuit voltage; \(2.10\) has 6 parameters"):
         fit(make_points(np.linspace(0.0, 1.0, 5), np.linspace(3.4, 4.1, 5)))
     with pytest.raises(UserError, match=r"points span SOC 0.50 to 0.70 only"):

@@ -60,10 +60,11 @@ def test_scheme_2_returns_small_parameters_to_their_initial_values(disturbed_sam
     assert np.abs(change[SMALL]).max() < 1e-3 * integral
     while_disturbed, _ = parameter_change("scheme-2", disturbed_samples[:3])
     assert (while_disturbed[SMALL] > 1e-4).all()  # the parameters return afterwards and were not constant
+    # e^2 drives both parameters, and the return is negligible after three samples
     assert while_disturbed[1] == pytest.approx(while_disturbed[3], rel=1e-9)
 
 
-def test_scheme_2_holds_what_lies_below_its_epsilon(disturbed_samples):
+def test_scheme_2_returns_the_parameters_below_its_epsilon():
     estimator = Estimator(
         CELL, make_settings("scheme-2", scheme_2_epsilon=7.0, scheme_2_lambda=50.0), initial_soc=1.0, identifier=None
     )
@@ -103,7 +104,7 @@ def test_scheme_3_converges_to_the_limits_of_table_4(disturbed_samples):
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2", "scheme-3", "improved"])
 def test_output_equation_of_each_law(law):
-    """(3.14) with its loop through u = -N e closed for the schemes, (4.1) for the improved method."""
+    """The schemes solve (3.14) together with u = -N e, because y^ depends on u. The improved method uses (4.1)."""
     samples = discharge(CELL, 0.275, 0.01)[:40]
     samples["voltage_v"] -= 0.1
     estimator = Estimator(CELL, make_settings(law, k0=0.3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
@@ -174,13 +175,15 @@ def test_algorithm_1_reports_why_it_did_not_converge():
 
 
 def test_error_of_a_run_is_that_of_the_observer_with_the_identifier_enabled():
-    samples = discharge(CELL, 0.055, 1.0)[:150]  # every sample is a snapshot
-    once, again = (
+    samples = discharge(CELL, 0.055, 1.0)[
+        :150
+    ]  # fewer than FIRST_SAMPLES of ``adaptive_run``, so that each is a snapshot
+    for_adaptive_run, for_plain_run = (
         Estimator(CELL, make_settings("improved"), identifier=IdentifierSettings(), initial_soc=0.9) for _ in range(2)
     )
-    trace = again.run(samples)
+    trace = for_plain_run.run(samples)
     assert np.abs(trace["tracking_error_v"] - trace["innovation_v"]).max() > 1e-3
-    assert adaptive_run(once, samples).error_v.tolist() == trace["tracking_error_v"].tolist()  # (3.15)
+    assert adaptive_run(for_adaptive_run, samples).error_v.tolist() == trace["tracking_error_v"].tolist()  # (3.15)
 
 
 def test_a_capture_outside_the_limits_is_rejected():

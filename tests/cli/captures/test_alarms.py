@@ -28,7 +28,8 @@ def test_raised_alarms_are_listed_with_their_times(
     result = json.loads(out)
     times = {each["alarm"]: (each["raised_s"], each["ended_s"], each["latched"]) for each in result["raised"]}
     assert times == {
-        "pack_over_voltage": (pytest.approx(32.0), None, True),
+        "pack_over_voltage": (pytest.approx(32.0), None, True),  # 30 s + delay_s = 2
+        # 70 s + delay_s = 5; 90 s + clear_delay_s = 60
         "over_temperature": (pytest.approx(75.0), pytest.approx(150.0), False),
     }
     assert result["unmeasured"] == ["cell_over_voltage", "cell_under_voltage", "cell_imbalance"]
@@ -54,7 +55,7 @@ def test_raised_alarms_are_listed_with_their_times(
         ("hook = [{topic = 'a', payload = '$nothing'}]", 2, "payload: 'nothing': must be one of $json"),
     ],
 )
-def test_check_reports_invalid_limits(
+def test_check_of_limits_and_hooks(
     pack: Path, capsys: pytest.CaptureFixture[str], alarms: str, code: int, message: str
 ) -> None:
     with pack.open("a") as file:

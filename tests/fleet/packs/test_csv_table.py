@@ -104,7 +104,7 @@ def test_cell_file_beside_the_table(table, tmp_path):
         check_models(path, parsed, {})
 
 
-def test_kind_without_a_cell_is_reported_once(table):
+def test_generic_cell_without_capacity_is_reported_once(table):
     path = table("pack,cell\na,lfp\nb,lfp\nc,ncr18650\n")
     with pytest.raises(UserError, match="line 2, and 1 more like this: lfp is a generic cell: give its capacity"):
         check_models(path, read_table(path), {})
@@ -152,7 +152,7 @@ def test_packs_of_one_kind_share_settings_and_model():
         (b'{"cell":"lfp","capacity_ah":"x"}', "its row is wrong: capacity_ah: must be a number, without quotes"),
         (b'{"cell":"lfp","more":1}', "its row is wrong: more: Extra inputs are not permitted"),
         (b'{"cell":"lfp"}', "lfp is a generic cell: give its capacity"),
-        (b'{"cell":"lfp","capacity_ah":1e-300}', ""),
+        (b'{"cell":"lfp","capacity_ah":1e-300}', ""),  # a valid row: any capacity above 0 is allowed
         (b'{"cell":"own"}', "own: no cell file of this name was loaded"),
         (b'{"cell":"broken"}', "cell broken: not valid TOML"),
         (b'{"cell":"/etc/passwd"}', "its row is wrong: cell: "),

@@ -38,8 +38,9 @@ class Registers:
             await self._new_request.wait_for(lambda: len(self.requests) >= count)
 
     async def answer(
-        self, function: int, start: int, address: int, count: int, current: list[int], _: object
+        self, function: int, start: int, address: int, count: int, registers: list[int], _: object
     ) -> ExcCodes | None:
+        """Write the requested values into ``registers``, whose first address is ``start``: an action of pymodbus."""
         self.requests.append((function, address, count))
         async with self._new_request:
             self._new_request.notify_all()
@@ -49,7 +50,7 @@ class Registers:
         for i in range(address, address + count):
             if i not in table:
                 return ExcCodes.ILLEGAL_ADDRESS
-            current[i - start] = table[i]
+            registers[i - start] = table[i]
         return None
 
     def device(self, unit: int) -> SimDevice:
@@ -69,7 +70,7 @@ async def tcp_device(
     """Run a device behind a gateway at 127.0.0.1. The gateway rejects requests to other units."""
     others = Registers()
     others.refusal = ExcCodes.GATEWAY_NO_RESPONSE
-    devices = [registers.device(unit), others.device(0)]
+    devices = [registers.device(unit), others.device(0)]  # pymodbus uses device 0 for all undefined units
     server = ModbusTcpServer(devices, framer=framer, address=("127.0.0.1", port))
     await server.serve_forever(background=True)
     try:

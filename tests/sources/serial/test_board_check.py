@@ -77,7 +77,7 @@ async def test_hello_is_requested_after_the_first_frame(line: Line) -> None:
 
 
 @pytest.fixture
-def auto(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+def only_port(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """Return the path of the only port. It exists while a board is plugged in."""
     path = tmp_path / "ttyUSB0"
     monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path))] if path.is_symlink() else [])
@@ -106,31 +106,31 @@ async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_auto_rejects_another_board_and_reopens_its_own(auto: Path) -> None:
+async def test_auto_rejects_another_board_and_reopens_its_own(only_port: Path) -> None:
     blocks = list[SampleBlock]()
     source = SerialSource(SensorSettings(port="auto", sample_rate_hz=50), first_retry_s=0.05)
     async with run_source(source, blocks):
-        async with plugged_in(auto, serial=1):
+        async with plugged_in(only_port, serial=1):
             await until(lambda: source._board_check.serial)
         await until(lambda: source.message)
-        async with plugged_in(auto, serial=2, voltage_v=11.1):
+        async with plugged_in(only_port, serial=2, voltage_v=11.1):
             await until(lambda: source.message and "refused" in source.message)
             assert "board 00000002 is not the pack's, 00000001" in (source.message or "")
             await until(lambda: source.counters["reconnects"] >= 2)  # the board is checked a second time
         blocks_before = len(blocks)
-        async with plugged_in(auto, serial=1):
+        async with plugged_in(only_port, serial=1):
             await until(lambda: len(blocks) > blocks_before)
         assert source.board["serial"] == "00000001"
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(22.2, abs=0.1)
 
 
-async def test_auto_reports_what_replaced_its_board(auto: Path) -> None:
+async def test_auto_reports_what_replaced_its_board(only_port: Path) -> None:
     source = SerialSource(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
     async with run_source(source, []):
-        async with plugged_in(auto, serial=1):
+        async with plugged_in(only_port, serial=1):
             await until(lambda: source._board_check.serial)
         await until(lambda: source.message)
-        with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, symlink(auto, other.path):
+        with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, symlink(only_port, other.path):
             task = asyncio.create_task(other.run())
             await until(lambda: source.message and "prints text" in source.message)
             task.cancel()
