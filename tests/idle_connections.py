@@ -84,7 +84,7 @@ async def attack_service(folder: Path, broker: Broker) -> Outcome:
     """
     port, exporter = free_port(), free_port()
     extra_toml = f'checkpoint_s = 1\n[prometheus]\nlisten = "127.0.0.1:{exporter}"\n'
-    service = Service(folder, broker, port, lambda _: BOARD, pack=PACK, extra_toml=extra_toml)
+    service = Service(folder, broker, port, lambda _: BOARD, pack=PACK, more=extra_toml)
     async with service:
         async with Listener(broker) as live:
             await live.wait_json("bms/attic/state")

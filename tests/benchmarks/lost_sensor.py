@@ -63,7 +63,7 @@ class Loss:
         alarm: Alarm that needs the quantity.
         fault_s: Time until ``sensor_fault`` [s].
         hook_s: Time until the hook's program ran [s].
-        ran: Alarm and state of each run of the program, until the quantity was restored.
+        runs_before: Alarm and state of each run of the program, until the quantity was restored.
     """
 
     alarm: str
@@ -146,7 +146,7 @@ def rows(broker: Broker, folder: Path, lost_s: float) -> Iterator[Row]:
     latest_s = lost_s + LATE_S
     for loss in asyncio.run(attack(broker, folder, lost_s)):
         in_time = lost_s <= loss.fault_s <= latest_s and lost_s <= loss.hook_s <= latest_s
-        ran_as_expected = loss.ran == (f"{loss.alarm} raised", f"{loss.alarm} cleared")
+        ran_as_expected = loss.runs_before == (f"{loss.alarm} raised", f"{loss.alarm} cleared")
         yield Row(
             f"a charged pack loses what {loss.alarm} needs",
             f"alarm and hook after {lost_s:g} to {latest_s:g} s",

@@ -15,4 +15,6 @@ def test_ten_minutes_of_serial_bytes_are_estimated() -> None:
 
 async def test_lost_sensor_raises_sensor_fault_and_runs_the_hook(broker: Broker, tmp_path: Path) -> None:
     losses = await attack(broker, tmp_path, lost_s=0.5)
-    assert [loss.ran for loss in losses] == [(f"{alarm} raised", f"{alarm} cleared") for alarm in LOSSES.values()]
+    assert [loss.runs_before for loss in losses] == [
+        (f"{alarm} raised", f"{alarm} cleared") for alarm in LOSSES.values()
+    ]

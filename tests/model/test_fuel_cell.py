@@ -68,7 +68,7 @@ def test_a_written_file_is_read_back(tmp_path: Path) -> None:
     ("text", "edit", "message"),
     [
         ("r_ohm = 0.1677", "r_ohm = -1", r"fuel_cell\.r_ohm = -1.*greater than 0.*membrane"),
-        ("r_ohm = 0.1677", "", r"fuel_cell\.r_ohm: missing \(membrane"),
+        ("r_ohm = 0.1677", "", r"fuel_cell\.r_ohm: missing \(resistance of membrane"),
         ("oxygen_atm = 0.21", "oxygen_atm = 0.21\nhumidity = 1", r"fuel_cell\.humidity.*unknown key"),
         ("exchange_current_a = 0.000927", "exchange_current_a = 2.0", r"exchange_current_a = 2\.0.*less than 1"),
         ("[fuel_cell]", "[std]\nocv = 1.0\n[fuel_cell]", r"std\.ocv"),

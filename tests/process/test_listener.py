@@ -17,7 +17,7 @@ from bms_estimator.page.page_server import PageServer
 from bms_estimator.process import listener as listener_module
 from bms_estimator.process.listener import CONNECTIONS, Connections, Listener
 from bms_estimator.settings.page import PageSettings
-from tests.idle_connections import DESCRIPTORS, attacked, few_descriptors
+from tests.idle_connections import DESCRIPTORS, few_descriptors, hold_idle_connections
 from tests.patience import LONG_S
 
 
@@ -33,7 +33,7 @@ async def test_a_thousand_idle_connections_leave_descriptors_and_an_authorized_c
 
 
 async def _answered_under_attack(server: PageServer, tmp_path: Path) -> None:
-    async with attacked(int(server.url.rsplit(":", 1)[1].strip("/"))):
+    async with hold_idle_connections(int(server.url.rsplit(":", 1)[1].strip("/"))):
         assert len(CONNECTIONS) <= CONNECTIONS.limit
         with contextlib.ExitStack() as files:  # the limit reserves half of the descriptors for other purposes
             for number in range(DESCRIPTORS // 2):

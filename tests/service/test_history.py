@@ -23,7 +23,7 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import gap_lengths
 from tests.checkpoint.test_checkpoint import (
     CELL,
-    NEW,
+    NEW_COUNTERS,
     SETTINGS,
     edit,
     learned_estimator,
@@ -140,7 +140,7 @@ async def test_a_start_after_an_unclean_end_counts_as_a_crash(tmp_path: Path) ->
 
 
 async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: Path) -> None:
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(learned_estimator().record, NEW)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(learned_estimator().record, NEW_COUNTERS)
     for hours, settings, reason in (
         (24 * 400.0, SETTINGS, ""),
         (47.0, edit("state", longest_days=2.0), ""),
@@ -271,7 +271,7 @@ async def test_after_a_long_gap_the_soc_follows_from_the_voltage(tmp_path: Path)
     estimator = new_estimator(SETTINGS, CELL)
     for second in range(600):
         estimator.step(float(second), 0.0, 3.75)
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(estimator.record, NEW)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(estimator.record, NEW_COUNTERS)
     restored, _ = await run_at(24.0 * 7.0, tmp_path, *((float(i), 0.0, 3.95) for i in range(60)))
     fresh = new_estimator(Settings(), CELL)  # its SOC is that of its first voltage
     fresh.step(0.0, 0.0, 3.95)

@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.serial_line import Line
-from tests.service.test_process import ended, feed, pack_file, service
+from tests.service.test_process import feed, pack_file, service, stop_service
 
 TOPICS = ("bms/pack/state", "bms/pack/event")
 
@@ -41,7 +41,7 @@ async def test_states_of_an_outage_survive_a_kill_and_arrive_first_in_order_and_
     async with Listener(broker) as live, service(pack) as process:
         await live.wait_json("bms/pack/state", lambda state: state["time"] > stored[-1][1])
         await live.wait_json("bms/pack/event", lambda event: event["name"] == "unseen")
-        await ended(process)
+        await stop_service(process)
         received = [(topic, json.loads(payload)["time"]) for topic, payload, _ in live.messages if topic in TOPICS]
     board.cancel()
     assert received[: len(stored)] == stored

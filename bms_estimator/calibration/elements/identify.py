@@ -349,7 +349,7 @@ class _Candidate:
 
 
 def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
-    """Return a capture with its SOC by coulomb counting from ``soc``, or from its first rest if ``soc`` is None."""
+    """Return a capture with its SOC by coulomb counting from ``soc``. None: from its first rest."""
     if temperature_c is not None:
         load = replace(load, temperature_c=temperature_of(load, temperature_c))
     temperature = temperature_of(load)

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.can_source import PROFILES, CanSource, CellSignals
-from bms_estimator.sources.fieldbus.can_signals import KEPT_S, CanMap, FrameId
+from bms_estimator.sources.fieldbus.can_signals import MAX_AGE_S, CanMap, FrameId
 
 PYLONTECH = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])
 """Data of frame 0x356 with 52.34 V, -12.3 A (charge is positive) and 21.5 degC."""
@@ -134,9 +134,9 @@ def test_reading_needs_recent_voltage_and_current_and_contains_the_newest_other_
     assert map_.feed(7.0, 1, False, b"\x83") is None
     assert map_.feed(10.0, 2, False, b"\x05") is not None
     assert map_.feed(11.0, 1, False, b"\x83") is None
-    assert map_.feed(12.0 + KEPT_S, 2, False, b"\x05") is None
-    assert map_.feed(13.0 + KEPT_S, 1, False, b"\x83") is None
-    late = map_.feed(13.5 + KEPT_S, 2, False, b"\x05")
+    assert map_.feed(12.0 + MAX_AGE_S, 2, False, b"\x05") is None
+    assert map_.feed(13.0 + MAX_AGE_S, 1, False, b"\x83") is None
+    late = map_.feed(13.5 + MAX_AGE_S, 2, False, b"\x05")
     assert late is not None
     assert (late.voltage_v, late.cells_v) == (13.1, ())
     assert math.isnan(late.temperature_c)

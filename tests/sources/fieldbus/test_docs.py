@@ -29,7 +29,7 @@ def test_example_of_a_dbc_file_fits_the_settings_before_it(tmp_path: Path) -> No
     path.write_text(match[2])
     table = tomllib.loads(match[1])["source"] | {"dbc": str(path)}
     frames = CanMap(CanSource.model_validate(table))
-    assert frames.places == (FrameId(0x6B0, False), FrameId(0x18FF0001, True))
+    assert frames.frame_ids == (FrameId(0x6B0, False), FrameId(0x18FF0001, True))
     assert frames.feed(0.0, 0x18FF0001, True, bytes.fromhex("e40ce50c")) is None
     reading = frames.feed(0.0, 0x6B0, False, bytes.fromhex("ff85020815000000"))
     assert reading is not None
