@@ -73,7 +73,8 @@ def replay(
 ) -> None:
     """Estimate from a capture or a table.
 
-    The estimator is that of live operation. A capture of ``record`` gives bit-identical estimates.
+    The estimator is that of the live service.
+    For a capture of `run --record`, the estimates are bit-identical to those of that run.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:

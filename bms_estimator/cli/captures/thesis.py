@@ -46,8 +46,9 @@ def thesis(
 ) -> None:
     """Recompute the thesis's tables and figures, and write them beside the printed ones as one HTML page.
 
-    Chapters 2 to 4 are simulated. Chapter 5 runs on the captures: at least one voltage relaxation test, and one
-    constant load or steps, all from the same type of cell.
+    Chapters 2 to 4 are simulated.
+    Chapter 5 runs on the captures, which are all from one type of cell.
+    It needs at least one voltage relaxation test, and at least one constant load or load with steps.
     """
     recorded = _recorded(captures, cell, capacity_ah, resolution_v, current_sign) if captures else None
     started_s = time.perf_counter()

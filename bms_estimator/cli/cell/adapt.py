@@ -40,11 +40,12 @@ def adapt_command(
 ) -> None:
     """Estimate a1..a15 by the thesis's adaptive observer and write a cell file.
 
-    Algorithm 1 of the thesis runs over the capture with the smallest mean current; the averages (3.19) of its parameters are a1..a12.
+    Algorithm 1 of the thesis runs over the capture with the smallest mean current.
+    The averages (3.19) of its parameters are a1..a12.
     Equation (4.2) over all captures gives R_s. Run `ocv` first for the OCV.
 
-    Replays of the captures are scored with the cell file of --cell and with the new one. The new file is written only if
-    its score is at most 5 % worse.
+    Replays of the captures are scored with the cell file of --cell and with the new one.
+    The new file is written only if its score is at most 5 % worse.
     """
     check_out(out, captures, force=force)
     check_once(captures)

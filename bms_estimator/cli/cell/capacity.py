@@ -73,8 +73,9 @@ def capacity(
 ) -> None:
     """Measure the capacity from rests and the charge counted between them.
 
-    Each rest gives an SOC by the cell's OCV. All rests together give the charge from full to empty with its standard
-    deviation, under any load. No cell file is written; enter the result as `cell.capacity_ah` and `cell.capacity_std`.
+    Each rest gives an SOC by the cell's OCV. The loads between the rests may have any form.
+    All rests together give the charge from full to empty, with its standard deviation.
+    No cell file is written; enter the result as `cell.capacity_ah` and `cell.capacity_std`.
     """
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]

@@ -58,11 +58,12 @@ def identify_command(
 
     Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole SOC range are best.
 
-    Run `ocv` first, which writes a cell file with the OCV. Replays of the captures are scored with the cell file of --cell
-    and with the new one. The new file is written only if its score is at most 5 % worse (docs/cell/identify.md).
+    Run `ocv` first, which writes a cell file with the OCV.
+    Replays of the captures are scored with the cell file of --cell and with the new one.
+    The new file is written only if its score is at most 5 % worse (docs/cell/identify.md).
 
-    For a fuel cell use polarization curves (columns current_a, voltage_v) and recordings under load:
-    docs/theory/fuel-cell.md.
+    For a fuel cell use polarization curves (columns current_a, voltage_v) and recordings under load.
+    See docs/theory/fuel-cell.md.
     """
     check_out(out, captures, force=force)
     check_once(captures)

@@ -156,7 +156,11 @@ def ocv(
     ] = 1.0,
     series: Annotated[
         int | None,
-        typer.Option(parser=whole(1), help="number of cells in series; default: from 3.7 V a cell", show_default=False),
+        typer.Option(
+            parser=whole(1),
+            help="number of cells in series; default: median voltage divided by 3.7 V; give it for LFP packs",
+            show_default=False,
+        ),
     ] = None,
     current_sign: SignOfCurrent = None,
     force: Force = False,
@@ -164,9 +168,13 @@ def ocv(
 ) -> None:
     """Determine the open-circuit voltage and write a cell file.
 
-    Sources are captures with rests (relaxation tests, thesis 5.2.1, or HPPC), slow discharges and charges, and curves with
-    columns soc, ocv_v[, hysteresis_v], at any temperatures. The kind of each file is recognized. The file's resistances are
-    estimates from the rests and the most similar generic cell; `identify` improves them.
+    Sources are captures with rests: HPPC, or relaxation tests (5.2.1 of the thesis).
+    Slow discharges and charges are sources too.
+    A given curve has the columns soc, ocv_v[, hysteresis_v].
+    Sources may have different temperatures. The kind of each source is recognized.
+
+    The resistances in the written cell file are estimates from the rests and the most similar generic cell.
+    `identify` improves them.
     """
     check_out(out, captures, force=force)
     check_once(captures)

@@ -44,8 +44,8 @@ def capture(
 ) -> None:
     """Write a pack's samples to a table that `replay`, `identify`, `validate` and `capacity` read.
 
-    Blocks are in the order of their numbers. The server keeps them for some days (`fleet serve`). With the settings of
-    `fleet packs show PACK --out FOLDER`, `replay` estimates as the workers did.
+    Blocks are in the order of their numbers. The server stores them for some days (`fleet serve`).
+    With the settings of `fleet packs show PACK --out FOLDER`, `replay` estimates as the workers did.
     """
     check_out(out, [], force=force)
     sink = table_sink(out)

@@ -28,8 +28,9 @@ def demo(
 ) -> None:
     """Run server, simulated packs, two workers and the fleet's page in one terminal for a minute; one worker is killed.
 
-    All are real processes on loopback with free ports and a temporary folder. The edges run ten times as fast as real
-    time. The output compares estimates with the true SOC of the simulated packs.
+    All are real processes on loopback with free ports and a temporary folder.
+    The edges run ten times as fast as real time.
+    The output compares estimates with the true SOC of the simulated packs.
     """
     with show_compile_progress():
         load_fleet_kernels()

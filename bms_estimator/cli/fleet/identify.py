@@ -56,8 +56,9 @@ def identify(
 ) -> None:
     """Re-identify packs from the blocks on the server.
 
-    A new cell is identified from two thirds of the samples. The last third decides whether the new or the old cell
-    predicts the voltage better. A cell file is written only if the new one is better; otherwise the reason is given.
+    A new cell is identified from two thirds of the samples.
+    The last third decides whether the new or the old cell predicts the voltage better.
+    A cell file is written only if the new one is better; otherwise the reason is printed.
     """
     address = (server, creds, ca)
     names = _names(packs or [], from_file)

@@ -52,8 +52,10 @@ def simulate(
 ) -> None:
     """Simulate the edges of many packs: send a block a minute for each, and again if a worker requests it.
 
-    A few MQTT connections stand for all edges. The packs have shipped cells with different capacities and resistances. A
-    block is computed from seed, pack and number. With --table and without --mqtt only the table is written.
+    A few MQTT connections stand for all edges.
+    The packs have shipped cells with different capacities and resistances.
+    A block is computed from seed, pack and number.
+    With --table and without --mqtt only the table is written.
     """
     if mqtt is None and table is None and truth is None:
         raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write the table of the packs alone")

@@ -20,7 +20,7 @@ from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
 def dashboard(
     pack: Annotated[
         Path | None,
-        typer.Argument(help="settings of a pack, for its \\[mqtt] and \\[page]", show_default=False),
+        typer.Argument(help="settings of a pack, pack.toml; its \\[mqtt] and \\[page] are used", show_default=False),
     ] = None,
     mqtt: Annotated[
         str | None, typer.Option(help="broker, mqtt://host:port; default: that of PACK, or mqtt://localhost:1883")

@@ -41,9 +41,9 @@ def demo(
 ) -> None:
     """Run broker, board, service and live page in one terminal, until Ctrl-C.
 
-    A simulated board measures a simulated 275 mAh cell under a changing load. The real service reads it from a
-    pseudo-terminal and publishes to a broker on loopback. The initial SOC is 20 % wrong; the true SOC is shown beside the
-    estimate.
+    A simulated board measures a simulated 275 mAh cell under a changing load.
+    The real service reads the board from a pseudo-terminal and publishes to a broker on loopback.
+    The initial SOC is 20 % wrong; the true SOC is shown beside the estimate.
     """
     log = deque[str](maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)

@@ -19,7 +19,7 @@ from bms_estimator.settings.pack import load_settings
 
 def edge(
     pack: Annotated[Path, typer.Argument(help="settings of the pack, with \\[edge]")] = Path("pack.toml"),
-    port: Annotated[str | None, typer.Option(help="serial port; overrides port in section [sensor]")] = None,
+    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
 ) -> None:
     """Send a pack's raw samples to a fleet's server, until SIGINT or SIGTERM.
 

@@ -32,9 +32,12 @@ REDRAW_S = 0.25
 def record(
     out: Annotated[Path, typer.Argument(help="new file", show_default=False)],
     pack: Annotated[
-        Path | None, typer.Option(help="settings of the pack, for its \\[sensor] or \\[source]", show_default=False)
+        Path | None,
+        typer.Option(
+            help="settings of the pack, pack.toml; its \\[sensor] or \\[source] names the device", show_default=False
+        ),
     ] = None,
-    port: Annotated[str | None, typer.Option(help="serial port; overrides port in section [sensor]")] = None,
+    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
     baud: Annotated[int | None, typer.Option(parser=whole(1200), help="baud rate in place of sensor.baud")] = None,
     rate_hz: Annotated[
         int | None, typer.Option(parser=whole(1, 1000), help="sample rate in place of sensor.sample_rate_hz")
@@ -49,10 +52,10 @@ def record(
         ),
     ] = None,
 ) -> None:
-    """Record a board's raw bytes with their arrival times, until Ctrl-C.
+    """Record the raw bytes of a board or another source with their arrival times, until Ctrl-C.
 
-    Each chunk is written as it arrives, so a killed recorder leaves a readable capture. Without --pack and
-    --port the only connected board is used.
+    Each chunk is written as it arrives, so a killed recorder leaves a readable capture.
+    Without --pack and --port the only connected board is used.
     """
     settings = load_pack(pack)[0] if pack else Settings()
     protocol = "text" if text else None

@@ -33,7 +33,7 @@ def run(
     packs: Annotated[
         list[Path] | None, typer.Argument(help="settings file of each pack", show_default="pack.toml")
     ] = None,
-    port: Annotated[str | None, typer.Option(help="serial port; overrides port in section [sensor]")] = None,
+    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
     mqtt: Annotated[str | None, typer.Option(help="broker in place of mqtt.url, mqtt://host:port")] = None,
     record: Annotated[
         Path | None, typer.Option(help="also record the source's raw bytes in this new file", show_default=False)

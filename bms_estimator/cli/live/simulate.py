@@ -70,9 +70,9 @@ def simulate(
 ) -> None:
     """Serve a simulated board on a pseudo-terminal, until Ctrl-C.
 
-    Prints the path of the pseudo-terminal for ``run --port PATH``. The board uses the firmware's protocol and measures a
-    simulated pack with a 10-bit converter. With --mqtt it publishes as an ESPHome node with a JK-BMS, for
-    ``source.profile = "esphome-jk"``.
+    The command prints the path of the pseudo-terminal for `run --port PATH`.
+    The board uses the firmware's protocol and measures a simulated pack with a 10-bit converter.
+    With --mqtt it publishes as an ESPHome node with a JK-BMS, for `source.profile = "esphome-jk"`.
     """
     model = load_cell(cell, capacity_ah).pack(series, 1)
     ampere = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a

@@ -16,7 +16,7 @@ from bms_estimator.model.sample import CurrentSign
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
 """Option that prints the result as JSON."""
 CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
-OR_FUEL_CELL_HELP = f"{CELL_HELP}; pem_30w or a fuel cell's file"
+OR_FUEL_CELL_HELP = f"{CELL_HELP}; for a fuel cell: pem_30w or path of a file"
 CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
 CapacityAh = Annotated[
     float | None,
