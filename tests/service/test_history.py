@@ -25,7 +25,7 @@ from tests.checkpoint.test_checkpoint import (
     CELL,
     NEW_COUNTERS,
     SETTINGS,
-    edit,
+    edit_settings,
     learned_estimator,
     run_samples,
     run_with_frequent_saves,
@@ -143,8 +143,8 @@ async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: 
     CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(learned_estimator().record, NEW_COUNTERS)
     for hours, settings, reason in (
         (24 * 400.0, SETTINGS, ""),
-        (47.0, edit("state", longest_days=2.0), ""),
-        (49.0, edit("state", longest_days=2.0), "refused: it is 2.0 days old, state.longest_days is 2"),
+        (47.0, edit_settings("state", longest_days=2.0), ""),
+        (49.0, edit_settings("state", longest_days=2.0), "refused: it is 2.0 days old, state.longest_days is 2"),
     ):
         assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: at(hours)).load().reason == reason
 
@@ -157,7 +157,7 @@ COUNTERS = RunCounters(
 async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0))
     file.save(learned_estimator().record, COUNTERS)
-    _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edit("state", longest_days=2.0))
+    _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edit_settings("state", longest_days=2.0))
     assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
 
 

@@ -89,7 +89,7 @@ def test_frame_of_a_profile_is_decoded() -> None:
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
     assert source_settings.sensor == {"current_sign": "charge_positive", **steps}
     map_ = CanMap(source_settings)
-    assert map_.places == (FrameId(0x356, False),)
+    assert map_.frame_ids == (FrameId(0x356, False),)
     assert map_.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
     assert map_.feed(0.0, 0x355, False, bytes(4)) is None
     reading = map_.feed(0.0, 0x356, False, PYLONTECH)
@@ -144,7 +144,7 @@ def test_reading_needs_recent_voltage_and_current_and_contains_the_newest_other_
 
 def test_signals_of_a_dbc_file_are_decoded(dbc_source: CanSource) -> None:
     map_ = CanMap(dbc_source)
-    assert set(map_.places) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
+    assert set(map_.frame_ids) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
     assert map_.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
     assert map_.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
     assert map_.feed(0.0, 0x501, False, bytes([1, 0xE6, 0x0C])) is None
@@ -202,7 +202,7 @@ def test_resolutions_of_a_profile_are_the_factors_of_its_dbc_file(profile: str) 
 def test_configured_dbc_file_replaces_that_of_the_profile(dbc: Path) -> None:
     source_settings = source(profile="pylontech-can", dbc=str(dbc), temperature={"signal": "Temp"})
     assert source_settings.sensor == {"current_sign": "charge_positive"}
-    assert set(CanMap(source_settings).places) == {FrameId(0x500, False), FrameId(0x18FF0000, True)}
+    assert set(CanMap(source_settings).frame_ids) == {FrameId(0x500, False), FrameId(0x18FF0000, True)}
 
 
 V, I = {"signal": "V"}, {"signal": "I"}  # noqa: E741
@@ -222,7 +222,7 @@ V, I = {"signal": "V"}, {"signal": "I"}  # noqa: E741
         ({"voltage": V | {"scale": 0.0}, "current": I, "dbc": "x"}, "must not be 0"),
         ({"voltage": V, "current": I, "dbc": "x", "cells": [{"signal": "C{}", "count": 97}]}, "96"),
         ({"voltage": V, "current": I, "dbc": "x", "cells": 2 * [{"signal": "C{}", "count": 60}]}, "at most 96"),
-        ({"voltage": V, "current": I, "dbc": "x", "cells": [{"signal": "Cell", "count": 2}]}, "holds {}"),
+        ({"voltage": V, "current": I, "dbc": "x", "cells": [{"signal": "Cell", "count": 2}]}, "must contain {}"),
     ],
 )
 def test_invalid_settings_are_rejected_with_a_reason(options: dict[str, object], reason: str) -> None:
