@@ -124,6 +124,7 @@ class Client(aiomqtt.Client):
                 raise BrokerConnectionError(f"a message cannot be sent: {error_string(info.rc)}")
             answer: asyncio.Future[PublishRejection | None] = asyncio.get_running_loop().create_future()
             self._answers[info.mid] = answer
+            self._client.loop_write()  # send now, because other tasks may run before the event loop finds the socket writable
             try:
                 await asyncio.wait([answer], timeout=self._acknowledge_s)
                 # after a suspend, both answer and timeout may be due: an answer takes precedence
@@ -225,10 +226,13 @@ class Client(aiomqtt.Client):
             super()._on_socket_open(client, userdata, sock)
 
     def _on_socket_register_write(self, client: Any, userdata: Any, sock: socket.socket) -> None:  # noqa: ARG002
-        """Register the socket as the base class does, unless it was closed meanwhile and its descriptor reused."""
+        """Register the socket as the base class does, unless it was closed meanwhile and its descriptor reused.
+
+        A socket without waiting packets is not registered, because ``publish`` has already sent them.
+        """
 
         def watch() -> None:
-            if sock.fileno() >= 0:
+            if sock.fileno() >= 0 and client.want_write():
                 self._loop.add_writer(sock, client.loop_write)
 
         self._loop.call_soon_threadsafe(watch)

@@ -44,6 +44,8 @@ class AlarmMonitor:
 
     Attributes:
         alarms: The monitored alarms and their states.
+        report: All alarms as of the last evaluation. An alarm that was raised and has ended since the previous one is
+            reported as raised.
 
     Raises:
         UserError: A setting of the alarms is not valid for the pack (``watched``).
@@ -64,30 +66,37 @@ class AlarmMonitor:
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
         self.alarms = AlarmEvaluator(watched(settings, cell), charging_a(cell), gap_s, inputs, silent_limit_s(settings))
+        self.report = self.alarms.report()
         self._last_sample_s, self._arrival_s = (
             clock.monotonic(),
             clock.wall(),
         )  # times of the last sample, accepted or not
         self._evaluated_s = -math.inf
 
-    def add(self, block: SampleBlock, trace: TraceBlock, now_s: float) -> None:
-        """Add a block of samples and its estimates.
+    def add(self, block: SampleBlock, trace: TraceBlock, now_s: float) -> bool:
+        """Add a block of samples and its estimates; evaluate the alarms if this is due.
 
         Args:
             block: Samples.
             trace: Estimates of the accepted samples.
             now_s: Monotonic clock [s].
+
+        Returns:
+            True if an alarm has changed.
         """
         self.alarms.add(block, trace, self._source.cells)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
-        if now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS:
-            self.evaluate(now_s)
+        is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
+        return is_due and self.evaluate(now_s)
 
-    def evaluate(self, now_s: float) -> None:
+    def evaluate(self, now_s: float) -> bool:
         """Evaluate the alarms from the samples since the last call, or from their absence.
 
         Args:
             now_s: Monotonic clock [s].
+
+        Returns:
+            True if an alarm has changed.
         """
         elapsed_s, self._evaluated_s = now_s - self._evaluated_s, now_s
         record = self._estimator.record[0]
@@ -97,7 +106,7 @@ class AlarmMonitor:
         self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.message or "")
         if (hooks := self._hooks()) is not None:
             self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall())
-        self._report_changes()
+        return self._report_changes()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Acknowledge an alarm; None: all alarms. Return the acknowledged alarms."""
@@ -105,14 +114,26 @@ class AlarmMonitor:
         self._report_changes()
         return acknowledged
 
+    def restore(self, saved_state: str) -> None:
+        """Restore the ``alarms.saved_state`` of an earlier run.
+
+        Raises:
+            ValueError, TypeError, LookupError: The saved state is damaged.
+        """
+        self.alarms.restore(saved_state)
+        self.report = self.alarms.report()
+
     def _counts(self) -> SampleCounts:
         """Return the sample counters. A damaged frame also counts as missing in a numbered sequence."""
         line, samples = self._source.counters, sample_counters(self._estimator.state[0])
         lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
         return SampleCounts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))
 
-    def _report_changes(self) -> None:
-        for change in self.alarms.changes():
+    def _report_changes(self) -> bool:
+        """Update the report, log the changes and pass them on. Return True if there are any."""
+        self.report = self.alarms.report()
+        changes = self.alarms.changes()
+        for change in changes:
             alarm = change.alarm
             if change.field == "watched":
                 write_log = log.info if alarm.watched else log.warning
@@ -122,3 +143,4 @@ class AlarmMonitor:
             else:
                 log.info("alarm cleared", alarm=alarm.name)
             self._on_alarm(change)
+        return bool(changes)

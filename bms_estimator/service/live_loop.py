@@ -102,7 +102,7 @@ async def run_estimation_loop(
         on_alarm=hooks.on_alarm_change,
     )
     _restore_alarms(publisher, counters.alarms)
-    hooks.restore_active(publisher.alarm_monitor.alarms.report())
+    hooks.restore_active(publisher.alarm_monitor.report)
     if requests is not None:
         RequestHandlers(estimator, publisher, current_zero).register(requests)
     interval_s = settings.state.checkpoint_s
@@ -214,7 +214,7 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clo
 def _restore_alarms(publisher: Publisher, saved: str) -> None:
     """Restore the alarms of an earlier run; damaged ones are logged and dropped."""
     try:
-        publisher.alarm_monitor.alarms.restore(saved)
+        publisher.alarm_monitor.restore(saved)
     except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
         log.warning("the alarms of the checkpoint are damaged and were not restored", reason=str(error))
 

@@ -76,11 +76,11 @@ async def run_pack_service(
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = DeliveryStats(store_trouble=lambda: database.reason) if database else DeliveryStats()
     all_sinks = [*sinks, *export_sinks(settings)]
+    if database and settings.store.history_days:
+        all_sinks.append(History(database, days=settings.store.history_days))
     requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = KnownBoardFile(folder, settings.pack.name) if folder else None
     source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, memory=memory)
-    if database and settings.store.history_days:
-        all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     publish_raw: PublishRaw | None = None
@@ -95,7 +95,7 @@ async def run_pack_service(
             home_assistant=settings.home_assistant,
             alarms=[each.name for each in watched(settings, cell)],
         )
-        all_sinks.append(mqtt)
+        all_sinks.insert(0, mqtt)  # so that no other sink delays the messages
         publish_raw = mqtt.publish_raw
     hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, publish_raw, select_relay(settings, source.relay))
     if settings.page is not None:

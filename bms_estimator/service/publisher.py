@@ -133,7 +133,7 @@ class Publisher:
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
     def add(self, block: SampleBlock, trace: TraceBlock) -> None:
-        """Add a block of samples and its estimates; publish if a snapshot is due."""
+        """Add a block of samples and its estimates; publish if a snapshot is due or an alarm has changed."""
         if self._source_health:
             self._latency.add(self._source_health().block_age_s)
         now_s = self._clock.monotonic()
@@ -144,29 +144,42 @@ class Publisher:
             self._drop_reason = out_of_range_reason(block, self._estimator.settings[0]) or ""
         elif self._drop_reason is not None:
             self._drop_reason, self._dropped_before = None, self._dropped()
-        self.alarm_monitor.add(block, trace, now_s)
-        if now_s >= self._due_s:
+        is_due = now_s >= self._due_s
+        if is_due and self.latest:  # before the alarms, so that their evaluation does not delay the estimate
+            self._publish_snapshot(now_s)
+        alarm_changed = self.alarm_monitor.add(block, trace, now_s)
+        if is_due and not self.latest:  # the first snapshot lists the alarms that the first samples permit
             self.publish()
+        elif alarm_changed:
+            self._pass_to_sinks(self.snapshot._replace(estimate=None, alarms=self.alarm_monitor.report))
 
     def add_lag(self, lag_s: float) -> None:
         """Add a measured delay of the event loop [s]."""
         self._lag_s = max(self._lag_s, lag_s)
 
     def publish(self) -> None:
-        """Make a snapshot, and pass it to all sinks."""
+        """Evaluate the alarms, make a snapshot, and pass it to all sinks."""
         now_s = self._clock.monotonic()
+        self.alarm_monitor.evaluate(now_s)
+        self._publish_snapshot(now_s)
+
+    def _publish_snapshot(self, now_s: float) -> None:
+        """Make a snapshot with the alarms of their last evaluation, and pass it to all sinks."""
         self._due_s += self.period_s
         if self._due_s <= now_s:  # a publisher that is late skips the missed publications
             self._due_s = now_s + self.period_s
-        self.alarm_monitor.evaluate(now_s)
-        self.snapshot = self._next_snapshot(now_s)
-        if self.snapshot.estimate is not None:
-            self.latest = self.snapshot.estimate
+        snapshot = self._next_snapshot(now_s)
+        if snapshot.estimate is not None:
+            self.latest = snapshot.estimate
             self._rest.add(self.latest, now_s)
-        elif not self.snapshot.health.sensor_online:
+        elif not snapshot.health.sensor_online:
             self._rest.reset()
+        self._pass_to_sinks(snapshot)
+
+    def _pass_to_sinks(self, snapshot: Snapshot) -> None:
+        self.snapshot = snapshot
         for sink in self._sinks:
-            sink.publish(self.snapshot)
+            sink.publish(snapshot)
 
     def publish_last(self) -> None:
         """Publish a last snapshot with all payloads recomputed."""
@@ -200,7 +213,7 @@ class Publisher:
             parameters,
             self._health(now_s, self._sensor_message(now_s)),
             self._info(),
-            self.alarm_monitor.alarms.report(),
+            self.alarm_monitor.report,
         )
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
@@ -216,7 +229,7 @@ class Publisher:
         if slow_due or health.sensor_online != (message is None):
             health = self._health(now_s, message)
             self._log_input_faults(health)
-        return Snapshot(estimate, parameters, health, info, self.alarm_monitor.alarms.report())
+        return Snapshot(estimate, parameters, health, info, self.alarm_monitor.report)
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         remaining = remaining_charge(self._estimator, window.current_a)

@@ -1,13 +1,16 @@
-"""Log lines of the publisher."""
+"""Log lines and times of publication of the publisher."""
 
+import numpy as np
 from structlog.testing import capture_logs
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.sample import SAMPLE
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
+from tests.collector import Collector
 from tests.scripted_source import ScriptedSource
 
 
@@ -31,3 +34,17 @@ def test_suspected_input_faults_are_logged_when_their_set_changes() -> None:
             publisher.publish()
         logged.append([str(line["suspects"])[:30] for line in lines])
     assert logged == [["['no data at 41 C, the cell fi"], [], ["none"], []]
+
+
+def test_a_raised_alarm_is_published_before_the_next_snapshot_is_due() -> None:
+    now_s, cell, sink = 0.0, load_cell("chen_mora"), Collector()
+    settings = Settings.model_validate({"publish": {"rate_hz": 0.1}, "alarms": {"pack_over_voltage": {"delay_s": 0.0}}})
+    estimator = Estimator(cell, initial_soc=0.5)
+    clock = Clock(monotonic=lambda: now_s)
+    publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock)
+    for now_s, voltage_v in ((0.0, 3.8), (1.0, 3.8), (2.0, 6.0), (3.0, 6.0)):
+        block = np.array([(now_s, 0.0, voltage_v, 25.0, 0)], dtype=SAMPLE)
+        publisher.add(block, estimator.run(block))
+    raised = [[alarm.name for alarm in each.alarms if alarm.active] for each in sink.snapshots]
+    assert raised == [[], ["pack_over_voltage"]]
+    assert [each.estimate is None for each in sink.snapshots] == [False, True]

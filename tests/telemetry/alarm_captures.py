@@ -106,7 +106,7 @@ async def replayed(
     publisher = Publisher(
         settings_, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
     )
-    publisher.alarm_monitor.alarms.restore(saved_state)
+    publisher.alarm_monitor.restore(saved_state)
     async for block in source:
         now_s = float(block["time_s"][-1])
         publisher.add(block, estimator.run(block))

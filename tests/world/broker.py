@@ -366,6 +366,9 @@ class VirtualPaho:
             self._broker._send_to_broker(connection, lambda: self._broker._end(connection, publishes_will=True))
             self.on_disconnect(self, None, NO_FLAGS, code, None)
 
+    def loop_write(self) -> paho.MQTTErrorCode:
+        return paho.MQTT_ERR_SUCCESS  # ``publish`` has sent the packet
+
     def socket(self) -> Any:
         return SimpleNamespace(shutdown=lambda _: self.lost(CONNECTION_LOST))
 

@@ -121,7 +121,7 @@ async def _evaluate(settings: Settings, cell: PackModel, source: Replay) -> Alar
         now_s = max(now_s, float(block["time_s"][-1]))
         monitor.add(block, estimator.run(block), now_s)
     monitor.evaluate(now_s)
-    reported = monitor.alarms.report()
+    reported = monitor.report
     raised, latched = _pair_changes(changes), {alarm.name for alarm in reported if alarm.latched}
     for each in raised:
         each.latched = each.ended_s is None and each.alarm in latched

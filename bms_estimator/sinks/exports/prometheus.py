@@ -35,8 +35,9 @@ class PrometheusSink(Collector):
         self._stack = contextlib.AsyncExitStack()
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Store a snapshot for the next scrape."""
-        self._last = snapshot
+        """Store a snapshot for the next scrape, with the last estimate if it has none."""
+        estimate = snapshot.estimate or (self._last and self._last.estimate)
+        self._last = snapshot._replace(estimate=estimate)
 
     def collect(self) -> Iterable[Metric]:
         """Return the metrics of the last snapshot."""

@@ -175,6 +175,7 @@ class MqttSink:
         while True:
             await self._wake.wait()
             self._wake.clear()
+            await asyncio.sleep(0)  # the outbox sends the state first
             if self._resend_retained:
                 self._resend_retained, self._sent = False, PublishedState()
                 self._availability.record_published()

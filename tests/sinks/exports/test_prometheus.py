@@ -38,10 +38,10 @@ def snapshot_with_all_values() -> Snapshot:
     return ONE._replace(estimate=ONE.estimate.model_copy(update=values), alarms=(SOC_LOW,))
 
 
-async def scrape(snapshot: Snapshot | None) -> str:
+async def scrape(*snapshots: Snapshot) -> str:
     settings = PrometheusSettings(listen=f"127.0.0.1:{free_port()}")
     async with PrometheusSink(settings) as sink:
-        if snapshot is not None:
+        for snapshot in snapshots:
             sink.publish(snapshot)
 
         def get() -> str:
@@ -60,6 +60,10 @@ def values(text: str) -> dict[tuple[str, ...], float]:
             assert labels.pop("device") == "pack"
             metrics[sample.name, *labels.values()] = sample.value
     return metrics
+
+
+async def test_a_snapshot_without_an_estimate_leaves_the_last_one_in_the_scrape() -> None:
+    assert values(await scrape(ONE, ONE._replace(estimate=None)))["bms_voltage_volts",] == 3.8
 
 
 async def test_a_scrape_has_the_values_in_base_units() -> None:
@@ -84,7 +88,7 @@ async def test_a_scrape_has_the_values_in_base_units() -> None:
 
 
 async def test_unknown_and_stale_values_have_no_metrics() -> None:
-    assert values(await scrape(None)) == {}
+    assert values(await scrape()) == {}
     for stale in (NOTHING_YET, snapshot("no board")):
         metrics = values(await scrape(stale))
         assert not {"bms_voltage_volts", "bms_soc_ratio"} & {name for name, *_ in metrics}
