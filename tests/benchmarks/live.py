@@ -18,6 +18,7 @@ from load import CELL, pulses
 from numpy.typing import NDArray
 from table import Row
 
+from bms_estimator.protocols.firmware.messages import SampleMessage
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 
@@ -79,26 +80,28 @@ class Run:
     cpu: float
     """CPU time of the service as a fraction of one core."""
     latency_s: NDArray[np.float64]
-    """Time from a sample taken to the reception of its estimate [s]."""
+    """Time from the bytes of a sample to the reception of its estimate [s]."""
     sent: int
     last: State
 
 
-class Signal:
-    """Signal at a board's sensors, sample by sample.
+class TimedBoard(VirtualBoard):
+    """Board with a signal of current pulses.
 
     Attributes:
-        taken_s: Monotonic time of each sample so far, at which its bytes are sent [s].
+        sent_s: Monotonic time of each frame so far, just before its bytes are written [s].
     """
 
     def __init__(self, rate_hz: int) -> None:
         block = pulses(MAX_S * rate_hz, rate_hz)
-        self._readings = [Reading(*row) for row in zip(block["current_a"], block["voltage_v"], strict=True)]
-        self.taken_s: list[float] = []
+        readings = [Reading(*row) for row in zip(block["current_a"], block["voltage_v"], strict=True)]
+        super().__init__(readings, rate_hz=rate_hz)
+        self.sent_s: list[float] = []
 
-    def __call__(self, _time_s: float) -> Reading:
-        self.taken_s.append(time.monotonic())
-        return self._readings[len(self.taken_s) - 1]
+    def _frame(self, message: SampleMessage) -> bytes:
+        frame = super()._frame(message)
+        self.sent_s.append(time.monotonic())
+        return frame
 
 
 def rows() -> Iterator[Row]:
@@ -131,9 +134,9 @@ def rows() -> Iterator[Row]:
 
 def measure(rate_hz: int) -> Run:
     """Run board, broker, service and subscriber."""
-    sensors, folder = Signal(rate_hz), tempfile.TemporaryDirectory()
-    with folder as path, VirtualBoard(sensors, rate_hz=rate_hz) as board, broker(Path(path)) as server:
-        return asyncio.run(_measure(Path(path), board, rate_hz, sensors, server))
+    folder = tempfile.TemporaryDirectory()
+    with folder as path, TimedBoard(rate_hz) as board, broker(Path(path)) as server:
+        return asyncio.run(_measure(Path(path), board, rate_hz, server))
 
 
 def measure_bare_publish() -> float:
@@ -175,7 +178,7 @@ def pack_file(folder: Path, name: str, port: str, rate_hz: int, server: Broker, 
     return path
 
 
-async def _measure(folder: Path, board: VirtualBoard, rate_hz: int, sensors: Signal, server: Broker) -> Run:
+async def _measure(folder: Path, board: TimedBoard, rate_hz: int, server: Broker) -> Run:
     pack = pack_file(folder, "bench", board.path, rate_hz, server, PUBLISH_RATE_HZ)
     states: list[State] = []
     running = asyncio.create_task(board.run_for_host())
@@ -200,8 +203,8 @@ async def _measure(folder: Path, board: VirtualBoard, rate_hz: int, sensors: Sig
             await asyncio.wait_for(service.wait(), PATIENCE_S)
             listening.cancel()
     samples = np.rint(np.array([s.board_time_s for s in published]) * rate_hz).astype(int)
-    latency_s = np.array([s.arrival_s for s in published]) - np.array(sensors.taken_s)[samples]
-    return Run(states[0].arrival_s - started_s, cpu, latency_s, len(sensors.taken_s), states[-1])
+    latency_s = np.array([s.arrival_s for s in published]) - np.array(board.sent_s)[samples]
+    return Run(states[0].arrival_s - started_s, cpu, latency_s, len(board.sent_s), states[-1])
 
 
 async def _listen(client: aiomqtt.Client, states: list[State]) -> None:

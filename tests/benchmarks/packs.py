@@ -12,10 +12,8 @@ from typing import Any
 
 import aiomqtt
 import psutil
-from live import MEASURE_S, MOSQUITTO, PATIENCE_S, PROGRAM, SETTLE_S, Broker, Signal, broker, pack_file
+from live import MEASURE_S, MOSQUITTO, PATIENCE_S, PROGRAM, SETTLE_S, Broker, TimedBoard, broker, pack_file
 from table import Row
-
-from bms_estimator.simulation.virtual_board import VirtualBoard
 
 PACKS, RATE_HZ, PUBLISH_RATE_HZ = 20, 10, 1.0
 MAX_CPU, MAX_MIB = 0.25, 400.0
@@ -29,7 +27,7 @@ def rows() -> Iterator[Row]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         server = stack.enter_context(broker(folder))
-        boards = [stack.enter_context(VirtualBoard(Signal(RATE_HZ), rate_hz=RATE_HZ)) for _ in range(PACKS)]
+        boards = [stack.enter_context(TimedBoard(RATE_HZ)) for _ in range(PACKS)]
         cpu, health = asyncio.run(_measure(folder, boards, server))
     online = sum(h["sensor_online"] for h in health.values())
     rss_mib, lag_s = (max(h[name] for h in health.values()) for name in ("rss_mib", "loop_lag_s"))
@@ -39,7 +37,7 @@ def rows() -> Iterator[Row]:
     yield Row("  its loop's lag (the machine's)", "-", f"{1e3 * lag_s:.1f} ms", None)
 
 
-async def _measure(folder: Path, boards: list[VirtualBoard], server: Broker) -> tuple[float, dict[str, Any]]:
+async def _measure(folder: Path, boards: list[TimedBoard], server: Broker) -> tuple[float, dict[str, Any]]:
     """Return the CPU time of the service as a fraction of a core once all packs are live, and the last health of each."""
     packs = [
         pack_file(folder, f"pack{i}", board.path, RATE_HZ, server, PUBLISH_RATE_HZ) for i, board in enumerate(boards)
