@@ -119,12 +119,14 @@ def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floa
     c = model.cell
     charging = current_a < -model.fuel_cell.internal_current_a
     if 2 * charging.sum() > charging.size:
-        raise UserError(f"{path}: the current is negative, but a fuel cell takes no charge: is --current-sign right?")
+        raise UserError(f"{path}: the current is negative, but a fuel cell cannot be charged: is --current-sign right?")
     good: NDArray[np.bool_] = (voltage_v >= c.voltage_min_v) & (voltage_v <= c.voltage_max_v)
     good &= (current_a <= c.current_max_a) & ~charging
     if good.sum() < MIN_POINTS:
         limits = f"{c.voltage_min_v:g} to {c.voltage_max_v:g} V and up to {c.current_max_a:g} A"
-        raise UserError(f"{path}: {good.sum()} usable points: give at least {MIN_POINTS} within {limits} of {c.name}")
+        raise UserError(
+            f"{path}: only {good.sum()} usable points: at least {MIN_POINTS} are needed within the limits of {c.name}, {limits}"
+        )
     return good
 
 

@@ -259,9 +259,12 @@ def test_error_names_the_unusable_file(capsys, curve: Path, steps: Path, tmp_pat
         (short, "2 usable points"),
         (hole, "a value is missing"),
         (tmp_path / "none.csv", "none.csv"),
-        (one_cell, "0 usable points: give at least 3 within 2 to 18 V and up to 15 A of pem_30w"),
-        (reversed_curve, "the current is negative, but a fuel cell takes no charge: is --current-sign right?"),
-        (reversed_steps, "the current is negative, but a fuel cell takes no charge: is --current-sign right?"),
+        (
+            one_cell,
+            "only 0 usable points: at least 3 are needed within the limits of pem_30w, 2 to 18 V and up to 15 A",
+        ),
+        (reversed_curve, "the current is negative, but a fuel cell cannot be charged: is --current-sign right?"),
+        (reversed_steps, "the current is negative, but a fuel cell cannot be charged: is --current-sign right?"),
     ):
         code, _, err = run(capsys, "identify", path, "--cell", "pem_30w", "--out", tmp_path / "out.toml")
         assert code == 2
