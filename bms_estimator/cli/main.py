@@ -20,7 +20,9 @@ COMMANDS = {
     "top": Entry(
         "bms_estimator.cli.live.top:top", "Show all packs that publish to an MQTT broker, as a table in the terminal."
     ),
-    "edge": Entry("bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet server, which estimates."),
+    "edge": Entry(
+        "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet server, whose workers estimate."
+    ),
     "replay": Entry(
         "bms_estimator.cli.captures.replay:replay",
         "Run the estimator over a capture: recorded raw bytes, CSV or Parquet.",

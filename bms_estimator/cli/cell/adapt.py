@@ -46,7 +46,7 @@ def adapt_command(
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
     The captures are replayed with the cell file of --cell and with the new cell file.
-    The new file is written only if the score of its replays is at most 5 % worse.
+    The new file is written only if the error score of its replays is at most 5 % higher (docs/cell/adapt.md).
     """
     check_out(out, captures, force=force)
     check_once(captures)

@@ -127,7 +127,7 @@ def _anchor_count(anchors: int) -> str:
 
 def _shown(result: CapacityResult) -> Group:
     """Return the result as a table."""
-    anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "off", box=box.SIMPLE_HEAD)
+    anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "SOC error", box=box.SIMPLE_HEAD)
     for column in anchors.columns[1:]:
         column.justify, column.no_wrap = "right", True
     for anchor in result.anchors[:SHOWN_ANCHORS]:

@@ -118,7 +118,7 @@ def _text(result: Exported) -> str:
     return (
         f"{result.out}: written from {result.checkpoint}\n"
         f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah; series resistance x {result.r_s_factor:.3f}\n"
-        f"OCV at SOC 0, 0.1 ... 1 corrected by {correction} mV, known to {error} mV"
+        f"OCV at SOC 0, 0.1 ... 1 corrected by {correction} mV, std {error} mV"
     )
 
 

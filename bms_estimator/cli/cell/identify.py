@@ -60,7 +60,7 @@ def identify_command(
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
     The captures are replayed with the cell file of --cell and with the new cell file.
-    The new file is written only if the score of its replays is at most 5 % worse (docs/cell/identify.md).
+    The new file is written only if the error score of its replays is at most 5 % higher (docs/cell/identify.md).
 
     For a fuel cell, give polarization curves (columns current_a, voltage_v) and captures under load
     (docs/theory/fuel-cell.md).

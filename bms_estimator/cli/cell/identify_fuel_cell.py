@@ -56,7 +56,7 @@ def identify_fuel_cell(
     """Identify the parameters, write the file and print the result; arguments as in ``identify_command``."""
     if temperature_c is not None and not MIN_PLAUSIBLE_C <= temperature_c <= MAX_PLAUSIBLE_C:
         raise UserError(
-            f"--temperature-c {temperature_c:g}: must lie within {MIN_PLAUSIBLE_C:g} and {MAX_PLAUSIBLE_C:g} C"
+            f"--temperature-c {temperature_c:g}: must be between {MIN_PLAUSIBLE_C:g} and {MAX_PLAUSIBLE_C:g} °C"
         )
     start = load_fuel_cell(cell)
     names = unique_names([name_of(path) for path in paths], paths)

@@ -73,7 +73,7 @@ def simulate(
     With --table and without --mqtt, only the table is written.
     """
     if mqtt is None and table is None and truth is None:
-        raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write the table of the packs alone")
+        raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write only the table of the packs")
     fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin), prefix=_prefix(prefix))
     for path, text in ((table, fleet.table), (truth, fleet.truth_table)):
         if path is not None:

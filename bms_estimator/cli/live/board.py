@@ -77,7 +77,7 @@ def board(
     accept: Annotated[
         Path | None,
         typer.Option(
-            help="settings file of a pack, pack.toml: let the pack's service accept the next board that connects; no port is opened",
+            help="let the service of the pack with this settings file accept the next board that connects; no port is opened",
             show_default=False,
         ),
     ] = None,

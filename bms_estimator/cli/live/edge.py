@@ -23,7 +23,7 @@ def edge(
     ),
     port: Annotated[str | None, typer.Option(help="serial port that replaces sensor.port of the settings")] = None,
 ) -> None:
-    """Send a pack's raw samples to a fleet server, which estimates, until SIGINT or SIGTERM.
+    """Send a pack's raw samples to a fleet server, whose workers estimate, until SIGINT or SIGTERM.
 
     Samples are stored on disk until the server confirms them (docs/fleet/edge.md).
     """

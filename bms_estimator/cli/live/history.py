@@ -53,7 +53,7 @@ def history(
     out: Annotated[Path | None, typer.Option(help="CSV file to write; default: stdout")] = None,
     force: Force = False,
 ) -> None:
-    """Print a pack's stored history as CSV: means, extremes and totals of each minute or longer interval.
+    """Print a pack's stored history as CSV: means, extremes and totals of intervals of a minute or more.
 
     The service may be running. In column names, out means discharge and in means charge.
     """

@@ -64,7 +64,7 @@ def simulate(
         ),
     ] = None,
     prefix: Annotated[
-        str, typer.Option(help="with --mqtt: name of the ESPHome node, which begins its topics")
+        str, typer.Option(help="with --mqtt: name of the ESPHome node, and first level of its topics")
     ] = "jk-bms",
     noise_lsb: Annotated[
         float, typer.Option(parser=decimal(0.0), help="standard deviation of the AD converter's noise [LSB]")

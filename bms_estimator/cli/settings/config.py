@@ -200,7 +200,7 @@ def _failed_conditions(cell: PackModel) -> list[str]:
 def _violation(condition: Condition) -> str:
     return (
         f"condition {condition.name} of Lemma 4.1.1 fails: {condition.left:g} is not below {condition.right:g}; "
-        "a capacitance of the observer may turn negative above its SOC limit"
+        "a capacitance of the observer may become negative although the SOC is above its limit"
     )
 
 

@@ -113,8 +113,8 @@ def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path
 @pytest.mark.parametrize(
     ("celsius", "message"),
     [
-        ("-300", "--temperature-c -300: must lie within -60 and 120 C"),
-        ("121", "--temperature-c 121: must lie within -60 and 120 C"),
+        ("-300", "--temperature-c -300: must be between -60 and 120 °C"),
+        ("121", "--temperature-c 121: must be between -60 and 120 °C"),
         ("nan", "'nan': no decimal number"),
     ],
 )
