@@ -41,8 +41,8 @@ def adapt_command(
     """Estimate the parameters a1..a15 of the thesis's cell model by its adaptive observer, and write a cell file.
 
     Algorithm 1 of the thesis runs over the capture with the smallest mean current.
-    a1..a12 are the averages (3.19) of the parameters in this run.
-    a13..a15 describe R_s, which is computed by (4.2) over all captures.
+    a1..a12 are the averages of the parameters in this run, by its equation (3.19).
+    a13..a15 describe R_s, which is computed by equation (4.2) over all captures.
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
     The captures are replayed with the cell file of --cell and with the new cell file.

@@ -71,7 +71,7 @@ def remove(
 ) -> None:
     """Remove packs from the server's table; samples that they send later are stored but not estimated."""
     asyncio.run(_remove(set(packs), (server, creds, ca)))
-    typer.echo(f"{len(set(packs))} packs removed")
+    typer.echo(f"removed from the table: {', '.join(dict.fromkeys(packs))}")
 
 
 @app.command()
