@@ -13,47 +13,66 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.version import __version__
 
 COMMANDS = {
-    "run": Entry("bms_estimator.cli.live.run:run", "Estimate live from a BMS, monitor or board, and publish."),
-    "top": Entry("bms_estimator.cli.live.top:top", "Show all packs of a broker."),
+    "run": Entry(
+        "bms_estimator.cli.live.run:run",
+        "Run the live service: estimate from a BMS, monitor or sensor board, and publish.",
+    ),
+    "top": Entry(
+        "bms_estimator.cli.live.top:top", "Show all packs that publish to an MQTT broker, as a table in the terminal."
+    ),
     "edge": Entry(
-        "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet's server, without estimating."
+        "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet server, whose workers estimate."
     ),
-    "replay": Entry("bms_estimator.cli.captures.replay:replay", "Estimate from a capture: raw bytes, CSV or Parquet."),
+    "replay": Entry(
+        "bms_estimator.cli.captures.replay:replay",
+        "Run the estimator over a capture: recorded raw bytes, CSV or Parquet.",
+    ),
     "alarms": Entry("bms_estimator.cli.captures.alarms:alarms", "List the alarms that a capture would have raised."),
-    "record": Entry("bms_estimator.cli.live.record:record", "Record a source's raw bytes with their arrival times."),
-    "simulate": Entry("bms_estimator.cli.live.simulate:simulate", "Simulate a board, BMS or monitor for tests."),
-    "ports": Entry("bms_estimator.cli.live.ports:ports", "List serial ports, and identify devices on them."),
-    "board": Entry(
-        "bms_estimator.cli.live.board:board", "Show a sensor board, set its bandgap, gains and serial number."
+    "record": Entry("bms_estimator.cli.live.record:record", "Record a device's raw bytes with their arrival times."),
+    "simulate": Entry(
+        "bms_estimator.cli.live.simulate:simulate", "Simulate a sensor board, BMS or battery monitor for tests."
     ),
-    "dashboard": Entry("bms_estimator.cli.live.dashboard:dashboard", "Serve the live page of all packs of a broker."),
-    "demo": Entry("bms_estimator.cli.live.demo:demo", "Run a broker, a simulated board and the service."),
+    "ports": Entry("bms_estimator.cli.live.ports:ports", "List serial ports, and identify the devices on them."),
+    "board": Entry(
+        "bms_estimator.cli.live.board:board",
+        "Show a sensor board's properties, and set its calibration and serial number.",
+    ),
+    "dashboard": Entry(
+        "bms_estimator.cli.live.dashboard:dashboard",
+        "Serve a live web page of all packs that publish to an MQTT broker.",
+    ),
+    "demo": Entry("bms_estimator.cli.live.demo:demo", "Run an MQTT broker, a simulated board and the live service."),
     "ocv": Entry(
         "bms_estimator.cli.cell.ocv:ocv",
-        "Write a cell file with the OCV from rests, slow discharges or a table.",
+        "Write a cell file with the OCV curve from rests, slow discharges or a table.",
     ),
     "identify": Entry(
-        "bms_estimator.cli.cell.identify:identify_command", "Write a cell file with resistances from captures."
+        "bms_estimator.cli.cell.identify:identify_command", "Write a cell file with the resistances that captures show."
     ),
     "adapt": Entry(
-        "bms_estimator.cli.cell.adapt:adapt_command", "Write a cell file by the thesis's steps; identify is better."
+        "bms_estimator.cli.cell.adapt:adapt_command",
+        "Write a cell file by the method of the thesis; identify gives better files.",
     ),
     "capacity": Entry(
-        "bms_estimator.cli.cell.capacity:capacity", "Measure the capacity from rests and the charge between them."
+        "bms_estimator.cli.cell.capacity:capacity", "Measure a cell's capacity from rests and the charge between them."
     ),
-    "cell": Entry("bms_estimator.cli.cell.export:app", "Export a cell file from the state of a pack's service."),
-    "history": Entry("bms_estimator.cli.live.history:history", "Print the history of a pack as CSV."),
+    "cell": Entry(
+        "bms_estimator.cli.cell.export:app", "Write a cell file from the learned state of a pack's live service."
+    ),
+    "history": Entry("bms_estimator.cli.live.history:history", "Print a pack's stored history as CSV."),
     "validate": Entry(
-        "bms_estimator.cli.captures.validate:validate_command", "Compare a cell file with a capture, open loop."
+        "bms_estimator.cli.captures.validate:validate_command",
+        "Compare the voltage of a cell file's model with a capture, open loop.",
     ),
     "thesis": Entry(
-        "bms_estimator.cli.captures.thesis:thesis", "Recompute the thesis's tables and figures as a report."
+        "bms_estimator.cli.captures.thesis:thesis",
+        "Recompute the tables and figures of the thesis, and write a report.",
     ),
     "asyncapi": Entry(
-        "bms_estimator.cli.settings.asyncapi:asyncapi", "Print the topics and payloads as an AsyncAPI document."
+        "bms_estimator.cli.settings.asyncapi:asyncapi", "Print the MQTT topics and payloads as an AsyncAPI document."
     ),
-    "fleet": Entry("bms_estimator.cli.fleet.commands:app", "Estimate many packs: server, workers, queries."),
-    "config": Entry("bms_estimator.cli.settings.config:app", "Write, check and show a pack's settings."),
+    "fleet": Entry("bms_estimator.cli.fleet.commands:app", "Estimate many packs: server, workers and queries."),
+    "config": Entry("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
 }
 
 EXTRAS = {
@@ -94,7 +113,10 @@ def _root(
         False, "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
     ),
 ) -> None:
-    """Real-time estimator of a Li-ion battery: SOC, parameters and stability margins."""
+    """Real-time estimator of a Li-ion battery: SOC, parameters and stability margins.
+
+    The thesis, which some commands name, is "Adaptive Estimation of Li-ion Battery Model Parameters".
+    """
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -114,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         package = (error.name or "").split(".")[0]
         if package not in EXTRAS:
             raise
-        _exit_with_error(f"this needs {package}: pip install 'bms_estimator[{EXTRAS[package]}]'")
+        _exit_with_error(f"this command needs the package {package}: pip install 'bms_estimator[{EXTRAS[package]}]'")
     except BrokenPipeError:
         _redirect_stdout_to_null()
         sys.exit(1)

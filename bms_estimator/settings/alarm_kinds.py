@@ -29,51 +29,56 @@ class AlarmKind(NamedTuple):
 ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
     "pack_over_voltage": AlarmKind("the pack's voltage is too high", "stop charging", ("voltage",), "V"),
     "pack_under_voltage": AlarmKind(
-        "the pack's voltage is too low", "take the load off, charge", ("voltage",), "V", is_upper_limit=False
+        "the pack's voltage is too low", "remove the load, and charge", ("voltage",), "V", is_upper_limit=False
     ),
     "cell_over_voltage": AlarmKind(
-        "a cell's voltage is too high", "stop charging, let the cells be balanced", ("cells",), "V"
+        "a cell's voltage is too high", "stop charging, and let the cells balance", ("cells",), "V"
     ),
     "cell_under_voltage": AlarmKind(
-        "a cell's voltage is too low", "take the load off, charge", ("cells",), "V", is_upper_limit=False
+        "a cell's voltage is too low", "remove the load, and charge", ("cells",), "V", is_upper_limit=False
     ),
-    "discharge_over_current": AlarmKind("the load takes too much current", "reduce it", ("current",), "A"),
-    "charge_over_current": AlarmKind("too much current goes into the pack", "reduce the charger's", ("current",), "A"),
+    "discharge_over_current": AlarmKind("the load draws too much current", "reduce the load", ("current",), "A"),
+    "charge_over_current": AlarmKind(
+        "the charge current is too high", "reduce the current of the charger", ("current",), "A"
+    ),
     "over_temperature": AlarmKind(
-        "the pack is too hot", "stop the current, let it cool", ("temperature",), "°C", device_class="heat"
+        "the pack is too hot", "stop the current, and let the pack cool", ("temperature",), "°C", device_class="heat"
     ),
     "under_temperature": AlarmKind(
         "the pack is too cold",
-        "warm it before it is used",
+        "warm the pack before use",
         ("temperature",),
         "°C",
         is_upper_limit=False,
         device_class="cold",
     ),
     "charging_below_freezing": AlarmKind(
-        "the pack is charged while it freezes",
-        "stop charging: it plates lithium",
+        "the pack is charged below freezing",
+        "stop charging, because it plates lithium",
         ("current", "temperature"),
         "°C",
         is_upper_limit=False,
         device_class="cold",
     ),
     "soc_low": AlarmKind(
-        "little charge is left (SOC less its standard deviation)",
+        "little charge is left (SOC minus its standard deviation)",
         "charge",
         ("voltage", "current"),
         is_upper_limit=False,
         device_class="battery",
     ),
     "stability_margin_low": AlarmKind(
-        "the SOC is close to where the model ends", "charge", ("voltage", "current"), is_upper_limit=False
+        "the SOC is close to the value below which the model is unstable",
+        "charge",
+        ("voltage", "current"),
+        is_upper_limit=False,
     ),
     "cell_imbalance": AlarmKind(
-        "the cells' voltages differ", "let them be balanced, look for a weak one", ("cells",), "V"
+        "the cells' voltages differ", "let the cells balance, and look for a weak cell", ("cells",), "V"
     ),
     "sensor_fault": AlarmKind(
-        "samples are lost, cannot be used or come from two publishers",
-        "check sensors and wiring; topic health counts what is wrong",
+        "samples are lost, unusable or from two publishers",
+        "check sensors and wiring; the counters in topic health name the fault",
     ),
     "model_mismatch": AlarmKind(
         "measured and estimated voltage disagree",
@@ -81,7 +86,9 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
         ("voltage", "current"),
         "V",
     ),
-    "link_lost": AlarmKind("no samples come", "check board, cable and power", unit="s"),
-    "hook_failed": AlarmKind("an alarm hook could not do its work", "check its program; do by hand what it is for"),
+    "link_lost": AlarmKind("no samples arrive", "check board, cable and power", unit="s"),
+    "hook_failed": AlarmKind(
+        "the last run of an alarm hook failed", "check the hook, and do by hand what it should have done"
+    ),
 }
 """All alarms by name."""

@@ -123,8 +123,8 @@ def _out_of_range(alarms: tuple[AlarmDefinition, ...], cell: PackModel) -> Itera
         if not low <= alarm.limit <= high:
             key = f"alarms.{alarm.name}.limit_{'a' if alarm.kind.unit == 'A' else 'v'}"
             yield (
-                f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {alarm.kind.unit}, as the cell file has it; "
-                "is it meant for a cell, or for the pack?"
+                f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {alarm.kind.unit}, the range of the cell file; "
+                "is the value for one cell instead of the pack, or the reverse?"
             )
 
 

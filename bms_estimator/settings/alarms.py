@@ -34,9 +34,11 @@ class AlarmRule(Strict):
 
     enabled: bool = True
     severity: Literal["warning", "critical"] = "warning"
-    delay_s: NotNegative = Field(default=10.0, description="time at the limit after which the alarm is raised")
-    clear_delay_s: NotNegative = Field(default=60.0, description="time beyond the clear level after which it ends")
-    latch: bool = Field(default=False, description="true: stays raised until it is acknowledged")
+    delay_s: NotNegative = Field(default=10.0, description="the alarm is raised after this time at or beyond its limit")
+    clear_delay_s: NotNegative = Field(
+        default=60.0, description="the alarm ends after this time within its clear level"
+    )
+    latch: bool = Field(default=False, description="true: the alarm stays raised until it is acknowledged")
 
 
 class VoltageRule(AlarmRule):
@@ -78,19 +80,20 @@ class AlarmHook(Strict):
 
     alarms: tuple[AlarmName, ...] = Field(default=(), description="names of alarms; default: all but hook_failed")
     on: tuple[Literal["raised", "cleared"], ...] = Field(
-        default=("raised", "cleared"), description="changes at which a program is run or a message published"
+        default=("raised", "cleared"),
+        description="changes of an alarm at which the program is run or the message published",
     )
     run: tuple[Annotated[str, Field(min_length=1)], ...] | None = Field(
-        default=None, description="program and its arguments; no shell"
+        default=None, description="program to run and its arguments; no shell is used"
     )
     timeout_s: Annotated[float, Field(gt=0, le=3600)] = Field(
-        default=10.0, description="time after which a program and its child processes are killed"
+        default=10.0, description="time after which the program and its child processes are killed"
     )
     pass_environment: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = Field(
-        default=(), description="further environment variables of the service that a program gets"
+        default=(), description="names of further environment variables of the service that are passed to the program"
     )
     topic: Annotated[str, Field(pattern=r"^[^+#\s]{1,200}$")] | None = Field(
-        default=None, description="topic of a message at QoS 1, not retained"
+        default=None, description="MQTT topic of the message, which is sent at QoS 1 and not retained"
     )
     payload: str = Field(
         default="$json", description="payload of the message; $json, $name, $state, $text and others are substituted"
@@ -101,10 +104,12 @@ class AlarmHook(Strict):
     )
     when_silent: Literal["keep", "high", "low"] | None = Field(
         default=None,
-        description="level of the pin after the board has received nothing from the service for silent_s; "
-        "default: relay, the safe side",
+        description="level of the relay pin after the board has received nothing from the service for silent_s; "
+        "default: the level in relay, which is the safe side",
     )
-    silent_s: Annotated[int, Field(ge=15, le=3600)] = 30
+    silent_s: Annotated[int, Field(ge=15, le=3600)] = Field(
+        default=30, description="time without a message from the service after which the board sets when_silent"
+    )
     dry_run: bool = Field(default=False, description="true: only log the action")
 
     @property
@@ -130,7 +135,7 @@ PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value
 
 
 class AlarmSettings(Strict):
-    """Limits of alarms; a table for each, as in pack_over_voltage = {limit_v = 29.2, delay_s = 5}. docs/pack/alarms.md."""
+    """Alarms, each with a table such as pack_over_voltage = {limit_v = 29.2, delay_s = 5}. Default limits: docs/pack/alarms.md."""
 
     pack_over_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=2.0, clear_delay_s=10.0, latch=True)
     pack_under_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=5.0, clear_delay_s=30.0)
@@ -149,24 +154,25 @@ class AlarmSettings(Strict):
     )
     model_mismatch: VoltageRule = Field(
         default=VoltageRule(delay_s=60.0),
-        description="limit_v: innovation of the pack, measured minus predicted voltage",
+        description="limit_v: difference between measured and predicted pack voltage",
     )
     link_lost: LinkRule = Field(
         default=LinkRule(delay_s=0.0, clear_delay_s=5.0),
-        description="limit_s: time without a sample; default: 10 s or 3 periods, whichever is longer",
+        description="limit_s: time without a sample; default: 10 s, or three sample periods if these are longer",
     )
 
     hook_failed: AlarmRule = Field(
         default=AlarmRule(clear_delay_s=10.0),
-        description="raised while the last run of a hook failed",
+        description="raised when a hook fails, until its next run succeeds",
     )
 
     lost_s: NotNegative = Field(
         default=10.0,
-        description="time without a value after which a quantity counts as lost, and time with values after which it counts as restored",
+        description="a measured quantity, such as the temperature, counts as lost after this time without values, and as restored after this time with values",
     )
     hook: tuple[AlarmHook, ...] = Field(
-        default=(), description="actions when an alarm is raised or cleared, as [[alarms.hook]]; default: none"
+        default=(),
+        description="actions when an alarm is raised or cleared, each in a section [[alarms.hook]]; default: none",
     )
 
     @model_validator(mode="after")

@@ -14,23 +14,23 @@ CURRENT_RESOLUTION_A = 0.01
 
 
 class BleSource(PolledSource):
-    """BMS over Bluetooth Low Energy; needs Python 3.12."""
+    """BMS over Bluetooth Low Energy; requires Python 3.12."""
 
-    kind: Literal["ble"]
+    kind: Literal["ble"] = Field(description="kind of this source")
     address: Annotated[str, Field(pattern=r"^[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}$")] | None = Field(
-        default=None, description='address of the BMS, such as "A4:C1:38:00:11:22"; required without name'
+        default=None, description='address of the BMS, such as "A4:C1:38:00:11:22"; either address or name is required'
     )
     name: Annotated[str, Field(min_length=1)] | None = Field(default=None, description="name that the BMS advertises")
     bms: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")] | None = Field(
         default=None,
-        description='device type of aiobmsble: "jbd", "jikong", "daly", ...; default: from its advertisement',
+        description='device type, as aiobmsble names it: "jbd", "jikong", "daly", ...; default: recognized by the advertisement of the BMS',
     )
     poll_s: Annotated[float, Field(ge=0.5, le=600)] = Field(default=2.0, description="interval between two readings")
 
     @model_validator(mode="after")
     def _address_or_name(self) -> Self:
         if (self.address is None) == (self.name is None):
-            raise ValueError("give address or name, and not both")
+            raise ValueError("give either address or name")
         return self
 
     @property

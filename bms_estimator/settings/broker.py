@@ -17,10 +17,10 @@ def validate_broker_urls(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
     """
     urls = (value,) if isinstance(value, str) else value
     if not urls:
-        raise ValueError("must name a broker")
+        raise ValueError("must name at least one broker")
     for url in urls:
         if "@" in url:
-            raise ValueError("set a user name as username, and a password in the file password_file")
+            raise ValueError("must not contain a user name or password; set username and password_file instead")
         if not re.fullmatch(r"mqtts?://[^/\s]+", url):
             raise ValueError("must be mqtt://host:port")
     return value
@@ -42,21 +42,23 @@ class BrokerSettings(Strict):
 
     url: BrokerUrls = Field(
         default="mqtt://localhost:1883",
-        description="mqtt://host:port, or mqtts://host:port for TLS; or a list to try in turn",
+        description="URL of the broker, mqtt://host:port or, with TLS, mqtts://host:port; or a list of URLs to try in turn",
     )
-    username: str | None = None
+    username: str | None = Field(default=None, description="user name at the broker")
     password_file: Path | None = Field(
         default=None,
         description="file with the password; a name without a folder is a systemd credential",
     )
-    ca_file: Path | None = Field(default=None, description="certificate authority for mqtts; default: the system's")
+    ca_file: Path | None = Field(
+        default=None, description="certificate authority of an mqtts broker; default: the system's certificates"
+    )
     cert_file: Path | None = Field(
         default=None,
-        description="PEM file with the client certificate for mqtts, if the broker requires one; a name without a folder is a systemd credential",
+        description="PEM file with the client certificate, if an mqtts broker requires one; a name without a folder is a systemd credential",
     )
     key_file: Path | None = Field(
         default=None,
-        description="PEM file with the unencrypted key of cert_file; default: cert_file; a name without a folder is a systemd credential",
+        description="PEM file with the unencrypted key of the client certificate; default: the key is in cert_file; a name without a folder is a systemd credential",
     )
 
     @property

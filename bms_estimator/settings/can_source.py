@@ -30,10 +30,10 @@ class Signal(Strict):
     """Signal of the DBC file."""
 
     signal: Annotated[str, Field(min_length=1)] = Field(
-        description="name in the DBC file: Signal, or Message.Signal where several have it"
+        description="name of the signal in the DBC file; Message.Signal if several messages have a signal of this name"
     )
-    scale: float = Field(default=1.0, description="from the DBC file's unit to V, A or degC")
-    offset: float = Field(default=0.0, description="added after the scale")
+    scale: float = Field(default=1.0, description="factor from the DBC file's unit to V, A or degC")
+    offset: float = Field(default=0.0, description="offset that is added after scale")
     absent: float | None = Field(
         default=None, description="value that marks a missing measurement, in the DBC file's unit, such as 3276.7"
     )
@@ -60,14 +60,14 @@ class CellSignals(Signal):
     """Cell voltages in numbered signals."""
 
     count: Annotated[int, Field(ge=1, le=96)] = Field(
-        default=1, description="number of cells; {} in signal stands for the number of each"
+        default=1, description="number of cells; {} in signal stands for the cell number"
     )
-    first: Annotated[int, Field(ge=0)] = Field(default=1, description="number of the first cell in signal")
+    first: Annotated[int, Field(ge=0)] = Field(default=1, description="cell number of the first cell in signal")
 
     @model_validator(mode="after")
     def _check_cell_placeholder(self) -> Self:
         if self.count > 1 and "{}" not in self.signal:
-            raise ValueError("signal: with several cells it must contain {}, which stands for the number of the cell")
+            raise ValueError("signal: must contain {}, which stands for the cell number, because count is above 1")
         return self
 
     def members(self) -> tuple[Signal, ...]:
@@ -78,10 +78,12 @@ class CellSignals(Signal):
 
 
 class CanSource(PolledSource):
-    """CAN bus, receive only."""
+    """CAN bus, on which the service sends nothing."""
 
-    kind: Literal["can"]
-    profile: str | None = Field(default=None, description=f"a bus whose signals are known: {', '.join(PROFILES)}")
+    kind: Literal["can"] = Field(description="kind of this source")
+    profile: str | None = Field(
+        default=None, description=f"CAN protocol whose signals are known: {', '.join(PROFILES)}"
+    )
     interface: Annotated[str, Field(min_length=1)] = Field(
         default="socketcan", description="interface of python-can: socketcan, slcan, pcan, gs_usb, ..."
     )
@@ -89,21 +91,28 @@ class CanSource(PolledSource):
         default="can0", description="network interface, or path of the adapter's serial port"
     )
     bitrate: Annotated[int, Field(ge=10_000, le=8_000_000)] | None = Field(
-        default=None, description="bit rate for adapters that need it; socketcan uses the system's"
+        default=None,
+        description="bit rate, for adapters that require it; socketcan uses the bit rate that the system has set",
     )
     options: dict[str, str | int | float | bool] = Field(
-        default_factory=dict, description="further arguments of python-can's Bus"
+        default_factory=dict, description="further arguments of the class Bus of python-can"
     )
     dbc: Path | None = Field(
-        default=None, description="DBC file (or KCD, ARXML, SYM) with the signals; default: that of the profile"
+        default=None,
+        description="DBC, KCD, ARXML or SYM file that describes the signals; default: DBC file of the profile",
     )
     interval_s: Annotated[float, Field(ge=0.001, le=600)] = Field(
-        default=1.0, description="expected sample period on the bus"
+        default=1.0, description="expected sample period of the values on the bus"
     )
-    voltage: Signal = Field(description='pack voltage, such as { signal = "PackVoltage" }')
-    current: Signal = Field(description="as voltage; sensor.current_sign gives the sign")
-    temperature: Signal | None = Field(default=None, description="as voltage")
-    cells: tuple[CellSignals, ...] = Field(default=(), description="list of such signals, each with its count")
+    voltage: Signal = Field(description='signal of the pack voltage, such as { signal = "PackVoltage" }')
+    current: Signal = Field(
+        description="signal of the current, written like voltage; sensor.current_sign is the direction of positive current"
+    )
+    temperature: Signal | None = Field(default=None, description="signal of the temperature, written like voltage")
+    cells: tuple[CellSignals, ...] = Field(
+        default=(),
+        description='signals of the cell voltages, such as [{ signal = "Cell{}_mV", count = 16, scale = 0.001 }]',
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -113,9 +122,9 @@ class CanSource(PolledSource):
     @model_validator(mode="after")
     def _check_dbc_and_cells(self) -> Self:
         if self.dbc is None and self.profile is None:
-            raise ValueError("dbc: missing; it describes the signals")
+            raise ValueError("dbc: missing; give a DBC file that describes the signals")
         if sum(cells.count for cells in self.cells) > 96:
-            raise ValueError("cells: at most 96 of them")
+            raise ValueError("cells: must be at most 96 cells")
         return self
 
     @property

@@ -4,18 +4,23 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from bms_estimator.settings.broker import BrokerSettings
+from bms_estimator.settings.broker import BrokerSettings, BrokerUrls
 
 
 class EdgeSettings(BrokerSettings):
-    """Edge of a fleet: destination and storage of raw samples, see docs/fleet/edge.md."""
+    """Edge of a fleet: fleet server to which raw samples are sent, and their storage; see docs/fleet/edge.md."""
 
     section: ClassVar[str] = "edge"
 
+    url: BrokerUrls = Field(
+        default="mqtt://localhost:1883",
+        description="URL of the fleet server, mqtt://host:port or, with TLS, mqtts://host:port; or a list of URLs to try in turn",
+    )
     block_s: Annotated[float, Field(ge=1.0, le=3600.0)] = Field(
-        default=60.0, description="duration of a block; a kill loses at most one"
+        default=60.0,
+        description="duration of a block of samples, which is stored and sent as one message; a killed process loses at most one block",
     )
     store_mib: Annotated[float, Field(ge=0.1, le=100_000.0)] = Field(
         default=100.0,
-        description="size limit of stored blocks, 100 days at 1 Hz; beyond it the oldest is dropped",
+        description="maximum size of the stored blocks [MiB]; the default holds 100 days at 1 Hz. A full store drops its oldest block",
     )

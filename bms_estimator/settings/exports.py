@@ -11,37 +11,45 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class InfluxSettings(Strict):
-    """Export of states and alarm changes to InfluxDB, or another server with its line protocol over HTTP."""
+    """Export of estimates and alarm changes to InfluxDB, or to another server that accepts its line protocol over HTTP."""
 
     url: Annotated[str, Field(pattern=r"^https?://[^/@\s?#]+(/[^@\s?#]*)?$")] = Field(
         default="http://localhost:8086", description="http://host:port or https://host:port, without user and password"
     )
-    database: Name = Field(default="bms", description="database of InfluxDB 1; ignored with bucket")
-    username: str | None = Field(default=None, description="user of InfluxDB 1, if required")
+    database: Name = Field(default="bms", description="database of InfluxDB 1; ignored if bucket is set")
+    username: str | None = Field(default=None, description="user name for InfluxDB 1, if required")
     password_file: Path | None = Field(
-        default=None, description="file with the password; a name without folder: a systemd credential"
+        default=None,
+        description="file with the password for InfluxDB 1; a name without a folder is a systemd credential",
     )
-    bucket: Name | None = Field(default=None, description="bucket of InfluxDB 2, in place of database")
+    bucket: Name | None = Field(default=None, description="bucket of InfluxDB 2, which replaces database")
     org: Name | None = Field(default=None, description="organization of InfluxDB 2")
-    token_file: Path | None = Field(default=None, description="file with a write token of InfluxDB 2; as password_file")
-    ca_file: Path | None = Field(default=None, description="certificate authority for https; default: the system's")
-    every_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(default=10.0, description="interval between requests")
+    token_file: Path | None = Field(
+        default=None,
+        description="file with a write token of InfluxDB 2; a name without a folder is a systemd credential",
+    )
+    ca_file: Path | None = Field(
+        default=None, description="certificate authority of an https server; default: the system's certificates"
+    )
+    every_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
+        default=10.0, description="interval between two write requests"
+    )
 
     @model_validator(mode="after")
     def _matching_credentials(self) -> Self:
         if self.bucket and (self.username or self.password_file):
-            raise ValueError("username and password_file: of no use with bucket, give token_file")
+            raise ValueError("username and password_file: of no use with bucket; give token_file instead")
         if not self.bucket and (self.token_file or self.org):
             raise ValueError("org and token_file: of no use without bucket")
         return self
 
 
 class PrometheusSettings(Strict):
-    """Prometheus: address of the metrics endpoint."""
+    """Endpoint from which Prometheus reads metrics."""
 
     listen: Annotated[str, Field(pattern=r"^([^:\s/@]+|\[[0-9A-Fa-f:]+\]):\d{1,5}$")] = Field(
         default="127.0.0.1:9108",
-        description="host:port for this pack, readable by anyone who reaches it",
+        description="host:port of this pack's metrics; every client that can connect to it can read them",
     )
 
     @property

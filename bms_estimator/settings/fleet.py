@@ -26,33 +26,37 @@ class ServerSettings(Strict):
 
     folder: Path | None = Field(
         default=None,
-        description="folder of streams and keys; default: systemd's StateDirectory, or the user's XDG state folder",
+        description="folder of streams and keys; default: StateDirectory of the systemd unit, otherwise bms-estimator-fleet in the user's XDG state folder",
     )
     listen: Address = Field(default="127.0.0.1:4222", description="host:port for workers, pages and queries")
     mqtt: Address = Field(default="127.0.0.1:1883", description="host:port for edges; usually port 8883 with TLS")
     monitor: Address = Field(
-        default="127.0.0.1:8222", description="host:port of the server's monitoring; only on the loopback interface"
+        default="127.0.0.1:8222",
+        description="host:port of the server's monitoring, which must be on the loopback interface",
     )
     partitions: Annotated[int, Field(ge=1, le=256)] = Field(
-        default=64, description="number of partitions that workers share; fixed when the streams are created"
+        default=64,
+        description="number of partitions of packs, which the workers divide among themselves; cannot be changed after the streams were created",
     )
     raw_gb: Gigabytes = Field(
         default=8.0,
-        description="maximum size of stored blocks for each tenant; 100,000 packs at 1 Hz send 100 GB a day",
+        description="maximum size of the stored blocks of samples, for each tenant; 100,000 packs at 1 Hz send 100 GB a day",
     )
-    raw_days: Annotated[float, Field(gt=0, le=3660)] = Field(default=7.0, description="maximum age of stored blocks")
+    raw_days: Annotated[float, Field(gt=0, le=3660)] = Field(
+        default=7.0, description="maximum age of stored blocks [days]"
+    )
     disk_gb: Gigabytes | None = Field(
         default=None, description="maximum size of all streams; default: three quarters of the free space"
     )
     sync_s: Annotated[float, Field(ge=0, le=3600)] = Field(
         default=10.0,
-        description="interval between fsyncs; a power cut may lose later messages unless another node has them; 0: fsync each message",
+        description="interval between fsyncs; a power failure loses messages since the last fsync, unless another node has them; 0: fsync after each message",
     )
 
     @model_validator(mode="after")
     def _monitor_is_local(self) -> Self:
         if not parse_listen(self.monitor).loopback:
-            raise ValueError(f'monitor = "{self.monitor}": it has no access control; listen on 127.0.0.1')
+            raise ValueError(f'monitor = "{self.monitor}": the monitor has no access control; listen on 127.0.0.1')
         return self
 
 
@@ -74,18 +78,16 @@ class TlsSettings(Strict):
 class TenantSettings(Strict):
     """A tenant with separate streams, workers and packs."""
 
-    raw_gb: Gigabytes | None = Field(
-        default=None, description="maximum size of stored blocks; default: that of [server]"
-    )
+    raw_gb: Gigabytes | None = Field(default=None, description="maximum size of stored blocks; default: server.raw_gb")
     raw_days: Annotated[float, Field(gt=0, le=3660)] | None = Field(
-        default=None, description="maximum age of stored blocks; default: that of [server]"
+        default=None, description="maximum age of stored blocks [days]; default: server.raw_days"
     )
     disk_gb: Gigabytes | None = Field(
         default=None, description="maximum size of all streams of the tenant, including replicas; default: no limit"
     )
     revoked: dict[DeviceName, AwareDatetime] = Field(
         default={},
-        description="time for each pack; tokens of the pack that were issued earlier are rejected, for example after a theft",
+        description="revocation times by pack; tokens of a pack that were issued before its time are rejected, for example after a theft",
     )
 
 
@@ -93,9 +95,10 @@ class FleetSettings(Strict):
     """A fleet's settings file."""
 
     server: ServerSettings = ServerSettings()
-    tls: TlsSettings | None = Field(default=None, description="required for clients on other machines")
+    tls: TlsSettings | None = Field(default=None, description="required if clients on other machines connect")
     tenants: dict[TenantName, TenantSettings] = Field(
-        default={}, description="[tenants.NAME]; default: one tenant for all clients of the server"
+        default={},
+        description="a section [tenants.NAME] for each tenant; default: one tenant for all clients of the server",
     )
 
     @model_validator(mode="after")

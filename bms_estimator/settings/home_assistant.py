@@ -11,19 +11,22 @@ Topic = Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")]
 
 
 class HomeAssistantSettings(Strict):
-    """Home Assistant discovery over the broker, docs/pack/home-assistant.md."""
+    """Discovery by Home Assistant over the MQTT broker; see docs/pack/home-assistant.md."""
 
-    enabled: bool = Field(default=True, description="false: no discovery; an existing device is removed")
+    enabled: bool = Field(
+        default=True, description="false: no discovery; the pack's device is removed from Home Assistant"
+    )
     discovery_prefix: Topic = Field(
         default="homeassistant", description="discovery prefix of Home Assistant's MQTT integration"
     )
     status_topic: Topic = Field(default="homeassistant/status", description="topic of Home Assistant's birth message")
     name: Annotated[str, Field(min_length=1)] | None = Field(
-        default=None, description="name of the device; default: pack.name"
+        default=None, description="name of the pack's device; default: pack.name"
     )
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
         default="discharge_positive", description="direction of positive current and power in Home Assistant"
     )
     names: dict[str, Annotated[str, Field(min_length=1)]] = Field(
-        default={}, description='names of entities, such as energy_in_kwh = "Energie geladen"'
+        default={},
+        description='names of entities in place of the default names, such as energy_in_kwh = "Energie geladen"',
     )

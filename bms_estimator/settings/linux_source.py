@@ -15,32 +15,40 @@ DEFAULT_RESOLUTION_V = 1.25e-3
 
 
 class LinuxSource(PolledSource):
-    """Current sensor with a kernel driver: INA2xx by hwmon, ADS1x15 by iio."""
+    """Current sensor with a driver in the kernel: INA2xx (hwmon) or ADS1x15 (iio)."""
 
-    kind: Literal["linux"]
+    kind: Literal["linux"] = Field(description="kind of this source")
     chip: Name = Field(
-        default="ina226", description="name of the chip, its bus address such as 1-0040, or a folder of sysfs"
+        default="ina226", description="name of the chip, its bus address such as 1-0040, or its folder in sysfs"
     )
     voltage: Name = Field(
         default="in1_input",
-        description="file of the chip, or the channel of an iio chip, such as in_voltage0; chip/file for another chip",
+        description="file of the chip with its voltage, or channel of an iio chip, such as in_voltage0; chip/file is a file of another chip",
     )
     current: Name = Field(
         default="curr1_input",
-        description="as voltage; a channel in volts is divided by shunt_ohm, which is then required",
+        description="file or channel of the current, written like voltage; a channel in volts is divided by shunt_ohm, which is then required",
     )
     temperature: Name | None = Field(
-        default=None, description="as voltage, such as temp1_input; temperature of the pack, not of the chip"
+        default=None,
+        description="file or channel of the pack's temperature (not the chip's), such as temp1_input, written like voltage",
     )
-    voltage_scale: Positive = Field(default=1.0, description="ratio of the divider: pack voltage / chip voltage")
-    voltage_offset_v: float = Field(default=0.0, description="offset added to the pack voltage")
-    current_scale: Positive = Field(default=1.0, description="factor that corrects the shunt's tolerance")
-    current_offset_a: float = Field(default=0.0, description="offset added to the current")
+    voltage_scale: Positive = Field(
+        default=1.0, description="ratio of the voltage divider: pack voltage / voltage at the chip"
+    )
+    voltage_offset_v: float = Field(
+        default=0.0, description="offset that is added to the pack voltage after voltage_scale"
+    )
+    current_scale: Positive = Field(
+        default=1.0, description="factor of the current that corrects the shunt's tolerance"
+    )
+    current_offset_a: float = Field(default=0.0, description="offset that is added to the current after current_scale")
     shunt_ohm: Positive | None = Field(
-        default=None, description="resistance of the shunt; default: the driver's assumption"
+        default=None, description="resistance of the shunt; default: the resistance that the driver assumes"
     )
     interval_s: Annotated[float, Field(ge=0.01, le=3600)] | None = Field(
-        default=None, description="sample period; default: the chip's, at least 0.1 s, or 1 s if it has none"
+        default=None,
+        description="sample period; default: update interval of the chip, but at least 0.1 s; 1 s if the chip has no update interval",
     )
 
     @property

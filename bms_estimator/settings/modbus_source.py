@@ -39,7 +39,7 @@ class Register(Strict):
     """Value of the device: content of its registers times ``scale``, plus ``offset``."""
 
     address: Annotated[int, Field(ge=0, le=0xFFFF)] = Field(
-        description="address in the request, from 0; 40001 in a manual is holding register 0"
+        description="register address in the request, counted from 0; 40001 in a manual is holding register 0"
     )
     table: Literal["holding", "input"] = Field(default="holding", description="holding: function 3; input: function 4")
     type: Literal["int16", "uint16", "int32", "uint32", "float32"] = "uint16"
@@ -47,8 +47,10 @@ class Register(Strict):
         default=False, description="true: the first of two registers is the low word of the value"
     )
     scale: float = Field(default=1.0, description="factor from the register value to V, A or degC")
-    offset: float = Field(default=0.0, description="offset added after scale, such as -273.15")
-    absent: int | None = Field(default=None, description="register value that means not measured, such as 32767")
+    offset: float = Field(default=0.0, description="offset that is added after scale, such as -273.15")
+    absent: int | None = Field(
+        default=None, description="register value that marks a missing measurement, such as 32767"
+    )
 
     @model_validator(mode="after")
     def _check_scale_and_address(self) -> Self:
@@ -69,7 +71,7 @@ class CellRegisters(Register):
 
     count: Annotated[int, Field(ge=1, le=96)] = Field(description="number of cells")
     step: Annotated[int, Field(ge=1, le=MAX_WORDS)] | None = Field(
-        default=None, description="distance from one cell to the next in registers; default: consecutive"
+        default=None, description="number of registers from one cell to the next; default: consecutive registers"
     )
 
     def cell(self, number: int) -> Register:
@@ -85,29 +87,37 @@ class CellRegisters(Register):
 
 
 class ModbusSource(PolledSource):
-    """Modbus device, on the network or on a serial line."""
+    """Modbus device on the network or on a serial line."""
 
-    kind: Literal["modbus"]
-    profile: str | None = Field(default=None, description=f"device with known registers: {', '.join(PROFILES)}")
+    kind: Literal["modbus"] = Field(description="kind of this source")
+    profile: str | None = Field(default=None, description=f"device whose registers are known: {', '.join(PROFILES)}")
     host: str | None = Field(default=None, description="Modbus TCP: host name or address of the device or gateway")
-    tcp_port: Annotated[int, Field(ge=1, le=65535)] = 502
+    tcp_port: Annotated[int, Field(ge=1, le=65535)] = Field(default=502, description="Modbus TCP: port of host")
     port: str | None = Field(
         default=None, description="Modbus RTU: path of the serial port, preferably below /dev/serial/by-id"
     )
-    baud: Annotated[int, Field(ge=300, le=4_000_000)] = 9600
-    parity: Literal["none", "even", "odd"] = "none"
-    stop_bits: Literal[1, 2] = 1
+    baud: Annotated[int, Field(ge=300, le=4_000_000)] = Field(default=9600, description="Modbus RTU: baud rate")
+    parity: Literal["none", "even", "odd"] = Field(default="none", description="Modbus RTU: parity bit")
+    stop_bits: Literal[1, 2] = Field(default=1, description="Modbus RTU: number of stop bits")
     framing: Literal["tcp", "rtu"] | None = Field(
-        default=None, description='"rtu" with a host: a gateway that forwards serial frames unchanged'
+        default=None,
+        description='"rtu" with host: the gateway forwards serial frames unchanged; default: "tcp" with host, "rtu" with port',
     )
-    unit: Annotated[int, Field(ge=0, le=255)] = Field(default=1, description="unit number of the device")
+    unit: Annotated[int, Field(ge=0, le=255)] = Field(
+        default=1, description="Modbus unit number (address) of the device"
+    )
     poll_s: Annotated[float, Field(ge=0.02, le=600)] = Field(default=1.0, description="interval between two readings")
-    timeout_s: Annotated[float, Field(ge=0.05, le=60)] = Field(default=1.0, description="timeout of one response")
-    voltage: Register = Field(description='pack voltage, such as { address = 259, type = "uint16", scale = 0.01 }')
-    current: Register = Field(description="as voltage; sensor.current_sign gives the sign")
-    temperature: Register | None = Field(default=None, description="as voltage")
+    timeout_s: Annotated[float, Field(ge=0.05, le=60)] = Field(default=1.0, description="timeout of each response")
+    voltage: Register = Field(
+        description='register of the pack voltage, such as { address = 259, type = "uint16", scale = 0.01 }'
+    )
+    current: Register = Field(
+        description="register of the current, written like voltage; sensor.current_sign is the direction of positive current"
+    )
+    temperature: Register | None = Field(default=None, description="register of the temperature, written like voltage")
     cells: CellRegisters | None = Field(
-        default=None, description="as voltage for the first cell, with count, and step if registers are not consecutive"
+        default=None,
+        description="register of the first cell's voltage, written like voltage, with count, the number of cells; step is the distance between two cells if registers are not consecutive",
     )
 
     @model_validator(mode="before")
@@ -118,7 +128,7 @@ class ModbusSource(PolledSource):
     @model_validator(mode="after")
     def _host_or_port(self) -> Self:
         if (self.host is None) == (self.port is None):
-            raise ValueError("give host for Modbus TCP, or port for a serial line, and not both")
+            raise ValueError("give either host for Modbus TCP, or port for a serial line")
         if self.port is not None and self.framing == "tcp":
             raise ValueError('framing: a serial line always uses "rtu"; remove framing, or give host for "tcp"')
         return self

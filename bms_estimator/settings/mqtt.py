@@ -14,8 +14,6 @@ class MqttSettings(BrokerSettings):
     """MQTT broker, and the commands that clients may send."""
 
     base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
-        default="bms", description="first level of all topics: no +, # or spaces, no / at either end"
+        default="bms", description="prefix of all topics; must not contain +, # or spaces, nor begin or end with /"
     )
-    commands: tuple[Command, ...] = Field(
-        default=(), description="requests with an effect that clients may send; default: none"
-    )
+    commands: tuple[Command, ...] = Field(default=(), description="commands that clients may send; default: none")

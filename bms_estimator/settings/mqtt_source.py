@@ -35,15 +35,15 @@ class ValueLocation(Strict):
 
     topic: Name | tuple[Name, ...] | None = Field(
         default=None,
-        description="topic, or several alternatives; default: source.topic; {cell} is the number of a cell",
+        description="topic, or a list of alternative topics; default: source.topic; {cell} stands for the cell number",
     )
     path: str = Field(
         default="",
-        description="path in JSON: keys and list indices, separated by dots; empty: the payload is a plain number; "
-        "{cell} is the number of a cell; the path of cells may also lead to a list",
+        description="path in the JSON payload: keys and list indices, separated by dots; empty: the payload is a plain number; "
+        "{cell} stands for the cell number; the path of cells may also lead to a list",
     )
     unit: Unit | None = Field(default=None, description="unit of the received value")
-    scale: float = Field(default=1.0, description="factor of the received value")
+    scale: float = Field(default=1.0, description="factor by which the received value is multiplied")
     offset: float = Field(default=0.0, description="offset added after scale, in the unit of the received value")
 
     @model_validator(mode="before")
@@ -69,43 +69,69 @@ class SourceBroker(BrokerSettings):
 
 
 class MqttSource(PolledSource):
-    """Battery values that another program publishes over MQTT, see docs/pack/mqtt-source.md."""
+    """Battery values that another program publishes over MQTT; see docs/pack/mqtt-source.md."""
 
-    kind: Literal["mqtt"]
-    profile: ProfileName | None = Field(default=None, description="publisher, which sets the defaults of this section")
-    prefix: Name | None = Field(default=None, description="name of the publisher in its topics; replaces {prefix}")
-    instance: str = Field(default="", description="battery of the publisher; replaces {instance} in topics and paths")
-    topic: Name | None = Field(default=None, description="topic of all quantities without their own")
-    voltage: ValueLocation | None = Field(
-        default=None, description='pack voltage: a path, or {topic = "...", path = "..."}'
+    kind: Literal["mqtt"] = Field(description="kind of this source")
+    profile: ProfileName | None = Field(
+        default=None, description="known publisher, whose topics are the defaults of this section"
     )
-    current: ValueLocation | None = Field(default=None, description="as voltage; sensor.current_sign gives the sign")
-    temperature: ValueLocation | None = Field(default=None, description="as voltage")
+    prefix: Name | None = Field(
+        default=None, description="name of the publisher in its topics, which replaces {prefix} in topics and paths"
+    )
+    instance: str = Field(
+        default="",
+        description="name or number of the battery in the publisher's topics, which replaces {instance} in topics and paths",
+    )
+    topic: Name | None = Field(default=None, description="topic of all quantities for which no other topic is set")
+    voltage: ValueLocation | None = Field(
+        default=None,
+        description='location of the pack voltage: path in the JSON payload, or {topic = "...", path = "..."}',
+    )
+    current: ValueLocation | None = Field(
+        default=None,
+        description="location of the current, written like voltage; sensor.current_sign is the direction of positive current",
+    )
+    temperature: ValueLocation | None = Field(
+        default=None, description="location of the temperature, written like voltage"
+    )
     cells: ValueLocation | None = Field(
-        default=None, description="as voltage, with {cell} for the cell number, or a list"
+        default=None,
+        description="location of the cell voltages, written like voltage; {cell} stands for the cell number, or the path leads to a list",
     )
     time: ValueLocation | None = Field(
-        default=None, description="as voltage: time of measurement on the publisher's clock"
+        default=None,
+        description="location of the time of measurement on the publisher's clock, written like voltage; default: arrival times are used",
     )
     settle_s: Annotated[float, Field(ge=0, le=60)] = Field(
-        default=0.5, description="time after a new voltage or current, after which the other one counts as unchanged"
+        default=0.5,
+        description="time for which a new voltage waits for a new current, or a new current for a new voltage; then the last value of the missing one is used",
     )
-    max_age_s: Positive = Field(default=30.0, description="maximum age of voltage and current")
-    slow_max_age_s: Positive = Field(default=300.0, description="maximum age of temperature and cells")
-    interval_s: Positive = Field(default=10.0, description="expected sample period; samples are stale after three")
+    max_age_s: Positive = Field(default=30.0, description="maximum age of a voltage or current in a sample")
+    slow_max_age_s: Positive = Field(
+        default=300.0, description="maximum age of a temperature or cell voltage in a sample"
+    )
+    interval_s: Positive = Field(
+        default=10.0, description="expected sample period; values are stale after three periods"
+    )
     availability_topic: str | None = Field(
-        default=None, description="topic on which the publisher or its last will reports offline; used only as a reason"
+        default=None,
+        description="topic on which the publisher, or its last will, reports offline; the service only names this as the reason when samples are missing",
     )
     ask: Mapping[str, str] = Field(
-        default={}, description="requests: payload by topic, for publishers that only answer"
+        default={}, description="requests to a publisher that only answers requests, as a table of payloads by topic"
     )
-    ask_s: Positive = Field(default=10.0, description="interval of the requests")
+    ask_s: Positive = Field(default=10.0, description="interval at which the requests of ask are published")
     url: BrokerUrls | None = Field(
-        default=None, description="URL of the broker, or a list to try in turn; default: that of [mqtt]"
+        default=None, description="URL of the broker, or a list of URLs to try in turn; default: broker of [mqtt]"
     )
-    username: str | None = Field(default=None, description="user at the broker in url")
-    password_file: Path | None = Field(default=None, description="as mqtt.password_file, for the broker at url")
-    ca_file: Path | None = Field(default=None, description="as mqtt.ca_file, for the broker at url")
+    username: str | None = Field(default=None, description="user name at the broker in url")
+    password_file: Path | None = Field(
+        default=None,
+        description="file with the password for the broker in url; a name without a folder is a systemd credential",
+    )
+    ca_file: Path | None = Field(
+        default=None, description="certificate authority of the broker in url; default: the system's certificates"
+    )
 
     quantities: ClassVar[tuple[str, ...]] = tuple(UNITS)
 
@@ -140,7 +166,7 @@ class MqttSource(PolledSource):
     def _complete(self) -> "MqttSource":
         for name in ("voltage", "current"):
             if getattr(self, name) is None:
-                raise ValueError(f"{name}: missing; give its path, or a profile: {', '.join(PROFILES)}")
+                raise ValueError(f"{name}: missing; give its path, or choose a profile: {', '.join(PROFILES)}")
         for name, place in self.places():
             if not place.topics and not self.topic:
                 raise ValueError(f"{name}.topic: missing, and source.topic is not set")
@@ -150,7 +176,7 @@ class MqttSource(PolledSource):
                 raise ValueError(f"{name}.scale = 0: must not be 0")
         if self.url is None and (self.username or self.password_file or self.ca_file):
             raise ValueError(
-                "username, password_file and ca_file are for a broker at url; without url, those of [mqtt] apply"
+                "username, password_file and ca_file apply to the broker in source.url, which is missing; remove them, because the broker of [mqtt] has its own"
             )
         return self
 

@@ -8,38 +8,50 @@ from bms_estimator.model.config_file import NotNegative, Positive, Strict
 
 
 class ObserverSettings(Strict):
-    """Adaptive observer, Algorithm 1 of the thesis; numbers in parentheses are equations of the thesis."""
+    """Adaptive observer: Algorithm 1 of the thesis. Numbers in parentheses are equations of the thesis (docs/theory/thesis.md)."""
 
     law: Literal["improved", "scheme-1", "scheme-2", "scheme-3", "learning"] = Field(
         default="improved",
-        description="adaptation law. improved: (3.18) with output (4.1); scheme-1..3: (3.16)..(3.18) with (3.14); learning: identifies parameters, the default with identifier.enabled = false",
+        description="adaptation law of the parameters. improved: (3.18) with output (4.1); scheme-1 to scheme-3: (3.16) to (3.18) with output (3.14); learning: identifies the parameters, and is the default if identifier.enabled = false",
     )
-    nussbaum: Literal["mittag-leffler", "k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"] = "mittag-leffler"
-    alpha: Annotated[float, Field(gt=2, le=3)] = Field(default=2.5, description="a of (3.10), in (2, 3]")
-    lambda_: Positive = Field(default=1.0, alias="lambda", description="lambda of (3.10)")
-    k0: NotNegative = Field(default=0.0, description="k(t0) of (3.13)")
+    nussbaum: Literal["mittag-leffler", "k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"] = Field(
+        default="mittag-leffler", description="Nussbaum function N(k), which multiplies the voltage error"
+    )
+    alpha: Annotated[float, Field(gt=2, le=3)] = Field(
+        default=2.5, description="exponent a of the Mittag-Leffler function (3.10), in (2, 3]"
+    )
+    lambda_: Positive = Field(
+        default=1.0, alias="lambda", description="factor lambda in the Mittag-Leffler function (3.10)"
+    )
+    k0: NotNegative = Field(default=0.0, description="initial value of the adaptive gain k, k(t0) in (3.13)")
     dead_zone_v: NotNegative | None = Field(
         default=None,
-        description="errors below it do not raise k; default: from the sensor's resolution; 0: (3.13) as printed",
+        description="voltage errors below this value do not increase k; default: two steps of sensor.voltage_resolution_v; 0: (3.13) as printed in the thesis",
     )
     epsilon_v: Positive | None = Field(
-        default=None, description="eps2 of Algorithm 1: an error below it counts as converged"
+        default=None,
+        description="voltage error below which Algorithm 1 counts as converged (eps2); default: twice the larger of dead_zone_v and sensor.voltage_resolution_v",
     )
-    gain_limit: Positive = Field(default=1e3, description="limit of |N|")
+    gain_limit: Positive = Field(default=1e3, description="limit of the magnitude of N(k)")
     rearm_gain: float | None = Field(
         default=0.5,
-        description='in lock, k is reset if N falls below it; "never": the printed law',
+        description='while the observer is in lock (see lock_error_v), k is reset to k0 when N(k) falls below this value; "never": k only grows, as printed in the thesis',
     )
     lock_error_v: Positive | None = Field(
-        default=None, description="an error above it for lock_time_s is a loss of lock"
+        default=None,
+        description="the observer is in lock while its voltage error is at most this value; default: 2 % of the nominal voltage, or ten steps of sensor.voltage_resolution_v if these are larger",
     )
-    lock_time_s: Positive = 10.0
+    lock_time_s: Positive = Field(
+        default=10.0, description="a voltage error above lock_error_v for this time is a loss of lock"
+    )
     margin_guard: Annotated[float, Field(ge=1e-6, le=1)] = Field(
         default=0.005,
-        description="distance above max(delta1, delta2), where a capacitance is 0, at which adaptation stops",
+        description="adaptation stops if the SOC is less than this above max(delta1, delta2), at which a capacitance of the model is 0",
     )
-    scheme_2_lambda: Positive = Field(default=100.0, description="lambda_i of (3.17)")
-    scheme_2_epsilon: Positive = Field(default=0.35, description="parameters up to this value are penalized, (3.17)")
+    scheme_2_lambda: Positive = Field(default=100.0, description="scheme-2: rate lambda_i in (3.17)")
+    scheme_2_epsilon: Positive = Field(
+        default=0.35, description="scheme-2: parameters up to this value are penalized by (3.17)"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -51,24 +63,27 @@ class ObserverSettings(Strict):
 
 
 class IdentifierSettings(Strict):
-    """Identifier: joint Kalman filter for SOC, its error, and the cell's parameters."""
+    """Identifier: joint Kalman filter for the SOC, its standard deviation, and the cell's parameters."""
 
-    enabled: bool = Field(default=True, description="false: SOC by coulomb counting, parameters by the observer's law")
+    enabled: bool = Field(
+        default=True,
+        description="false: the SOC is counted from the current, and the observer's law estimates the parameters",
+    )
     map_memory_h: Annotated[float, Field(ge=1)] = Field(
-        default=336.0, description="time constant of forgetting learned elements"
+        default=336.0, description="time constant with which old values of learned parameters lose weight"
     )
     current_offset_std_a: NotNegative | None = Field(
         default=None,
-        description="standard deviation of the current sensor's offset; default: from the capacity; 0: no offset",
+        description="standard deviation of the current sensor's offset; default: 0.7 % of the 1C current; 0: no offset",
     )
     capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
         default=None,
-        description="relative standard deviation of the capacity; default: that of the cell file; 0: capacity is exact",
+        description="relative standard deviation of the capacity; default: that of the cell file; 0: the capacity is exact",
     )
     soc_std: Annotated[float, Field(ge=0.005, le=0.5)] | None = Field(
         default=None, description="standard deviation of the initial SOC; default: 0.2"
     )
     hysteresis_v: NotNegative | None = Field(
         default=None,
-        description="OCV of one cell after charge minus that after discharge; default: that of the cell file",
+        description="OCV of one cell after charge minus its OCV after discharge; default: hysteresis in the cell file",
     )

@@ -35,56 +35,61 @@ DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
 
 
 class PackSettings(Strict):
-    """Cells of the pack, their number, and the initial SOC."""
+    """Name and initial SOC of the pack; type, capacity and number of its cells."""
 
-    name: DeviceName = Field(default="pack", description="name of the pack in topics: letters, digits, _ and -")
+    name: DeviceName = Field(
+        default="pack", description="name of the pack, also in MQTT topics: letters, digits, _ and -"
+    )
     cell: Annotated[str, Field(min_length=1)] = Field(
         default="ncr18650",
-        description="generic cell (lfp, nmc, nca, lco, lmo, lto; needs capacity_ah), a shipped cell's name, or the path of a cell file",
+        description="generic cell (lfp, nmc, nca, lco, lmo or lto; requires capacity_ah), name of a shipped cell, or path of a cell file",
     )
     capacity_ah: Positive | None = Field(
-        default=None, description="capacity of one cell-file object; default: that of the cell file"
+        default=None,
+        description="capacity of the cell, or of the module that the cell file describes; default: capacity in the cell file",
     )
     series: Annotated[int, Field(ge=1, le=10_000)] = Field(
-        default=1, description="number of cell-file objects in series"
+        default=1, description="number of cells, or of modules that the cell file describes, in series"
     )
     parallel: Annotated[int, Field(ge=1, le=10_000)] = Field(
-        default=1, description="number of cell-file objects in parallel"
+        default=1, description="number of cells, or of modules that the cell file describes, in parallel"
     )
-    initial_soc: Fraction | None = Field(default=None, description="initial SOC, 0..1; default: from the OCV")
+    initial_soc: Fraction | None = Field(
+        default=None, description="initial SOC; default: from the measured voltage, by the OCV curve"
+    )
 
 
 class PublishSettings(Strict):
-    """Publish rate."""
+    """Rate of the published estimates."""
 
     rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)] = Field(
-        default=1.0, description="publications per second"
+        default=1.0, description="number of published estimates per second"
     )
 
 
 class StateSettings(Strict):
-    """State that survives a restart."""
+    """Checkpoints, from which a restarted service resumes."""
 
     folder: Path | None = Field(
         default=None,
-        description="folder of checkpoints and history; default: systemd's StateDirectory, or the user's XDG state folder",
+        description="folder of checkpoints and history; default: StateDirectory of the systemd unit, otherwise bms-estimator in the user's XDG state folder",
     )
-    checkpoint_s: Annotated[float, Field(ge=1)] = 60.0
+    checkpoint_s: Annotated[float, Field(ge=1)] = Field(default=60.0, description="interval between two checkpoints")
     longest_days: Positive | None = Field(
         default=None,
-        description="maximum age of a checkpoint, for packs that are exchanged [days]; default: no limit",
+        description="maximum age of a checkpoint from which the service resumes [days], for packs that are exchanged; default: no limit",
     )
 
 
 class StoreSettings(Strict):
-    """Data in the state folder: queued messages during a broker outage, and the pack's history."""
+    """Other data in the state folder: messages queued during a broker outage, and the pack's history."""
 
     outbox_messages: Annotated[int, Field(ge=1, le=10_000_000)] = Field(
         default=90_000,
-        description="maximum number of queued states and events, a day of states at 1 Hz; beyond it the oldest is dropped",
+        description="maximum number of queued estimates and events; the default is a day of estimates at 1 Hz. A full queue drops its oldest message",
     )
     history_days: Annotated[int, Field(ge=0, le=36_600)] = Field(
-        default=366, description="length of the stored history [days]; 0: none"
+        default=366, description="length of the stored history [days]; 0: no history"
     )
 
 
@@ -99,16 +104,20 @@ class Settings(Strict):
 
     pack: PackSettings = PackSettings()
     sensor: SensorSettings = SensorSettings()
-    source: SourceSettings | None = Field(default=None, description="omit if the source is the board of [sensor]")
+    source: SourceSettings | None = Field(
+        default=None, description="omit this section if [sensor] describes the source"
+    )
     observer: ObserverSettings = ObserverSettings()
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
-    mqtt: MqttSettings | None = Field(default=None, description="omit to publish nothing")
-    edge: EdgeSettings | None = Field(default=None, description="omit to send no samples to a fleet")
+    mqtt: MqttSettings | None = Field(default=None, description="omit this section to publish nothing over MQTT")
+    edge: EdgeSettings | None = Field(
+        default=None, description="omit this section to send no samples to a fleet server"
+    )
     home_assistant: HomeAssistantSettings = HomeAssistantSettings()
-    influx: InfluxSettings | None = Field(default=None, description="omit to disable")
-    prometheus: PrometheusSettings | None = Field(default=None, description="omit to disable")
-    page: PageSettings | None = Field(default=None, description="omit to serve no page")
+    influx: InfluxSettings | None = Field(default=None, description="omit this section to disable the export")
+    prometheus: PrometheusSettings | None = Field(default=None, description="omit this section to disable the endpoint")
+    page: PageSettings | None = Field(default=None, description="omit this section to serve no page")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()
@@ -148,7 +157,9 @@ class Settings(Strict):
             return tables
         if serial := [name for name, allowed in NO_DEVICE.items() if configured.get(name, allowed[0]) not in allowed]:
             names = ", ".join(f"sensor.{name}" for name in serial)
-            raise ValueError(f"{names}: describes a serial device, which [source] replaces: remove one of them")
+            raise ValueError(
+                f"{names}: only for a serial device, but [source] describes another source; remove one of them"
+            )
         return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **configured, "protocol": "text"}}
 
     @property

@@ -52,17 +52,19 @@ def _validate_listen(text: str) -> str:
 
 
 class PageSettings(Strict):
-    """Live page for a browser."""
+    """Live web page of the pack."""
 
     listen: Annotated[str, AfterValidator(_validate_listen)] = Field(
         default=DEFAULT_LISTEN,
-        description="host:port; packs of one process with the same address share a page. Beyond this machine, such as 0.0.0.0:8765, token_file is required",
+        description="host:port of the page; packs of one process with the same address share a page. An address that other machines can reach, such as 0.0.0.0:8765, requires token_file",
     )
     token_file: Path | None = Field(
         default=None,
-        description="file with the access token; as mqtt.password_file",
+        description="file with the access token; a name without a folder is a systemd credential",
     )
-    hosts: tuple[str, ...] = Field(default=(), description="further host names of the page, for example behind a proxy")
+    hosts: tuple[str, ...] = Field(
+        default=(), description="further host names under which browsers request the page, for example behind a proxy"
+    )
 
     @property
     def address(self) -> Listen:

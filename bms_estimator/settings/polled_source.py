@@ -38,5 +38,5 @@ def with_profile(table: object, profiles: Mapping[str, Mapping[str, object]]) ->
     if not isinstance(table, dict) or not isinstance(name := table.get("profile"), str):
         return table
     if name not in profiles:
-        raise ValueError(f"profile: {name!r} is none of {', '.join(profiles)}")
+        raise ValueError(f"profile: {name!r} must be one of {', '.join(profiles)}")
     return {**profiles[name], **table}

@@ -22,44 +22,51 @@ def _filled(sensor: dict[str, object]) -> dict[str, object]:
 
 
 class SensorSettings(Strict):
-    """Sensor board or serial device: port, resolution, current sign."""
+    """Sensor board, or BMS or meter on a serial port: port, protocol, resolution, sign of the current."""
 
     port: str = Field(
-        default="auto", description="device path, preferably below /dev/serial/by-id; auto: the only board"
+        default="auto",
+        description="path of the serial port, preferably below /dev/serial/by-id; auto: port of the only connected board",
     )
     serial: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")] | None = Field(
         default=None,
-        description='serial number of the board, as `bms-estimator board` prints it, such as "0000002a"; default: that of the first board, which is stored',
+        description='serial number of the board, as `bms-estimator board` prints it, such as "0000002a"; default: serial number of the first board that connects, which the service stores',
     )
     protocol: Annotated[str, OneOf(PROTOCOLS)] = Field(
-        default=BOARD, description="binary (this project's firmware), text, or the name of a BMS or meter"
+        default=BOARD,
+        description=f"binary: board with this project's firmware; text: board that prints text lines; otherwise the BMS or meter: {', '.join(name for name in DEVICES if name != 'text')}",
     )
     address: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
-        description="address of the pack on a shared RS485 line; default: the first that responds",
+        description="address of the BMS on a shared RS485 line; default: the first address that responds",
     )
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
-        default=500_000, description="default: that of the device"
+        default=500_000, description="baud rate of the serial port; default: that of the protocol"
     )
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(
-        default=100, description="sample rate requested from a binary board"
+        default=100, description="sample rate that is requested from a board with the protocol binary"
     )
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
         default="discharge_positive",
-        description="direction of positive current in the source or a table; default: that of the device",
+        description="direction of positive current in the values of the device, or in the columns of a CSV or Parquet file; default: that of the protocol",
     )
-    voltage_resolution_v: Positive = Field(default=25.0 / 1024, description="voltage step; default: that of the device")
+    voltage_resolution_v: Positive = Field(
+        default=25.0 / 1024, description="voltage resolution (LSB); default: that of the device"
+    )
     voltage_noise_v: NotNegative | None = Field(
-        default=None, description="standard deviation of one voltage sample; default: half a step"
+        default=None,
+        description="standard deviation of the noise of one voltage sample; default: half of voltage_resolution_v",
     )
     current_resolution_a: NotNegative | None = Field(
-        default=None, description="current step; default: that of the device, none for a board"
+        default=None,
+        description="current resolution (LSB); default: that of the device; 0 for a board, whose resolution is negligible",
     )
     current_dead_band_a: NotNegative | None = Field(
-        default=None, description="smaller currents are reported as 0; default: that of the device, otherwise none"
+        default=None,
+        description="the device reports currents below this magnitude as 0; default: that of the device, otherwise 0",
     )
     period_s: Positive | None = Field(
-        default=None, description="sample period of a source with a fixed pace; default: that of the device"
+        default=None, description="sample period of a device that sends at a fixed rate; default: that of the device"
     )
 
     @model_validator(mode="wrap")
@@ -76,7 +83,7 @@ class SensorSettings(Strict):
     def _only_boards_have_serials(self) -> Self:
         if self.serial and self.protocol != "binary":
             raise ValueError(
-                f"serial: only a binary board reports its serial number, but protocol is {self.protocol}; remove it"
+                f"serial: only a binary board reports its serial number, but sensor.protocol is {self.protocol}; remove serial"
             )
         return self
 

@@ -170,7 +170,7 @@ class AlarmEvaluator:
         # a silence restored from an earlier run lasts until the first sample of this run
         lasts = bool(self._silence) and not self._has_samples
         if (silent_s >= self._silent_s or lasts) != bool(self._silence):
-            self._silence = "" if self._silence else reason or "no samples come"
+            self._silence = "" if self._silence else reason or "no samples arrive"
             self._update_unwatched(self._at_s)
             self._save_state()
         state = self._states.get("link_lost")

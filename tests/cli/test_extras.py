@@ -34,4 +34,4 @@ def test_missing_package_is_reported_with_its_extra(
     pack.write_text(f"[source]\n{source}\n")
     code, _, err = run(capsys, "record", "--pack", pack, tmp_path / "out.bmsraw")
     assert code == 2
-    assert f"this needs {package}: pip install 'bms_estimator[{extra}]'" in err
+    assert f"this command needs the package {package}: pip install 'bms_estimator[{extra}]'" in err

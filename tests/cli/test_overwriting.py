@@ -52,7 +52,7 @@ def test_existing_file_is_replaced_only_with_force(command, options, name, captu
 )
 @pytest.mark.parametrize(
     ("make_duplicate", "message"),
-    [(Path.symlink_to, "given twice"), (lambda again, path: shutil.copy(path, again), "the same as")],
+    [(Path.symlink_to, "given twice"), (lambda again, path: shutil.copy(path, again), "has the same content as")],
     ids=["link", "copy"],
 )
 def test_duplicate_capture_is_rejected(command, make_duplicate, message, capture, tmp_path, capsys, monkeypatch):
@@ -64,5 +64,5 @@ def test_duplicate_capture_is_rejected(command, make_duplicate, message, capture
     assert ended.value.code == 2
     err = capsys.readouterr().err.replace(f"{tmp_path}/", "")
     assert f"error: again.csv: {message}" in err
-    assert "it would count twice" in err
+    assert "the capture would count twice" in err
     assert not list(tmp_path.glob("mine*"))

@@ -16,7 +16,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.cli.options.capture_options import OR_FUEL_CELL_HELP, AsJson, CapacityAh, SignOfCurrent
+from bms_estimator.cli.options.capture_options import (
+    CAPTURE_HELP,
+    OR_FUEL_CELL_HELP,
+    AsJson,
+    CapacityAh,
+    SignOfCurrent,
+)
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
@@ -63,23 +69,25 @@ class AlarmResult:
 
 
 def alarms(
-    capture: Annotated[
-        Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet; -: from stdin", show_default=False)
-    ],
+    capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
     cell: Annotated[str | None, typer.Option(help=OR_FUEL_CELL_HELP, show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[
-        Path | None, typer.Option(help="settings of the pack with its limits, pack.toml", show_default=False)
+        Path | None,
+        typer.Option(help="settings file of the pack, pack.toml, with the limits of the alarms", show_default=False),
     ] = None,
     soc: Annotated[
-        float | None, typer.Option(parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the OCV")
+        float | None,
+        typer.Option(
+            parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the measured voltage, by the OCV curve"
+        ),
     ] = None,
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the alarms that a capture would have raised, with their times. No hooks are run.
+    """List the alarms that a capture would have raised, with their times.
 
-    The checks are those of live operation.
+    The alarms are evaluated as in the live service, but no hooks are run.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:
@@ -91,7 +99,7 @@ def alarms(
         source = Replay(opened, longest_s=STEP_S)
         result = asyncio.run(_evaluate(settings, model, source))
         if source.samples == 0:
-            raise UserError(f"{path}: holds no sample")
+            raise UserError(f"{path}: contains no sample")
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
@@ -159,4 +167,4 @@ def _print(title: str, result: AlarmResult) -> None:
     else:
         console.print(f"{title}: no alarm")
     console.print(f"not raised: {', '.join(result.quiet) or '-'}")
-    console.print(f"not measured here: {', '.join(result.unmeasured) or '-'}")
+    console.print(f"not monitored, because the capture lacks the quantity: {', '.join(result.unmeasured) or '-'}")

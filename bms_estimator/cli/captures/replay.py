@@ -18,6 +18,7 @@ from rich.table import Table
 
 from bms_estimator.cli.captures.replay_summary import Result, Summary
 from bms_estimator.cli.options.capture_options import (
+    CAPTURE_HELP,
     OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
@@ -49,32 +50,38 @@ MAX_GLITCHES = 0.01
 
 
 def replay(
-    capture: Annotated[
-        Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet; -: from stdin", show_default=False)
-    ],
+    capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
     cell: Annotated[str | None, typer.Option(help=OR_FUEL_CELL_HELP, show_default=False)] = None,
     capacity_ah: CapacityAh = None,
-    pack: Annotated[Path | None, typer.Option(help="settings of the pack, pack.toml", show_default=False)] = None,
+    pack: Annotated[Path | None, typer.Option(help="settings file of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
-        float | None, typer.Option(parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the OCV")
+        float | None,
+        typer.Option(
+            parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the measured voltage, by the OCV curve"
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="file for the estimates of each sample: .csv, .csv.gz, .parquet", show_default=False),
+        typer.Option(
+            help="file to which the estimates of each sample are written: .csv, .csv.gz or .parquet", show_default=False
+        ),
     ] = None,
     force: Force = False,
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,
-    mqtt: Annotated[str | None, typer.Option(help="publish to this broker, mqtt://host:port")] = None,
+    mqtt: Annotated[
+        str | None, typer.Option(help="also publish the estimates to this MQTT broker, mqtt://host:port")
+    ] = None,
     speed: Annotated[
         float | None,
-        typer.Option(parser=decimal(1e-3), help="speed relative to the recording; default: as fast as possible"),
+        typer.Option(
+            parser=decimal(1e-3), help="speed of the replay relative to the recorded time; default: as fast as possible"
+        ),
     ] = None,
 ) -> None:
-    """Estimate from a capture or a table.
+    """Run the live service's estimator over a capture.
 
-    The estimator is that of the live service.
-    For a capture of `run --record`, the estimates are bit-identical to those of that run.
+    For a file of `run --record`, the estimates are bit-identical to those of the recorded run.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:
@@ -104,7 +111,7 @@ def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
     if source.damaged:
         yield f"damaged after {duration_s:.1f} s; the rest was not read"
     if source.unread_bytes:
-        yield f"the last {source.unread_bytes:,} bytes are no complete record: truncated, or a length is damaged"
+        yield f"the last {source.unread_bytes:,} bytes are no complete record: the file is truncated, or the length in a record is damaged"
 
 
 async def _replay(settings: Settings, cell: PackModel, source: Replay, table: TableSink | None) -> Result:
@@ -202,7 +209,7 @@ def _temperature(result: Result) -> dict[str, str]:
     dropped = f"{result.temperatures_dropped:,} implausible values"
     if not result.temperature_sensor:
         reason = dropped if result.temperatures_dropped else "not measured"
-        return {"temperature": f"{reason}: the band is wider"}
+        return {"temperature": f"{reason}: SOC std is larger"}
     return {"temperature": dropped} if result.temperatures_dropped else {}
 
 

@@ -14,7 +14,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh, SignOfCurrent, check_once, name_of
+from bms_estimator.cli.options.capture_options import (
+    CAPTURE_FORMATS,
+    CELL_HELP,
+    CapacityAh,
+    SignOfCurrent,
+    check_once,
+    name_of,
+)
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import TABLE_RESOLUTION_V
 from bms_estimator.model.cell import load_cell
@@ -32,23 +39,25 @@ MIN_WIDTH = 160
 def thesis(
     captures: Annotated[
         list[Path] | None,
-        typer.Argument(help="recorded captures for chapter 5, CSV (.gz) or Parquet; default: a simulated 6S pack"),
+        typer.Argument(help=f"captures for chapter 5, each a {CAPTURE_FORMATS}; default: a simulated 6S pack"),
     ] = None,
     cell: Annotated[str | None, typer.Option(help=f"cell of the captures: {CELL_HELP}", show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     resolution_v: Annotated[
-        float, typer.Option(parser=decimal(1e-9), help="voltage step of the captures [V]")
+        float, typer.Option(parser=decimal(1e-9), help="voltage resolution (LSB) of the captures [V]")
     ] = TABLE_RESOLUTION_V,
     current_sign: SignOfCurrent = None,
     out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
-    table: Annotated[str | None, typer.Option(help="only this table, 1 to 13 or Errata", show_default=False)] = None,
-    figure: Annotated[str | None, typer.Option(help="only this figure, 1 to 50", show_default=False)] = None,
+    table: Annotated[
+        str | None, typer.Option(help="recompute only this table: 1 to 13, or Errata", show_default=False)
+    ] = None,
+    figure: Annotated[str | None, typer.Option(help="recompute only this figure: 1 to 50", show_default=False)] = None,
 ) -> None:
-    """Recompute the thesis's tables and figures, and write them beside the printed ones as one HTML page.
+    """Recompute the tables and figures of the thesis, and write a report that compares them with the printed ones.
 
-    Chapters 2 to 4 are simulated.
-    Chapter 5 runs on the captures, which are all from one type of cell.
-    It needs at least one voltage relaxation test, and at least one constant load or load with steps.
+    The report is one HTML page. Chapters 2 to 4 of the thesis are simulated.
+    Chapter 5 is computed from the captures, all of one type of cell.
+    At least one capture must be a voltage relaxation test, and at least one a constant load or a load with steps.
     """
     recorded = _recorded(captures, cell, capacity_ah, resolution_v, current_sign) if captures else None
     started_s = time.perf_counter()
@@ -70,7 +79,7 @@ def _recorded(
     captures: list[Path], cell: str | None, capacity_ah: float | None, resolution_v: float, current_sign: SignOfCurrent
 ) -> Recorded:
     if cell is None:
-        raise UserError("captures need --cell NAME|CELL.toml for capacity, limits and bounds")
+        raise UserError("captures require --cell NAME|CELL.toml, which gives capacity, limits and bounds of the cell")
     check_once(captures)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     named = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))

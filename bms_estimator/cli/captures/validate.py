@@ -12,14 +12,14 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.validate import Errors, Validation, validate
-from bms_estimator.cli.options.capture_options import AsJson, CapacityAh, CellName, SignOfCurrent
+from bms_estimator.cli.options.capture_options import CAPTURE_FORMATS, AsJson, CapacityAh, CellName, SignOfCurrent
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.captures.replay import load_capture
 
 
 def validate_command(
-    capture: Annotated[Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet", show_default=False)],
+    capture: Annotated[Path, typer.Argument(help=f"capture to read: {CAPTURE_FORMATS}", show_default=False)],
     cell: CellName,
     capacity_ah: CapacityAh = None,
     soc: Annotated[
@@ -31,9 +31,9 @@ def validate_command(
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate a capture's voltage from its current alone and compare.
+    """Simulate a capture's voltage from its current, and compare it with the measured voltage (open loop).
 
-    The parameters are frozen, and the measured voltage gives only the SOC of the first rest.
+    The parameters are constant. The measured voltage is used only for the SOC of the first rest.
     """
     model = load_cell(cell, capacity_ah)
     validation = validate(load_capture(capture, current_sign=current_sign), model, initial_soc=soc)

@@ -38,14 +38,15 @@ def adapt_command(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate a1..a15 by the thesis's adaptive observer and write a cell file.
+    """Estimate the parameters a1..a15 of the thesis's cell model by its adaptive observer, and write a cell file.
 
     Algorithm 1 of the thesis runs over the capture with the smallest mean current.
-    The averages (3.19) of its parameters are a1..a12.
-    Equation (4.2) over all captures gives R_s. Run `ocv` first for the OCV.
+    a1..a12 are the averages of the parameters in this run, by its equation (3.19).
+    a13..a15 describe R_s, which is computed by equation (4.2) over all captures.
 
-    Replays of the captures are scored with the cell file of --cell and with the new one.
-    The new file is written only if its score is at most 5 % worse.
+    Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
+    The captures are replayed with the cell file of --cell and with the new cell file.
+    The new file is written only if the error score of its replays is at most 5 % higher (docs/cell/adapt.md).
     """
     check_out(out, captures, force=force)
     check_once(captures)

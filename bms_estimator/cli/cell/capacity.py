@@ -12,7 +12,7 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.capacity import Anchor, Capacity, measure_capacity
-from bms_estimator.cli.options.capture_options import CELL_HELP, AsJson, CapacityAh, SignOfCurrent
+from bms_estimator.cli.options.capture_options import CAPTURE_FORMATS, CELL_HELP, AsJson, CapacityAh, SignOfCurrent
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
@@ -56,26 +56,28 @@ class CapacityResult:
 
 def capacity(
     captures: Annotated[
-        list[Path], typer.Argument(help="captures with rests, CSV (.gz) or Parquet, of one cell", show_default=False)
+        list[Path],
+        typer.Argument(help=f"captures of one cell, with rests; each a {CAPTURE_FORMATS}", show_default=False),
     ],
-    cell: Annotated[str, typer.Option(help=f"{CELL_HELP}; its OCV", show_default=False)],
+    cell: Annotated[str, typer.Option(help=f"{CELL_HELP}; only the OCV of the cell is used", show_default=False)],
     capacity_ah: CapacityAh = None,
     current_offset_std_a: Annotated[
         float | None,
         typer.Option(
             parser=decimal(0.0),
-            help="standard deviation of the current sensor's offset [A]; default: that of `identifier.current_offset_std_a`",
+            help="standard deviation of the current sensor's offset [A]; default: 0.7 % of the 1C current",
             show_default=False,
         ),
     ] = None,
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the capacity from rests and the charge counted between them.
+    """Measure a cell's capacity from rests and the charge that is counted between them.
 
-    Each rest gives an SOC by the cell's OCV. The loads between the rests may have any form.
-    All rests together give the charge from full to empty, with its standard deviation.
-    No cell file is written; enter the result as `cell.capacity_ah` and `cell.capacity_std`.
+    The voltage of each rest gives an SOC by the OCV curve of --cell. The loads between the rests may have any form.
+    From all rests the charge between full and empty is estimated, with its standard deviation.
+    No cell file is written. Enter the result in a cell file: the capacity as `cell.capacity_ah`,
+    and its standard deviation divided by the capacity as `cell.capacity_std`.
     """
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
@@ -125,7 +127,7 @@ def _anchor_count(anchors: int) -> str:
 
 def _shown(result: CapacityResult) -> Group:
     """Return the result as a table."""
-    anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "off", box=box.SIMPLE_HEAD)
+    anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "SOC error", box=box.SIMPLE_HEAD)
     for column in anchors.columns[1:]:
         column.justify, column.no_wrap = "right", True
     for anchor in result.anchors[:SHOWN_ANCHORS]:

@@ -19,7 +19,11 @@ from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Cell file from a service's learned state.")
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    help="Write a cell file from the learned state of a pack's live service.",
+)
 
 TENTHS = np.linspace(0.0, 1.0, 11)
 """SOC at which corrections and errors of the OCV are printed."""
@@ -48,17 +52,20 @@ def _group() -> None:
 
 @app.command()
 def export(
-    pack: Annotated[Path, typer.Argument(help="settings of the pack, pack.toml", show_default=False)],
+    pack: Annotated[Path, typer.Argument(help="settings file of the pack, pack.toml", show_default=False)],
     out: NewCellFile,
     checkpoint: Annotated[
-        Path | None, typer.Option(help="checkpoint file; default: that of the service", show_default=False)
+        Path | None,
+        typer.Option(
+            help="checkpoint file; default: checkpoint in the state folder of the pack's service", show_default=False
+        ),
     ] = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a cell file from a pack's checkpoint: OCV, capacity and resistances, each with its error.
+    """Write a cell file from a pack's checkpoint: learned OCV, capacity and resistances, with standard deviations.
 
-    A service that uses the file starts with the learned values.
+    A service whose settings name this cell file starts with the learned values.
     """
     settings, model = load_pack(pack)
     cell, series = unpacked_cell(pack, settings), settings.pack.series
@@ -71,13 +78,15 @@ def export(
     content = file.load()
     if content.reason:
         raise UserError(
-            f"{file.path}: no checkpoint to export: {content.reason}; a service of {pack} saves one each "
-            f"{settings.state.checkpoint_s:g} s (--checkpoint names another file)"
+            f"{file.path}: no checkpoint to export: {content.reason}; a service with the settings {pack} saves a checkpoint every "
+            f"{settings.state.checkpoint_s:g} s (give another file with --checkpoint)"
         )
     estimator = new_estimator(settings, model)
     reason = restore_state(estimator, content.state, 0.0)
     if reason or not estimator.record[0]["filter"]["started"]:
-        raise UserError(f"{file.path}: nothing to export: {reason or 'the identifier was off, it has learned nothing'}")
+        raise UserError(
+            f"{file.path}: nothing to export: {reason or 'the identifier was off, so that nothing was learned'}"
+        )
     learned = identified_cell(estimator, cell, series)
     renamed = learned.model_copy(update={"cell": learned.cell.model_copy(update={"name": name_of(out)})})
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], TENTHS)
@@ -109,7 +118,7 @@ def _text(result: Exported) -> str:
     return (
         f"{result.out}: written from {result.checkpoint}\n"
         f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah; series resistance x {result.r_s_factor:.3f}\n"
-        f"OCV at SOC 0, 0.1 ... 1 corrected by {correction} mV, known to {error} mV"
+        f"OCV at SOC 0, 0.1 ... 1 corrected by {correction} mV, std {error} mV"
     )
 
 

@@ -35,7 +35,7 @@ from bms_estimator.sources.captures.replay import load_capture
 
 def identify_command(
     captures: CapturesFromRest,
-    cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; gives capacity and OCV", show_default=False)],
+    cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; supplies capacity and OCV", show_default=False)],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
     soc: InitialSoc = None,
@@ -43,27 +43,27 @@ def identify_command(
         float | None,
         typer.Option(
             parser=decimal(),
-            help="temperature of captures without the column temperature_c [°C]; default: 25",
+            help="temperature of the captures that have no column temperature_c [°C]; default: 25",
             show_default=False,
         ),
     ] = None,
     keep_ocv: Annotated[
-        bool, typer.Option(help="use the OCV of --cell unchanged; default: correct it", show_default=False)
+        bool, typer.Option(help="keep the OCV of --cell unchanged; default: correct the OCV", show_default=False)
     ] = False,
     current_sign: SignOfCurrent = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Identify a cell's resistances from captures and write a cell file.
+    """Identify a cell's resistances from captures, and write a cell file.
 
     Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole SOC range are best.
 
-    Run `ocv` first, which writes a cell file with the OCV.
-    Replays of the captures are scored with the cell file of --cell and with the new one.
-    The new file is written only if its score is at most 5 % worse (docs/cell/identify.md).
+    Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
+    The captures are replayed with the cell file of --cell and with the new cell file.
+    The new file is written only if the error score of its replays is at most 5 % higher (docs/cell/identify.md).
 
-    For a fuel cell use polarization curves (columns current_a, voltage_v) and recordings under load.
-    See docs/theory/fuel-cell.md.
+    For a fuel cell, give polarization curves (columns current_a, voltage_v) and captures under load
+    (docs/theory/fuel-cell.md).
     """
     check_out(out, captures, force=force)
     check_once(captures)
@@ -148,11 +148,11 @@ def _remarks(cell: str, identification: Identification) -> list[str]:
 
 def _scores(identification: Identification) -> str:
     if not math.isfinite(identification.score_after):
-        return "No capture is long enough for replays cut in mid-load"
+        return "No capture is long enough for replays that start in mid-load"
     held = sum(c.held_back for c in identification.captures)
     return (
-        f"Replays cut in mid-load, started 0.2 wrong: interval score {identification.score_before:.2f} % before, "
-        f"{identification.score_after:.2f} % after; {held} of {len(identification.captures)} captures held back from what they judge"
+        f"Replays that start in mid-load with an SOC error of 0.2: interval score {identification.score_before:.2f} % before, "
+        f"{identification.score_after:.2f} % after; {held} of {len(identification.captures)} captures held back from the fit that they judge"
     )
 
 
@@ -169,7 +169,10 @@ def _tables(out: Path, identification: Identification, seconds: float) -> Group:
     for c in identification.captures:
         fits.add_row(*_row(c))
     low_c, high_c = _temperatures(identification)
-    lines = [f"cell temperatures {low_c:g} to {high_c:g} °C; outside, the band widens", _scores(identification)]
+    lines = [
+        f"cell temperatures {low_c:g} to {high_c:g} °C; outside this range, the estimates have larger standard deviations",
+        _scores(identification),
+    ]
     if identification.ocv_correction_v:
         lines.append(f"OCV corrected by {1e3 * identification.ocv_correction_v:.1f} mV RMS")
     if identification.left_out:

@@ -56,7 +56,7 @@ def identify_fuel_cell(
     """Identify the parameters, write the file and print the result; arguments as in ``identify_command``."""
     if temperature_c is not None and not MIN_PLAUSIBLE_C <= temperature_c <= MAX_PLAUSIBLE_C:
         raise UserError(
-            f"--temperature-c {temperature_c:g}: must lie within {MIN_PLAUSIBLE_C:g} and {MAX_PLAUSIBLE_C:g} C"
+            f"--temperature-c {temperature_c:g}: must be between {MIN_PLAUSIBLE_C:g} and {MAX_PLAUSIBLE_C:g} °C"
         )
     start = load_fuel_cell(cell)
     names = unique_names([name_of(path) for path in paths], paths)
@@ -119,12 +119,14 @@ def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floa
     c = model.cell
     charging = current_a < -model.fuel_cell.internal_current_a
     if 2 * charging.sum() > charging.size:
-        raise UserError(f"{path}: the current is negative, but a fuel cell takes no charge: is --current-sign right?")
+        raise UserError(f"{path}: the current is negative, but a fuel cell cannot be charged: is --current-sign right?")
     good: NDArray[np.bool_] = (voltage_v >= c.voltage_min_v) & (voltage_v <= c.voltage_max_v)
     good &= (current_a <= c.current_max_a) & ~charging
     if good.sum() < MIN_POINTS:
         limits = f"{c.voltage_min_v:g} to {c.voltage_max_v:g} V and up to {c.current_max_a:g} A"
-        raise UserError(f"{path}: {good.sum()} usable points: give at least {MIN_POINTS} within {limits} of {c.name}")
+        raise UserError(
+            f"{path}: only {good.sum()} usable points: at least {MIN_POINTS} are needed within the limits of {c.name}, {limits}"
+        )
     return good
 
 

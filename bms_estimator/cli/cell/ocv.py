@@ -32,6 +32,7 @@ from bms_estimator.calibration.ocv.sources import (
 )
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.cli.options.capture_options import (
+    CAPTURE_FORMATS,
     AsJson,
     Force,
     NewCellFile,
@@ -137,7 +138,7 @@ def ocv(
     captures: Annotated[
         list[Path],
         typer.Argument(
-            help="captures (CSV, .gz, Parquet): relaxation tests or HPPC, slow discharges and charges; or curves (CSV)",
+            help=f"captures with rests or slow discharges and charges, each a {CAPTURE_FORMATS}; or OCV curves (CSV)",
             show_default=False,
         ),
     ],
@@ -146,19 +147,24 @@ def ocv(
         float | None,
         typer.Option(
             parser=decimal(1e-6),
-            help="capacity for counting the SOC [Ah]; default: measured by a slow discharge",
+            help="capacity with which the SOC is counted [Ah]; default: capacity measured by a slow discharge",
             show_default=False,
         ),
     ] = None,
-    form: Annotated[Form, typer.Option(help="smooth table, or function (2.10) of the thesis")] = Form.TABLE,
+    form: Annotated[
+        Form,
+        typer.Option(
+            help="form of the OCV in the cell file: smooth table, or function (2.10) of the thesis, after Chen and Mora"
+        ),
+    ] = Form.TABLE,
     soc: Annotated[
-        float, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample of the fullest captures")
+        float, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample of the captures that start fullest")
     ] = 1.0,
     series: Annotated[
         int | None,
         typer.Option(
             parser=whole(1),
-            help="number of cells in series; default: median voltage divided by 3.7 V; give it for LFP packs",
+            help="number of cells in series; required for LFP packs; default: median voltage divided by 3.7 V",
             show_default=False,
         ),
     ] = None,
@@ -166,15 +172,16 @@ def ocv(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Determine the open-circuit voltage and write a cell file.
+    """Determine the open-circuit voltage (OCV) over SOC, and write a cell file.
 
-    Sources are captures with rests: HPPC, or relaxation tests (5.2.1 of the thesis).
-    Slow discharges and charges are sources too.
-    A given curve has the columns soc, ocv_v[, hysteresis_v].
-    Sources may have different temperatures. The kind of each source is recognized.
+    The OCV is determined from files of three kinds, which are recognized:
+    captures with rests, such as HPPC or relaxation tests (5.2.1 of the thesis);
+    captures of slow discharges and charges;
+    OCV curves in CSV files with the columns soc, ocv_v and, optionally, hysteresis_v.
+    The files may have been recorded at different temperatures.
 
-    The resistances in the written cell file are estimates from the rests and the most similar generic cell.
-    `identify` improves them.
+    The cell file also contains resistances, estimated from the rests and the most similar generic cell.
+    `identify` improves these resistances.
     """
     check_out(out, captures, force=force)
     check_once(captures)
@@ -230,7 +237,7 @@ def _cells_in_series(voltage_v: NDArray[np.float64], configured: int | None) -> 
     count = configured or max(round(middle_v / CELL_VOLTAGE_V), 1)
     if not configured and count > MAX_CELLS:
         raise UserError(
-            f"the voltage is {middle_v:g} V, that of {count} cells in series: are these millivolts? If not, give --series"
+            f"the median voltage is {middle_v:g} V, as of {count} cells in series; if the column is in millivolts, convert it to volts, otherwise give --series"
         )
     if not MIN_CELL_V <= middle_v / count <= MAX_CELL_V:
         raise UserError(f"--series {count}: {middle_v:g} V would be {middle_v / count:.2f} V per cell")
@@ -248,7 +255,7 @@ def _check_ends(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> None:
         return
     raise UserError(
         f"the points begin at SOC {ocv_sources.points.soc[0]:.2f}, and their curve would be {empty_v:.2f} V at SOC 0: give captures "
-        f"down to empty, or the right capacity; {ocv_sources.capacity_ah:g} Ah is too much if the cell was emptied [--capacity-ah]"
+        f"down to empty; if the cell was emptied, the capacity of {ocv_sources.capacity_ah:g} Ah is too large (--capacity-ah)"
     )
 
 
@@ -388,7 +395,7 @@ def _table(out: Path, result: OcvResult, ocv_sources: OcvSources) -> Table:
 
 def _sources_table(result: OcvResult) -> Table:
     """Return a table with the recognized kind of each source."""
-    table = Table("source", "recognized as", "°C", "off", "hysteresis", box=box.SIMPLE_HEAD)
+    table = Table("source", "recognized as", "°C", "RMS error", "hysteresis", box=box.SIMPLE_HEAD)
     for source in result.sources:
         table.add_row(
             source.name,

@@ -17,6 +17,8 @@ from bms_estimator.sinks.trace_file import table_sink
 if TYPE_CHECKING:
     from bms_estimator.fleet.identification.block_capture import BlockCapture
 
+TIME_EXAMPLE = "2026-01-31 or 2026-01-31T12:00"
+"""Start or end time in help texts."""
 FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
 """Formats of start and end time."""
 MAX_SHOWN_GAPS = 5
@@ -25,16 +27,25 @@ MAX_START_DELAY_S = 120.0
 """Delay of the first block after the requested start above which a warning is printed [s]: two blocks of a minute."""
 
 Since = Annotated[
-    datetime | None, typer.Option("--from", formats=FORMATS, help="start time, UTC; default: the oldest block")
+    datetime | None,
+    typer.Option(
+        "--from",
+        formats=FORMATS,
+        metavar="TIME",
+        help=f"start time in UTC: {TIME_EXAMPLE}; default: the oldest stored sample",
+    ),
 ]
 Until = Annotated[
-    datetime | None, typer.Option("--to", formats=FORMATS, help="end time (exclusive), UTC; default: the newest block")
+    datetime | None,
+    typer.Option(
+        "--to", formats=FORMATS, metavar="TIME", help="end time in UTC, exclusive; default: the newest stored sample"
+    ),
 ]
 
 
 def capture(
     pack: Annotated[str, typer.Argument(help="name of the pack", show_default=False)],
-    out: Annotated[Path, typer.Argument(help="table to write: .parquet, .csv.gz or .csv", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="file to write: .parquet, .csv.gz or .csv", show_default=False)],
     since: Since = None,
     until: Until = None,
     server: Server = SERVER,
@@ -42,10 +53,10 @@ def capture(
     ca: Ca = None,
     force: Force = False,
 ) -> None:
-    """Write a pack's samples to a table that `replay`, `identify`, `validate` and `capacity` read.
+    """Write a pack's stored samples to a file that `replay`, `identify`, `validate` and `capacity` can read.
 
-    Blocks are in the order of their numbers. The server stores them for some days (`fleet serve`).
-    With the settings of `fleet packs show PACK --out FOLDER`, `replay` estimates as the workers did.
+    The server stores samples for some days (setting `server.raw_days`). They are written in the order of sending.
+    With the settings that `fleet packs show PACK --out FOLDER` writes, `replay` gives the workers' estimates.
     """
     check_out(out, [], force=force)
     sink = table_sink(out)
@@ -84,10 +95,10 @@ async def fetch_blocks(pack: str, since_s: float, until_s: float, address: Serve
 
 def no_samples_reason(pack: str, fetched: "BlockCapture") -> str:
     """Return the error text for a pack without samples."""
-    damaged = f"; {fetched.damaged} of its messages are not blocks" if fetched.damaged else ""
+    damaged = f"; {fetched.damaged} of its messages are damaged" if fetched.damaged else ""
     return (
-        f"{pack}: the server has no samples of it in this period{damaged}; is the name right, and does its edge send? "
-        "(`fleet packs list` prints the names; server.raw_days limits the age of blocks)"
+        f"{pack}: the server has no samples of this pack in this period{damaged}; check its name, and whether its edge sends "
+        "(`fleet packs list` prints the names; server.raw_days limits the age of stored samples)"
     )
 
 
@@ -101,7 +112,7 @@ def _warnings(fetched: "BlockCapture", since_s: float) -> list[str]:
         more = (
             f" and {len(fetched.missing) - MAX_SHOWN_GAPS} more gaps" if len(fetched.missing) > MAX_SHOWN_GAPS else ""
         )
-        lines.append(f"blocks {gaps}{more} are missing: lost, or yet to be sent again by the edge")
+        lines.append(f"blocks {gaps}{more} are missing: they are lost, or the edge has yet to send them again")
     if fetched.damaged:
-        lines.append(f"{fetched.damaged} messages are not blocks")
+        lines.append(f"{fetched.damaged} messages are damaged and were skipped")
     return lines

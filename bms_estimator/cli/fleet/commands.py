@@ -6,18 +6,26 @@ from bms_estimator.cli.lazy_group import Entry, LazyGroup
 
 COMMANDS = {
     "demo": Entry(
-        "bms_estimator.cli.fleet.demo:demo", "Run server, simulated packs, workers and page in one terminal."
+        "bms_estimator.cli.fleet.demo:demo", "Run a server, simulated packs, workers and the page in one terminal."
     ),
-    "serve": Entry("bms_estimator.cli.fleet.serve:serve", "Run a node of the server, with its streams."),
-    "user": Entry("bms_estimator.cli.fleet.serve:user", "Print the token with which a pack's edge connects."),
-    "worker": Entry("bms_estimator.cli.fleet.worker:worker", "Estimate packs; each worker takes a share of them."),
-    "packs": Entry("bms_estimator.cli.fleet.packs:app", "Load, list, show or remove packs and their cells."),
-    "capture": Entry("bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a table."),
+    "serve": Entry(
+        "bms_estimator.cli.fleet.serve:serve", "Run a node of the fleet server, which stores samples and results."
+    ),
+    "user": Entry("bms_estimator.cli.fleet.serve:user", "Print the token with which the edge of a pack connects."),
+    "worker": Entry("bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."),
+    "packs": Entry("bms_estimator.cli.fleet.packs:app", "Upload, list, show or remove the settings of packs."),
+    "capture": Entry(
+        "bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a CSV or Parquet file."
+    ),
     "identify": Entry("bms_estimator.cli.fleet.identify:identify", "Re-identify packs from their stored samples."),
-    "collect": Entry("bms_estimator.cli.fleet.queries:collect", "Write hourly summaries to Parquet."),
+    "collect": Entry(
+        "bms_estimator.cli.fleet.queries:collect", "Write hourly summaries of all packs to Parquet files."
+    ),
     "ask": Entry("bms_estimator.cli.fleet.queries:ask", "Query the hourly summaries of all packs."),
-    "page": Entry("bms_estimator.cli.fleet.page:page", "Serve the page of all packs."),
-    "simulate": Entry("bms_estimator.cli.fleet.simulate:simulate", "Simulate the edges of many packs."),
+    "page": Entry("bms_estimator.cli.fleet.page:page", "Serve a web page of all packs."),
+    "simulate": Entry(
+        "bms_estimator.cli.fleet.simulate:simulate", "Simulate the edges of many packs, which send samples."
+    ),
 }
 
 
@@ -25,7 +33,12 @@ class _Commands(LazyGroup):
     entries = COMMANDS
 
 
-app = typer.Typer(cls=_Commands, no_args_is_help=True, add_completion=False, help="Many packs on a NATS server.")
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    help="Estimate many packs: their edges send samples to a NATS server, and workers estimate.",
+)
 
 
 @app.callback()

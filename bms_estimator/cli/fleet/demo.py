@@ -18,19 +18,22 @@ from bms_estimator.process.signals import stop_on_signal
 def demo(
     packs: Annotated[int, typer.Option(parser=whole(1, 100_000), help="number of simulated packs")] = 1000,
     seconds: Annotated[
-        float, typer.Option(parser=decimal(3.0), help="duration in seconds for which edges send")
+        float, typer.Option(parser=decimal(3.0), help="duration in seconds for which the edges send samples")
     ] = 45.0,
     page_port: Annotated[
         int | None,
         typer.Option(parser=whole(1, 65535), help="port of the page; default: a free port", show_default=False),
     ] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
+    ] = True,
 ) -> None:
-    """Run server, simulated packs, two workers and the fleet's page in one terminal for a minute; one worker is killed.
+    """Run a server, simulated packs, two workers and the fleet's page in one terminal for a minute.
 
-    All are real processes on loopback with free ports and a temporary folder.
+    All are real processes on the loopback interface, with free ports and a temporary folder.
+    One of the two workers is killed, and the other takes over its packs.
     The edges run ten times as fast as real time.
-    The output compares estimates with the true SOC of the simulated packs.
+    The output compares the estimates with the true SOC of the simulated packs.
     """
     with show_compile_progress():
         load_fleet_kernels()

@@ -38,15 +38,22 @@ RESULTS = "results.csv"
 def identify(
     packs: Annotated[list[str] | None, typer.Argument(help="names of packs", show_default=False)] = None,
     from_file: Annotated[
-        Path | None, typer.Option(help="file with names, one a line, or a CSV with the column pack", show_default=False)
+        Path | None,
+        typer.Option(
+            help="file with names of packs: one name a line, or a CSV file with the column pack", show_default=False
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="folder for cell files and results.csv")] = Path("identified"),
-    put: Annotated[bool, typer.Option("--put", help="upload the new cells, which workers use at once")] = False,
+    out: Annotated[Path, typer.Option(help="folder for the cell files and results.csv")] = Path("identified"),
+    put: Annotated[
+        bool, typer.Option("--put", help="upload the new cell files, which the workers then use at once")
+    ] = False,
     since: Since = None,
     until: Until = None,
     processes: Annotated[
         int | None,
-        typer.Option(parser=whole(1), help="number of processes; default: one for each CPU", show_default=False),
+        typer.Option(
+            parser=whole(1), help="number of parallel processes; default: one for each CPU", show_default=False
+        ),
     ] = None,
     server: Server = SERVER,
     creds: Creds = None,
@@ -54,11 +61,11 @@ def identify(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Re-identify packs from the blocks on the server.
+    """Re-identify the cells of packs from their stored samples on the server.
 
-    A new cell is identified from two thirds of the samples.
-    The last third decides whether the new or the old cell predicts the voltage better.
-    A cell file is written only if the new one is better; otherwise the reason is printed.
+    A new cell is identified from the first two thirds of a pack's samples.
+    The voltages that the old and the new cell predict are then compared with the last third.
+    A cell file is written only if the new cell predicts better; otherwise the reason is printed.
     """
     address = (server, creds, ca)
     names = _names(packs or [], from_file)
@@ -81,7 +88,9 @@ def identify(
         typer.echo(f"{out}: {better} of {len(results)} packs have a better cell")
         Console().print(_table(results))
     for pack in changed:
-        typer.echo(f"warning: {pack}: its row was changed meanwhile; its new cell was not uploaded", err=True)
+        typer.echo(
+            f"warning: {pack}: another client changed its row in the meantime; its new cell was not uploaded", err=True
+        )
 
 
 def _outcomes(

@@ -17,20 +17,32 @@ from bms_estimator.fleet.packs.pack_row import PackSpec, model_key, settings_of
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Table of packs and their cells.")
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    help="Upload, list, show or remove the settings of packs in the server's table.",
+)
 
 
 @app.command()
 def load(
-    table: Annotated[Path, typer.Argument(help="CSV: pack, cell, capacity_ah, series ...", show_default=False)],
+    table: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV file with the columns pack, cell, capacity_ah, series ... (docs/fleet/packs.md)",
+            show_default=False,
+        ),
+    ],
     server: Server = SERVER,
     creds: Creds = None,
     ca: Ca = None,
-    remove: Annotated[bool, typer.Option("--remove", help="remove packs that are not in the table")] = False,
+    remove: Annotated[
+        bool, typer.Option("--remove", help="remove packs from the server that are not in this file")
+    ] = False,
 ) -> None:
-    """Upload a table of packs; unchanged rows are not written again.
+    """Upload a table of packs to the server; unchanged rows are not written again.
 
-    Workers use changes within seconds. A cell that ends in .toml is a cell file beside the table.
+    Workers apply changes within seconds. A cell whose name ends in .toml is a cell file in the folder of the table.
     """
     packs = read_table(table)
     files = {name: _text(path) for name, path in packs.cell_files.items()}
@@ -39,7 +51,7 @@ def load(
 
 @app.command("list")
 def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> None:
-    """Print the server's table as CSV that `load` reads; errors in rows go to stderr."""
+    """Print the server's table of packs as CSV, which `load` can read; errors in rows are printed to stderr."""
     known = asyncio.run(known_packs((server, creds, ca)))
     kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackSpec)}
     # packs with equal models have equal errors, so that one pack of each model is checked
@@ -57,9 +69,9 @@ def remove(
     creds: Creds = None,
     ca: Ca = None,
 ) -> None:
-    """Remove packs from the server's table; later blocks of them are stored but not estimated."""
+    """Remove packs from the server's table; samples that they send later are stored but not estimated."""
     asyncio.run(_remove(set(packs), (server, creds, ca)))
-    typer.echo(f"{len(set(packs))} removed")
+    typer.echo(f"removed from the table: {', '.join(dict.fromkeys(packs))}")
 
 
 @app.command()
@@ -68,9 +80,12 @@ def show(
     server: Server = SERVER,
     creds: Creds = None,
     ca: Ca = None,
-    out: Annotated[Path | None, typer.Option(help="folder for pack.toml and the cell file", show_default=False)] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="write pack.toml and the cell file to this folder instead of printing", show_default=False),
+    ] = None,
 ) -> None:
-    """Print a pack's settings as a pack file, with which `replay` estimates as the workers do."""
+    """Print a pack's settings as a pack file; `replay --pack` with this file gives the workers' estimates."""
     known = asyncio.run(known_packs((server, creds, ca)))
     refuse_unknown([pack], known)
     files = pack_files(pack, known)

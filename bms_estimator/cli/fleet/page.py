@@ -25,16 +25,22 @@ def page(
     listen: Annotated[str, typer.Option(help="host:port of the page")] = DEFAULT_LISTEN,
     folder: Annotated[
         Path | None,
-        typer.Option(help="folder that `fleet collect` writes, for trends", show_default=False),
+        typer.Option(
+            help="folder to which `fleet collect` writes, from which the page shows trends", show_default=False
+        ),
     ] = None,
-    token_file: Annotated[Path | None, typer.Option(help="file with the access token", show_default=False)] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="file with the access token of the page", show_default=False)
+    ] = None,
     host: Annotated[
         list[str] | None,
-        typer.Option(help="host name of the page in addition to that of --listen; repeatable", show_default=False),
+        typer.Option(help="further host name under which browsers request the page; repeatable", show_default=False),
     ] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
+    ] = True,
 ) -> None:
-    """Serve the page of all packs of a fleet, until SIGINT or SIGTERM."""
+    """Serve a web page of all packs of a fleet, until SIGINT or SIGTERM."""
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
     configure_logs()
     with flush_logs():

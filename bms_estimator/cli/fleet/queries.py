@@ -28,10 +28,10 @@ def collect(
     ca: Ca = None,
     folder: Annotated[Path, typer.Option(help="folder of the Parquet files")] = FOLDER,
     period: Annotated[
-        float, typer.Option(min=0.0, help="maximum time in seconds that a row waits for its file")
+        float, typer.Option(min=0.0, help="write a row to a file at most this many seconds after its arrival")
     ] = 300.0,
 ) -> None:
-    """Write hourly summaries to Parquet, until SIGINT or SIGTERM."""
+    """Write the hourly summaries of all packs, which the workers publish, to Parquet files, until SIGINT or SIGTERM."""
     from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
     from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
 
@@ -65,20 +65,27 @@ async def _collect(address: ServerAddress, folder: Path, period_s: float) -> Non
 
 def ask(
     name: Annotated[
-        str | None, typer.Argument(help="name of a query, or sql; default: list the queries", show_default=False)
+        str | None,
+        typer.Argument(
+            help="name of a query, or sql for a query of your own; default: list the queries", show_default=False
+        ),
     ] = None,
-    query: Annotated[str | None, typer.Argument(help="SELECT ... FROM hours, after sql", show_default=False)] = None,
-    folder: Annotated[Path, typer.Option(help="folder that `fleet collect` writes")] = FOLDER,
+    query: Annotated[
+        str | None, typer.Argument(help="after sql: a statement SELECT ... FROM hours", show_default=False)
+    ] = None,
+    folder: Annotated[Path, typer.Option(help="folder to which `fleet collect` writes")] = FOLDER,
     days: Annotated[
-        int | None, typer.Option(min=1, help="number of most recent days; default: all", show_default=False)
+        int | None,
+        typer.Option(min=1, help="use only this number of most recent days; default: all days", show_default=False),
     ] = None,
     within: Annotated[
-        float, typer.Option(min=0.0, help="query failing: maximum number of days until a limit is reached")
+        float,
+        typer.Option(min=0.0, help="query failing: list packs that will reach a limit within this number of days"),
     ] = 90.0,
-    json: Annotated[bool, typer.Option("--json", help="print a JSON list of objects")] = False,
-    csv: Annotated[bool, typer.Option("--csv", help="print CSV")] = False,
+    json: Annotated[bool, typer.Option("--json", help="print the result as a JSON list of objects")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="print the result as CSV")] = False,
 ) -> None:
-    """Query the hourly summaries of all packs; without a name list the queries."""
+    """Query the hourly summaries of all packs. Without a name, list the queries."""
     from bms_estimator.fleet.queries import duckdb_queries as questions  # noqa: PLC0415 - its packages are optional
 
     if name is None:
@@ -98,7 +105,7 @@ def ask(
 def _list(questions: "dict[str, Query]") -> None:
     for name, question in questions.items():
         typer.echo(f"{name:10}{question.help}")
-    typer.echo(f"{'sql':10}SELECT on the view hours; its columns: fleet ask sql 'DESCRIBE hours'")
+    typer.echo(f"{'sql':10}any SELECT from the view hours; fleet ask sql 'DESCRIBE hours' lists its columns")
 
 
 def _print_json(answer: "Answer") -> None:

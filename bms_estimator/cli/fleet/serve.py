@@ -21,25 +21,38 @@ from bms_estimator.settings.pack import DeviceName
 from bms_estimator.settings.page import parse_listen
 
 SettingsFile = Annotated[
-    Path | None, typer.Argument(help="settings of the fleet, fleet.toml; default: all defaults", show_default=False)
+    Path | None,
+    typer.Argument(
+        help="settings file of the fleet, fleet.toml; without a file, the default settings apply", show_default=False
+    ),
 ]
-Folder = Annotated[Path | None, typer.Option(help="folder for streams and keys; default: that of the settings")]
+Folder = Annotated[
+    Path | None,
+    typer.Option(
+        help="folder for streams and keys; default: server.folder of the settings, otherwise the user's state folder"
+    ),
+]
 
 
 def serve(
     settings_file: SettingsFile = None,
     folder: Folder = None,
-    listen: Annotated[str | None, typer.Option(help="host:port for workers; default: that of the settings")] = None,
-    mqtt: Annotated[str | None, typer.Option(help="host:port for edges; default: that of the settings")] = None,
-    node: Annotated[int, typer.Option(min=1, max=5, help="number of this node in --of")] = 1,
+    listen: Annotated[
+        str | None, typer.Option(help="host:port for workers; default: server.listen of the settings")
+    ] = None,
+    mqtt: Annotated[str | None, typer.Option(help="host:port for edges; default: server.mqtt of the settings")] = None,
+    node: Annotated[int, typer.Option(min=1, max=5, help="position of this node in the list --of")] = 1,
     of: Annotated[
         str | None,
-        typer.Option(help=f"addresses of all 3 or 5 nodes for each other, host:port,host,...; port {CLUSTER_PORT}"),
+        typer.Option(
+            help="addresses under which the 3 or 5 nodes of a cluster connect to each other: host,host:port,...; "
+            f"default port: {CLUSTER_PORT}"
+        ),
     ] = None,
 ) -> None:
-    """Run a node of the fleet's server, with its streams, until SIGINT or SIGTERM.
+    """Run a node of the fleet server, which stores samples and results in streams, until SIGINT or SIGTERM.
 
-    The first start creates keys for each tenant. The other nodes need a copy of keys/claims.json.
+    The first start creates keys for each tenant in the folder. In a cluster, copy keys/claims.json to the other nodes.
     """
     settings = _settings(settings_file, listen=listen, mqtt=mqtt)
     place = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, of))
@@ -55,17 +68,23 @@ def serve(
 
 
 def user(
-    tenant: Annotated[str, typer.Argument(help="name of the tenant in the settings", show_default=False)],
+    tenant: Annotated[str, typer.Argument(help="name of the tenant, as in the settings", show_default=False)],
     pack: Annotated[str, typer.Argument(help="name of the pack", show_default=False)],
-    settings_file: Annotated[Path | None, typer.Option("--settings", help="fleet.toml")] = None,
+    settings_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--settings", help="settings file of the fleet, fleet.toml; without a file, the default settings apply"
+        ),
+    ] = None,
     folder: Folder = None,
     days: Annotated[
-        float | None, typer.Option(min=0.0, max=36_600.0, help="validity of the token in days; default: unlimited")
+        float | None,
+        typer.Option(min=0.0, max=36_600.0, help="number of days for which the token is valid; default: unlimited"),
     ] = None,
 ) -> None:
-    """Print the token of a pack's edge, which is its MQTT password.
+    """Print the token of a pack's edge, which the edge uses as its MQTT password.
 
-    The token permits only sending blocks of this pack and receiving the replies. Keep it secret.
+    With the token an edge can only send samples of this pack and receive the replies. Keep the token secret.
     """
     try:
         TypeAdapter(DeviceName).validate_python(pack)
@@ -109,13 +128,13 @@ def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, .
     """
     if of is None:
         if number != 1:
-            raise UserError(f"--node {number}: name all nodes with --of host,host,host")
+            raise UserError(f"--node {number}: requires --of host,host,host, which names all nodes")
         return ()
     nodes = tuple(host if _has_port(host) else f"{host}:{CLUSTER_PORT}" for host in of.split(","))
     if len(set(nodes)) != len(nodes) or len(nodes) not in (3, 5):
-        raise UserError(f"--of {of}: must name 3 or 5 distinct nodes; two nodes have no majority without one of them")
+        raise UserError(f"--of {of}: must name 3 or 5 distinct nodes, so that a majority remains if one fails")
     if number > len(nodes):
-        raise UserError(f"--node {number}: --of names {len(nodes)}")
+        raise UserError(f"--node {number}: --of names only {len(nodes)} nodes")
     try:
         if not all(parse_listen(node).loopback for node in nodes):
             settings.refuse_open(f"--of {of}")

@@ -9,12 +9,20 @@ SERVER = "nats://127.0.0.1:4222"
 """Default address of the server."""
 
 Server = Annotated[
-    str, typer.Option(help="fleet server, nats://host:port or tls://host:port; separate several with commas")
+    str,
+    typer.Option(
+        help="address of the fleet server, nats://host:port or tls://host:port; separate several nodes with commas"
+    ),
 ]
-Creds = Annotated[Path | None, typer.Option(help="credentials file of the tenant", show_default=False)]
+Creds = Annotated[
+    Path | None,
+    typer.Option(help="credentials file of the tenant; required if the server has tenants", show_default=False),
+]
 Ca = Annotated[
     Path | None,
-    typer.Option(help="certificate authority of the server; default: the system's", show_default=False),
+    typer.Option(
+        help="file with the certificate authority of the server; default: the system's certificates", show_default=False
+    ),
 ]
 ServerAddress = tuple[str, Path | None, Path | None]
 """URLs of the server, credentials file, and certificate authority."""

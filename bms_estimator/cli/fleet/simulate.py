@@ -29,36 +29,51 @@ def simulate(
     packs: Annotated[int, typer.Option(parser=whole(1, MAX_PACKS), help="number of packs")] = 1000,
     mqtt: Annotated[
         str | None,
-        typer.Option(help="fleet server, mqtt://host:port or mqtts://host:port; separate several with commas"),
+        typer.Option(
+            help="address of the fleet server, mqtt://host:port or mqtts://host:port; separate several nodes with commas"
+        ),
     ] = None,
     username: Annotated[str | None, typer.Option(help="MQTT user that may publish for all packs")] = None,
-    password_file: Annotated[Path | None, typer.Option(help="file with the password")] = None,
-    ca: Annotated[Path | None, typer.Option(help="certificate authority of the server; default: the system's")] = None,
+    password_file: Annotated[Path | None, typer.Option(help="file with the password of this user")] = None,
+    ca: Annotated[
+        Path | None,
+        typer.Option(help="file with the certificate authority of the server; default: the system's certificates"),
+    ] = None,
     speed: Annotated[float, typer.Option(parser=decimal(1e-3, 1e5), help="speed relative to real time")] = 1.0,
     blocks: Annotated[
         int | None,
         typer.Option(
-            parser=whole(1), help="number of blocks (minutes) of each pack; default: until Ctrl-C", show_default=False
+            parser=whole(1),
+            help="number of blocks of one minute that each pack sends; default: until Ctrl-C",
+            show_default=False,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(parser=whole(), help="seed of the packs")] = 1,
+    seed: Annotated[int, typer.Option(parser=whole(), help="random seed of the packs")] = 1,
     begin: Annotated[
-        datetime | None, typer.Option(help="start time of the edges; default: a minute ago", show_default=False)
+        datetime | None,
+        typer.Option(
+            metavar="TIME",
+            help="local time of the first sample, 2026-01-31T12:00:00; default: a minute ago",
+            show_default=False,
+        ),
     ] = None,
-    prefix: Annotated[str, typer.Option(help="prefix of the names")] = "sim",
-    connections: Annotated[int, typer.Option(parser=whole(1, 100), help="MQTT connections for all edges")] = 4,
+    prefix: Annotated[str, typer.Option(help="prefix of the packs' names")] = "sim",
+    connections: Annotated[
+        int, typer.Option(parser=whole(1, 100), help="number of MQTT connections that all edges share")
+    ] = 4,
     table: Annotated[Path | None, typer.Option(help="write the table for `fleet packs load` to this file")] = None,
-    truth: Annotated[Path | None, typer.Option(help="write the true values to this CSV file")] = None,
+    truth: Annotated[Path | None, typer.Option(help="write the true parameters of the packs to this CSV file")] = None,
 ) -> None:
-    """Simulate the edges of many packs: send a block a minute for each, and again if a worker requests it.
+    """Simulate the edges of many packs, each of which sends a block of samples a minute.
 
-    A few MQTT connections stand for all edges.
-    The packs have shipped cells with different capacities and resistances.
-    A block is computed from seed, pack and number.
-    With --table and without --mqtt only the table is written.
+    An edge sends a block again if a worker requests it.
+    All edges share a few MQTT connections.
+    The packs consist of shipped cells, with different capacities and resistances.
+    The samples of a block depend only on the seed, the pack and the number of the block.
+    With --table and without --mqtt, only the table is written.
     """
     if mqtt is None and table is None and truth is None:
-        raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write the table of the packs alone")
+        raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write only the table of the packs")
     fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin), prefix=_prefix(prefix))
     for path, text in ((table, fleet.table), (truth, fleet.truth_table)):
         if path is not None:
@@ -90,7 +105,7 @@ def _prefix(prefix: str) -> str:
     try:
         return TypeAdapter(DeviceName).validate_python(prefix)
     except ValidationError:
-        raise UserError(f"--prefix {prefix}: only letters, digits, _ and -") from None
+        raise UserError(f"--prefix {prefix}: must consist of letters, digits, _ and -") from None
 
 
 def _broker(url: str, **options: str | Path | None) -> MqttSettings:

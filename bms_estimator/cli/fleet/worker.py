@@ -25,15 +25,16 @@ def worker(
     creds: Creds = None,
     ca: Ca = None,
     name: Annotated[
-        str | None, typer.Option(help="name of the worker; must be unique", show_default="host and process number")
+        str | None,
+        typer.Option(help="name of the worker, which must be unique", show_default="host name and process number"),
     ] = None,
     checkpoint_s: Annotated[
-        float, typer.Option(min=1.0, help="interval in seconds between checkpoints of a partition")
+        float, typer.Option(min=1.0, help="interval in seconds between two checkpoints of the same partition")
     ] = CHECKPOINT_S,
 ) -> None:
     """Run a worker, which estimates the packs of some partitions, until SIGINT or SIGTERM.
 
-    All workers of a tenant share its partitions.
+    The packs of a tenant are divided into partitions, which its workers share among themselves.
     """
     options = Options(server, _worker_name(name), creds, ca, checkpoint_s)
     configure_logs()

@@ -31,18 +31,22 @@ from bms_estimator.sources.serial.port_list import NoPortError, resolve_port
 
 
 def board(
-    port: Annotated[str, typer.Argument(help="serial port; auto: the only one")] = "auto",
+    port: Annotated[
+        str, typer.Argument(help="serial port of the board; auto: port of the only connected board")
+    ] = "auto",
     aref_v: Annotated[
         float | None,
         typer.Option(
-            parser=decimal(), help="voltage measured between AREF and GND [V]; sets the bandgap", show_default=False
+            parser=decimal(),
+            help="set the bandgap voltage from the voltage that a multimeter shows between AREF and GND [V]",
+            show_default=False,
         ),
     ] = None,
     divider: Annotated[
         float | None,
         typer.Option(
             parser=decimal(MIN_DIVIDER, MAX_DIVIDER),
-            help="set the divider ratio: pack voltage / voltage at A0",
+            help="set the ratio of the voltage divider: pack voltage / voltage at pin A0",
             show_default=False,
         ),
     ] = None,
@@ -50,7 +54,7 @@ def board(
         float | None,
         typer.Option(
             parser=decimal(MIN_VOLTS_PER_AMPERE, MAX_VOLTS_PER_AMPERE),
-            help="set the slope of the current sensor [V/A], for a ratiometric sensor at 5 V",
+            help="set the slope of the current sensor [V/A]; of a ratiometric sensor, the slope at a supply of 5 V",
             show_default=False,
         ),
     ] = None,
@@ -58,32 +62,38 @@ def board(
         bool | None,
         typer.Option(
             "--ratiometric/--absolute",
-            help="set whether the slope is proportional to the 5 V supply",
+            help="set whether the slope is proportional to the supply voltage (ratiometric) or constant (absolute)",
             show_default=False,
         ),
     ] = None,
     serial: Annotated[
         int | None,
         typer.Option(
-            parser=whole(1, 2**32 - 1), help="set the serial number, which is shown in hexadecimal", show_default=False
+            parser=whole(1, 2**32 - 1),
+            help="set the serial number, given in decimal and shown in hexadecimal",
+            show_default=False,
         ),
     ] = None,
     accept: Annotated[
         Path | None,
         typer.Option(
-            help="accept the next board that connects for the pack with these settings; no port is opened",
+            help="let the service of the pack with this settings file accept the next board that connects; no port is opened",
             show_default=False,
         ),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(help="state folder of the service with --accept; default: that of the settings, or the user's"),
+        typer.Option(
+            help="with --accept: state folder of the service; default: state.folder of the settings, otherwise the user's state folder"
+        ),
     ] = None,
     baud: Annotated[int, typer.Option(parser=whole(1200), help="baud rate of the board")] = BAUD,
 ) -> None:
-    """Show a board's properties, and set its bandgap, gains and serial number, which it stores in EEPROM.
+    """Show a sensor board's properties, and set its calibration and serial number.
 
-    The bandgap voltage differs by up to 10 % between boards and scales the measured voltage, so calibrate it once.
+    The board stores these values in its EEPROM.
+    The bandgap voltage differs by up to 10 % between boards, and scales the measured pack voltage.
+    Therefore calibrate the bandgap once, with --aref-v.
     """
     if accept is not None:
         settings = load_settings(accept)
@@ -118,13 +128,15 @@ def _accept_next(settings: Settings, folder: Path) -> None:
         UserError: The settings name the board, none is stored in the folder, or the file cannot be written.
     """
     if settings.sensor.serial:
-        raise UserError(f"sensor.serial = {settings.sensor.serial}: the settings name the board; change it there")
+        raise UserError(
+            f"sensor.serial = {settings.sensor.serial}: the settings name the board; change sensor.serial instead of --accept"
+        )
     file = KnownBoardFile(folder, settings.pack.name)
     known = file.load()
     if not known:
         raise UserError(
-            f"{file.path}: no board is stored there; give the state folder of the service with --folder "
-            "(that of the installed unit is /var/lib/bms-estimator, readable by root)"
+            f"{file.path}: no board is stored in this file; give the state folder of the service with --folder "
+            "(the installed systemd unit uses /var/lib/bms-estimator, which root can read)"
         )
     try:
         file.save(NO_BOARD)
@@ -144,8 +156,8 @@ def _bandgap_v(client: BoardClient, hello: Hello, aref_v: float) -> float:
     bandgap_v = hello.bandgap_uv * 1e-6 * aref_v / reference_v
     if not MIN_BANDGAP_V <= bandgap_v <= MAX_BANDGAP_V:
         raise UserError(
-            f"--aref-v {aref_v:g}: the bandgap would be {bandgap_v:.3f} V, but every board's is between "
-            f"{MIN_BANDGAP_V} and {MAX_BANDGAP_V} V; with {_volts(hello)} the board measures {reference_v:.3f} V at AREF"
+            f"--aref-v {aref_v:g}: the bandgap voltage would be {bandgap_v:.3f} V, but on every board it is between "
+            f"{MIN_BANDGAP_V} and {MAX_BANDGAP_V} V; with its present bandgap voltage of {_volts(hello)} the board measures {reference_v:.3f} V at AREF"
         )
     return bandgap_v
 

@@ -20,21 +20,32 @@ from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
 def dashboard(
     pack: Annotated[
         Path | None,
-        typer.Argument(help="settings of a pack, pack.toml; its \\[mqtt] and \\[page] are used", show_default=False),
+        typer.Argument(
+            help="settings file of a pack, pack.toml, whose sections \\[mqtt] and \\[page] are used", show_default=False
+        ),
     ] = None,
     mqtt: Annotated[
-        str | None, typer.Option(help="broker, mqtt://host:port; default: that of PACK, or mqtt://localhost:1883")
+        str | None,
+        typer.Option(help="MQTT broker, mqtt://host:port; default: broker in PACK, otherwise mqtt://localhost:1883"),
     ] = None,
     listen: Annotated[
-        str | None, typer.Option(help=f"host:port of the page; default: that of PACK, or {DEFAULT_LISTEN}")
+        str | None,
+        typer.Option(help=f"host:port of the page; default: page.listen in PACK, otherwise {DEFAULT_LISTEN}"),
     ] = None,
-    token_file: Annotated[Path | None, typer.Option(help="file with the access token", show_default=False)] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="file with the access token of the page", show_default=False)
+    ] = None,
     folder: Annotated[
-        Path | None, typer.Option(help="state folder of services on this machine, for their history")
+        Path | None,
+        typer.Option(
+            help="state folder of the services on this machine, from which the page reads the history of their packs"
+        ),
     ] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
+    ] = True,
 ) -> None:
-    """Serve the live page of all packs that publish to a broker, until SIGINT or SIGTERM."""
+    """Serve a live web page of all packs that publish to an MQTT broker, until SIGINT or SIGTERM."""
     settings = load_settings(pack) if pack else Settings()
     broker = (with_broker(settings, mqtt) if mqtt else settings).mqtt or MqttSettings()
     page = page_settings(settings.page or PageSettings(), listen=listen, token_file=token_file)

@@ -24,26 +24,32 @@ def demo(
     port: Annotated[
         int | None,
         typer.Option(
-            parser=whole(1, 65535), help="port of the broker; default: 1883, or a free port", show_default=False
+            parser=whole(1, 65535),
+            help="port of the broker; default: 1883 if it is free, otherwise another port",
+            show_default=False,
         ),
     ] = None,
     page_port: Annotated[
         int | None,
         typer.Option(
-            parser=whole(1, 65535), help="port of the live page; default: 8765, or a free port", show_default=False
+            parser=whole(1, 65535),
+            help="port of the live page; default: 8765 if it is free, otherwise another port",
+            show_default=False,
         ),
     ] = None,
-    rate_hz: Annotated[int, typer.Option(parser=whole(1, 1000), help="sample rate [Hz]")] = 100,
+    rate_hz: Annotated[int, typer.Option(parser=whole(1, 1000), help="sample rate of the board [Hz]")] = 100,
     speed: Annotated[
         float, typer.Option(parser=decimal(0.1, 10.0), help="speed of the board's clock relative to real time")
     ] = 1.0,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page on a desktop")] = True,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
+    ] = True,
 ) -> None:
-    """Run broker, board, service and live page in one terminal, until Ctrl-C.
+    """Run an MQTT broker, a simulated board, the live service and its web page in one terminal, until Ctrl-C.
 
-    A simulated board measures a simulated 275 mAh cell under a changing load.
-    The real service reads the board from a pseudo-terminal and publishes to a broker on loopback.
-    The initial SOC is 20 % wrong; the true SOC is shown beside the estimate.
+    The simulated board measures a simulated 275 mAh cell under a changing load.
+    The service reads the board through a pseudo-terminal, and publishes to the broker on the loopback interface.
+    The initial SOC is 20 % wrong. The true SOC is shown beside the estimate.
     """
     log = deque[str](maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)

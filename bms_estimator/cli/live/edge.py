@@ -18,12 +18,14 @@ from bms_estimator.settings.pack import load_settings
 
 
 def edge(
-    pack: Annotated[Path, typer.Argument(help="settings of the pack, with \\[edge]")] = Path("pack.toml"),
-    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
+    pack: Annotated[Path, typer.Argument(help="settings file of the pack, with a section \\[edge]")] = Path(
+        "pack.toml"
+    ),
+    port: Annotated[str | None, typer.Option(help="serial port that replaces sensor.port of the settings")] = None,
 ) -> None:
-    """Send a pack's raw samples to a fleet's server, until SIGINT or SIGTERM.
+    """Send a pack's raw samples to a fleet server, whose workers estimate, until SIGINT or SIGTERM.
 
-    Unconfirmed samples are stored on disk: see docs/fleet/edge.md.
+    Samples are stored on disk until the server confirms them (docs/fleet/edge.md).
     """
     settings = with_sensor(load_settings(pack), port=port)
     configure_logs()

@@ -20,34 +20,45 @@ from bms_estimator.settings.pack import load_settings
 from bms_estimator.store.history_reader import HistoryFile, PastEvent
 from bms_estimator.store.minute import MINUTE_S, Minute
 
+TIME_EXAMPLE = "2026-01-31 or 2026-01-31T12:00"
+"""Start or end time in help texts."""
 FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
 """Formats of start and end time."""
 
 
 def history(
-    pack: Annotated[Path, typer.Argument(help="settings of the pack, pack.toml")],
+    pack: Annotated[Path, typer.Argument(help="settings file of the pack, pack.toml")],
     since: Annotated[
-        datetime | None, typer.Option(formats=FORMATS, help="start time, UTC; default: the oldest row")
+        datetime | None,
+        typer.Option(
+            formats=FORMATS, metavar="TIME", help=f"first time in UTC: {TIME_EXAMPLE}; default: the oldest row"
+        ),
     ] = None,
     until: Annotated[
-        datetime | None, typer.Option(formats=FORMATS, help="end time (exclusive), UTC; default: now")
+        datetime | None,
+        typer.Option(formats=FORMATS, metavar="TIME", help="end time in UTC, exclusive; default: now"),
     ] = None,
     step: Annotated[
-        int, typer.Option(parser=whole(MINUTE_S), help="interval of the rows in seconds, whole minutes")
+        int, typer.Option(parser=whole(MINUTE_S), help="interval of the rows in seconds, a multiple of 60")
     ] = MINUTE_S,
-    events: Annotated[bool, typer.Option("--events", help="print events instead of measurements")] = False,
+    events: Annotated[
+        bool, typer.Option("--events", help="print events instead of means, extremes and totals")
+    ] = False,
     folder: Annotated[
-        Path | None, typer.Option(help="state folder of the service; default: that of the settings, or the user's")
+        Path | None,
+        typer.Option(
+            help="state folder of the service; default: state.folder of the settings, otherwise the user's state folder"
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="CSV file to write; default: stdout")] = None,
     force: Force = False,
 ) -> None:
-    """Print the history of a pack as CSV: means, extremes and totals by the minute or a longer interval.
+    """Print a pack's stored history as CSV: means, extremes and totals of intervals of a minute or more.
 
-    The service may run meanwhile. Charge and energy out are discharge.
+    The service may be running. In column names, out means discharge and in means charge.
     """
     if step % MINUTE_S:
-        raise UserError(f"--step {step}: must be whole minutes: a multiple of {MINUTE_S}")
+        raise UserError(f"--step {step}: must be a multiple of {MINUTE_S} s")
     settings = load_settings(pack)
     path = (folder or state_folder(settings)) / f"{settings.pack.name}.sqlite"
     if out is not None:

@@ -15,20 +15,22 @@ from bms_estimator.sources.serial.port_list import holder, stable_names
 
 
 def ports(
-    paths: Annotated[list[str] | None, typer.Argument(help="serial ports; default: all")] = None,
+    paths: Annotated[list[str] | None, typer.Argument(help="paths of serial ports; default: all ports")] = None,
     probe: Annotated[
-        bool, typer.Option("--probe", help="identify the device on each port; opening a port may reset its board")
+        bool, typer.Option("--probe", help="open each port and identify its device; this may reset a board")
     ] = False,
     baud: Annotated[
         int | None,
         typer.Option(
-            parser=whole(1200), help="baud rate of the probe; default: that of each protocol", show_default=False
+            parser=whole(1200),
+            help="baud rate at which devices are probed; default: the baud rate of each protocol",
+            show_default=False,
         ),
     ] = None,
 ) -> None:
-    """List serial ports by their stable names, and identify boards, BMS and meters on them.
+    """List serial ports by their stable names; with --probe, identify the boards, BMS and meters on them.
 
-    A stable name does not change when devices are plugged in another order. Use it as ``sensor.port``.
+    A stable name does not depend on the order in which devices are plugged in. Use such a name as `sensor.port`.
     """
     existing = {port.device: port.description for port in list_ports.comports()}
     listed = {path: existing.get(path, "") for path in paths} if paths else existing

@@ -30,32 +30,38 @@ REDRAW_S = 0.25
 
 
 def record(
-    out: Annotated[Path, typer.Argument(help="new file", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="file to create", show_default=False)],
     pack: Annotated[
         Path | None,
         typer.Option(
-            help="settings of the pack, pack.toml; its \\[sensor] or \\[source] names the device", show_default=False
+            help="settings file of the pack, pack.toml, whose section \\[sensor] or \\[source] describes the device",
+            show_default=False,
         ),
     ] = None,
-    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
-    baud: Annotated[int | None, typer.Option(parser=whole(1200), help="baud rate in place of sensor.baud")] = None,
-    rate_hz: Annotated[
-        int | None, typer.Option(parser=whole(1, 1000), help="sample rate in place of sensor.sample_rate_hz")
+    port: Annotated[str | None, typer.Option(help="serial port that replaces sensor.port of the settings")] = None,
+    baud: Annotated[
+        int | None, typer.Option(parser=whole(1200), help="baud rate that replaces sensor.baud of the settings")
     ] = None,
-    text: Annotated[bool, typer.Option("--text", help="read a board that prints text lines")] = False,
+    rate_hz: Annotated[
+        int | None,
+        typer.Option(
+            parser=whole(1, 1000), help="sample rate [Hz] that replaces sensor.sample_rate_hz of the settings"
+        ),
+    ] = None,
+    text: Annotated[bool, typer.Option("--text", help="the board sends text lines, not binary frames")] = False,
     seconds: Annotated[
         float | None,
         typer.Option(
             parser=decimal(0.0),
-            help="duration in seconds from the first bytes; default: until Ctrl-C",
+            help="duration in seconds, counted from the first received bytes; default: until Ctrl-C",
             show_default=False,
         ),
     ] = None,
 ) -> None:
-    """Record the raw bytes of a board or another source with their arrival times, until Ctrl-C.
+    """Record the raw bytes of a sensor board or another device with their arrival times, until Ctrl-C.
 
-    Each chunk is written as it arrives, so a killed recorder leaves a readable capture.
-    Without --pack and --port the only connected board is used.
+    Bytes are written as they arrive, so that the file is readable even if the command is killed.
+    Without --pack and --port, the command records the only connected board.
     """
     settings = load_pack(pack)[0] if pack else Settings()
     protocol = "text" if text else None

@@ -31,20 +31,24 @@ from bms_estimator.sources.captures.recorder import CaptureRecorder
 
 def run(
     packs: Annotated[
-        list[Path] | None, typer.Argument(help="settings file of each pack", show_default="pack.toml")
+        list[Path] | None, typer.Argument(help="settings files, one for each pack", show_default="pack.toml")
     ] = None,
-    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
-    mqtt: Annotated[str | None, typer.Option(help="broker in place of mqtt.url, mqtt://host:port")] = None,
+    port: Annotated[str | None, typer.Option(help="serial port that replaces sensor.port of the settings")] = None,
+    mqtt: Annotated[
+        str | None, typer.Option(help="MQTT broker that replaces mqtt.url of the settings, mqtt://host:port")
+    ] = None,
     record: Annotated[
-        Path | None, typer.Option(help="also record the source's raw bytes in this new file", show_default=False)
+        Path | None, typer.Option(help="also record the device's raw bytes in this new file", show_default=False)
     ] = None,
     view: Annotated[
-        bool | None, typer.Option("--view/--no-view", help="live view on stdout; default: on a terminal")
+        bool | None,
+        typer.Option("--view/--no-view", help="show a live view on stdout; default: only if stdout is a terminal"),
     ] = None,
 ) -> None:
-    """Estimate live from a BMS, battery monitor or board, and publish, until SIGINT or SIGTERM.
+    """Run the live service: estimate from a BMS, battery monitor or sensor board, and publish the estimates.
 
-    One process may serve several packs, each with its own source and broker connection.
+    The service runs until SIGINT or SIGTERM.
+    One process may serve several packs, each with its own device and broker connection.
     """
     paths = packs or [Path("pack.toml")]
     apply_options = partial(_with_options, port=port, mqtt=mqtt)
@@ -54,7 +58,7 @@ def run(
             _run_one(*loaded[0], record, view=sys.stdout.isatty() if view is None else view)
         else:
             if port or record or view:
-                raise UserError("--port, --record and --view are for one pack")
+                raise UserError("--port, --record and --view require a single pack")
             _run_several(loaded)
 
 

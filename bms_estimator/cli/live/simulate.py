@@ -36,29 +36,39 @@ def simulate(
     current_a: Annotated[
         float | None,
         typer.Option(
-            parser=decimal(), help="current of the load [A], positive on discharge; default: 3C", show_default=False
+            parser=decimal(),
+            help="current of the load [A], positive on discharge; default: the 3C current",
+            show_default=False,
         ),
     ] = None,
     soc: Annotated[float, typer.Option(parser=decimal(0.0, 1.0), help="initial SOC, 0..1")] = 0.9,
     rate_hz: Annotated[
-        int, typer.Option(parser=whole(1, 1000), help="sample rate until the host requests another [Hz]")
+        int,
+        typer.Option(parser=whole(1, 1000), help="sample rate of the board [Hz], until the host requests another rate"),
     ] = RATE_HZ_AT_RESET,
     text: Annotated[
-        bool, typer.Option("--text", help="send text lines from the board instead of binary frames")
+        bool, typer.Option("--text", help="let the board send text lines instead of binary frames")
     ] = False,
     protocol: Annotated[
         str | None,
         typer.Option(
-            help=f"simulate a device with this sensor.protocol: {', '.join(DEVICES)}; jk-pb is a JK-BMS with newer frames",
+            help=f"simulate a device with this protocol instead of a board: {', '.join(DEVICES)} (a JK-BMS with newer frames)",
             show_default=False,
         ),
     ] = None,
     mqtt: Annotated[
         str | None,
-        typer.Option(help="publish to this broker as an ESPHome node with a JK-BMS", show_default=False),
+        typer.Option(
+            help="simulate an ESPHome node with a JK-BMS instead of a board, which publishes to this MQTT broker, mqtt://host:port",
+            show_default=False,
+        ),
     ] = None,
-    prefix: Annotated[str, typer.Option(help="name of the ESPHome node")] = "jk-bms",
-    noise_lsb: Annotated[float, typer.Option(parser=decimal(0.0), help="noise of the converter, in steps")] = 0.5,
+    prefix: Annotated[
+        str, typer.Option(help="with --mqtt: name of the ESPHome node, and first level of its topics")
+    ] = "jk-bms",
+    noise_lsb: Annotated[
+        float, typer.Option(parser=decimal(0.0), help="standard deviation of the AD converter's noise [LSB]")
+    ] = 0.5,
     speed: Annotated[float, typer.Option(parser=decimal(1e-3), help="speed relative to real time")] = 1.0,
     seconds: Annotated[
         float,
@@ -66,13 +76,14 @@ def simulate(
             parser=decimal(0.0), help="simulated duration in seconds; default: until Ctrl-C", show_default=False
         ),
     ] = math.inf,
-    seed: Annotated[int, typer.Option(parser=whole(), help="seed of load and noise")] = 0,
+    seed: Annotated[int, typer.Option(parser=whole(), help="random seed of load and noise")] = 0,
 ) -> None:
-    """Serve a simulated board on a pseudo-terminal, until Ctrl-C.
+    """Simulate a sensor board, BMS or battery monitor on a pseudo-terminal, until Ctrl-C.
 
-    The command prints the path of the pseudo-terminal for `run --port PATH`.
-    The board uses the firmware's protocol and measures a simulated pack with a 10-bit converter.
-    With --mqtt it publishes as an ESPHome node with a JK-BMS, for `source.profile = "esphome-jk"`.
+    The command prints the path of the pseudo-terminal, which `run --port PATH` can open.
+    The simulated board uses the firmware's protocol, and measures a simulated pack with a 10-bit AD converter.
+    --protocol simulates a BMS or battery monitor instead.
+    --mqtt simulates an ESPHome node with a JK-BMS instead, for the setting `source.profile = "esphome-jk"`.
     """
     model = load_cell(cell, capacity_ah).pack(series, 1)
     ampere = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a

@@ -27,22 +27,28 @@ REDRAW_S = 1.0
 
 def top(
     pack: Annotated[
-        Path | None, typer.Argument(help="pack file whose \\[mqtt] says where the broker is", show_default=False)
+        Path | None,
+        typer.Argument(
+            help="settings file of a pack, pack.toml, whose section \\[mqtt] names the broker", show_default=False
+        ),
     ] = None,
     mqtt: Annotated[
         str | None,
-        typer.Option(help="broker, mqtt://host:port; default: that of PACK, or localhost", show_default=False),
+        typer.Option(
+            help="MQTT broker, mqtt://host:port; default: broker in PACK, otherwise mqtt://localhost:1883",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
-    """Show all packs of a broker in a table.
+    """Show all packs that publish to an MQTT broker, as a table.
 
-    On a terminal q quits. If standard output is no terminal, each state is a line, until Ctrl-C.
+    In a terminal, q quits. If stdout is not a terminal, each published estimate is printed as a line, until Ctrl-C.
     """
     settings = load_settings(pack) if pack else Settings()
     if mqtt or not pack:
         settings = with_broker(settings, mqtt or str(MqttSettings.model_fields["url"].default))
     if settings.mqtt is None:
-        raise UserError(f"{pack}: has no [mqtt]: name the broker there, or with --mqtt mqtt://host:port")
+        raise UserError(f"{pack}: has no section [mqtt]; name the broker there, or give --mqtt mqtt://host:port")
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)
     with flush_logs():

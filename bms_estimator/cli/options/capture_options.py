@@ -13,34 +13,41 @@ from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 
-AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
+AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 """Option that prints the result as JSON."""
 CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
-OR_FUEL_CELL_HELP = f"{CELL_HELP}; for a fuel cell: pem_30w or path of a file"
+OR_FUEL_CELL_HELP = f"{CELL_HELP}; of a fuel cell: pem_30w, or path of its cell file"
+CAPTURE_FORMATS = "file of `record` or `run --record`, CSV (.csv, .csv.gz) or Parquet"
+"""Formats of a capture in help texts."""
+CAPTURE_HELP = f"capture to read: {CAPTURE_FORMATS}; -: read standard input"
 CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
 CapacityAh = Annotated[
     float | None,
     typer.Option(
         parser=decimal(),
-        help="capacity of the cell [Ah]; required for a generic cell; default: that of the cell file",
+        help="capacity of the cell [Ah]; required for a generic cell; default: capacity in the cell file",
         show_default=False,
     ),
 ]
 CapturesFromRest = Annotated[
-    list[Path], typer.Argument(help="recorded captures, CSV (.gz) or Parquet, each from rest", show_default=False)
+    list[Path], typer.Argument(help=f"captures that begin with a rest; each a {CAPTURE_FORMATS}", show_default=False)
 ]
 InitialSoc = Annotated[
     float | None,
     typer.Option(
         parser=decimal(0.0, 1.0),
-        help="SOC at the first sample of each capture; default: from the voltage of the first rest",
+        help="SOC at the first sample of each capture; default: from the voltage of the capture's first rest",
     ),
 ]
 NewCellFile = Annotated[Path, typer.Option(help="cell file to write", show_default=False)]
-Force = Annotated[bool, typer.Option("--force", help="replace the file of --out")]
+Force = Annotated[bool, typer.Option("--force", help="replace an existing output file")]
 SignOfCurrent = Annotated[
     CurrentSign | None,
-    typer.Option(help="direction of positive current in the file; default: that of the format, otherwise discharge"),
+    typer.Option(
+        metavar="SIGN",
+        help="direction of positive current in the capture: discharge_positive or charge_positive; default: "
+        "as the capture states it, otherwise discharge_positive",
+    ),
 ]
 
 
@@ -65,8 +72,8 @@ def check_once(captures: Sequence[Path]) -> None:
     for i, path in enumerate(captures):
         for other in captures[:i]:
             if path.is_file() and other.is_file() and filecmp.cmp(path, other, shallow=False):
-                same = "given twice" if path.samefile(other) else f"the same as {other}"
-                raise UserError(f"{path}: {same}; it would count twice")
+                same = "given twice" if path.samefile(other) else f"has the same content as {other}"
+                raise UserError(f"{path}: {same}; the capture would count twice")
 
 
 def unique_names(names: Sequence[str], paths: Sequence[Path]) -> list[str]:

@@ -12,7 +12,7 @@ from numba.core import event
 from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
-TEXT = "compiling the kernels, once, a minute or two"
+TEXT = "compiling the kernels; this takes a minute or two, and later starts use the cache"
 """Text of the progress line."""
 
 

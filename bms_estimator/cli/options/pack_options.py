@@ -40,7 +40,7 @@ def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None)
         UserError: Neither ``pack`` nor ``cell`` is given, or ``load_pack`` fails.
     """
     if pack is None and cell is None:
-        raise UserError("give --cell NAME|CELL.toml or --pack pack.toml")
+        raise UserError("give either --cell NAME|CELL.toml or --pack pack.toml")
     settings = load_settings(pack) if pack else Settings(sensor=SensorSettings(voltage_resolution_v=TABLE_RESOLUTION_V))
     if cell is None and pack is not None:
         cell = _locate_cell(pack, settings.pack.cell)
@@ -75,7 +75,7 @@ def reject_soc_for_fuel_cell(model: PackModel, key: str) -> None:
         UserError: The model is a fuel cell.
     """
     if isinstance(model, FuelCellModel):
-        raise UserError(f"{key}: {model.cell.name} is a fuel cell, which has no state of charge; remove it")
+        raise UserError(f"{key}: {model.cell.name} is a fuel cell, which has no state of charge; remove {key}")
 
 
 def with_pack(settings: Settings, **changes: object) -> Settings:
@@ -93,7 +93,7 @@ def with_sensor(settings: Settings, **changes: object) -> Settings:
     given = {name: value for name, value in changes.items() if value is not None}
     if given and settings.source is not None:
         raise UserError(
-            f"{', '.join(given)}: applies to a serial port, but the settings have another [source]; remove one of them"
+            f"{', '.join(given)}: applies to a serial device, but [source] in the settings is another device; remove one of them"
         )
     sensor = SensorSettings.model_validate(settings.sensor.model_dump(exclude_unset=True) | given)
     return settings.model_copy(update={"sensor": sensor})
@@ -109,6 +109,7 @@ def with_broker(settings: Settings, url: str) -> Settings:
     try:
         mqtt = MqttSettings.model_validate(others | {"url": url})
     except ValidationError:
-        expected = MqttSettings.model_fields["url"].description
-        raise UserError(f"--mqtt {without_secrets(url)}: must be {expected}") from None
+        raise UserError(
+            f"--mqtt {without_secrets(url)}: must be mqtt://host:port, or mqtts://host:port for TLS"
+        ) from None
     return settings.model_copy(update={"mqtt": mqtt})

@@ -10,9 +10,9 @@ from bms_estimator.sinks.mqtt.asyncapi import document
 
 
 def asyncapi(
-    base_topic: Annotated[str, typer.Option(help="mqtt.base_topic of the pack file")] = str(
+    base_topic: Annotated[str, typer.Option(help="prefix of the topics, as mqtt.base_topic in the settings")] = str(
         MqttSettings.model_fields["base_topic"].default
     ),
 ) -> None:
-    """Print all topics and payloads as an AsyncAPI 3 document."""
+    """Print all MQTT topics and payloads as an AsyncAPI 3 document."""
     typer.echo(json.dumps(document(base_topic), indent=2, allow_nan=False))

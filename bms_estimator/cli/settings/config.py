@@ -34,25 +34,27 @@ from bms_estimator.sources.serial.device_detection import DetectedDevice
 from bms_estimator.sources.serial.device_detection import probe as probe_port
 from bms_estimator.sources.serial.port_list import board_ports
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check or show a pack's settings.")
 
-ONLY_IN_SERVICE = "not checked: a systemd credential exists only while the service runs"
+ONLY_IN_SERVICE = "not checked, because a systemd credential exists only while the service runs"
 """Text of the warning about a file that only the running service can read."""
 
 BrokerSettings = TypeVar("BrokerSettings", MqttSettings, EdgeSettings)
 
-PackFile = Annotated[Path, typer.Argument(help="settings of the pack")]
+PackFile = Annotated[Path, typer.Argument(help="settings file of the pack")]
 
 
 @app.command()
 def init(
     file: PackFile = Path("pack.toml"),
     probe: Annotated[
-        bool, typer.Option("--probe", help="identify the device on the serial ports, and configure it")
+        bool, typer.Option("--probe", help="find the device on the serial ports, and write its settings to the file")
     ] = False,
-    port: Annotated[str | None, typer.Option(help="serial port to probe; default: all", show_default=False)] = None,
+    port: Annotated[
+        str | None, typer.Option(help="search only this serial port; default: all ports", show_default=False)
+    ] = None,
 ) -> None:
-    """Write a settings file with every setting, its unit, default and meaning."""
+    """Write a settings file that lists every setting with its meaning, unit and default."""
     if port is not None and not probe:
         raise UserError(f"--port {port}: requires --probe")
     if file.exists():
@@ -75,7 +77,7 @@ def _probe_settings(ports: Sequence[str]) -> Given:
         UserError: No device, or more than one.
     """
     if not ports:
-        raise UserError("--probe: no serial port of a board or BMS was found; name it with --port")
+        raise UserError("--probe: no serial port of a board or BMS was found; name the port with --port")
     results = dict[str, DetectedDevice | str]()
     for port in ports:
         with show_probing(port):
@@ -96,7 +98,7 @@ def _probe_settings(ports: Sequence[str]) -> Given:
 
 @app.command()
 def check(file: PackFile = Path("pack.toml")) -> None:
-    """Check a settings file and its cell file; report errors and likely mistakes."""
+    """Check a settings file and the cell file that it names; report errors and likely mistakes."""
     settings, cell = load_pack(file)
     warnings = [
         *implausible_settings(settings, cell),
@@ -128,9 +130,11 @@ def check(file: PackFile = Path("pack.toml")) -> None:
 
 @app.command()
 def show(
-    file: Annotated[Path | None, typer.Argument(help="settings of the pack; default: all defaults")] = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="settings file of the pack; without a file, the default settings are shown")
+    ] = None,
 ) -> None:
-    """Print the settings in effect and derived values as TOML."""
+    """Print all settings in effect as TOML, with derived values as comments."""
     settings, cell = load_pack(file) if file else (Settings(), load_cell(Settings().pack.cell))
     shown = settings.model_dump(mode="json", by_alias=True, exclude_none=True)
     shown["observer"].setdefault("rearm_gain", "never")  # TOML has no null
@@ -196,7 +200,7 @@ def _failed_conditions(cell: PackModel) -> list[str]:
 def _violation(condition: Condition) -> str:
     return (
         f"condition {condition.name} of Lemma 4.1.1 fails: {condition.left:g} is not below {condition.right:g}; "
-        "a capacitance of the observer may turn negative above its SOC limit"
+        "a capacitance of the observer may become negative although the SOC is above its limit"
     )
 
 

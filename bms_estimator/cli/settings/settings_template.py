@@ -15,8 +15,8 @@ UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": 
 WIDTH = 110
 """Maximum line length of comments."""
 HEAD = """\
-# Settings of one pack. A setting in a comment has the value shown; remove the # to change it.
-# Values are in SI units, which the keys contain. Current is positive on discharge.
+# Settings of one pack. A setting that begins with # has the default value shown; remove the # to change it.
+# A key such as poll_s ends in the unit of its value. Current is positive on discharge.
 """
 _SIGNS = {Gt: ("gt", "above"), Ge: ("ge", "at least"), Lt: ("lt", "below"), Le: ("le", "at most")}
 
@@ -65,7 +65,7 @@ def _allowed(key: str, field: FieldInfo) -> str:
     choices, limits = _constraints(field.annotation)
     limits += [_limit(item) for item in field.metadata if type(item) in _SIGNS]
     unit = [UNITS[key.rsplit("_", 1)[-1]]] if "_" in key and key.rsplit("_", 1)[-1] in UNITS else []
-    one_of = [f"one of {', '.join(choices)}"] if choices else []
+    one_of = [f"one of {', '.join(choices)}"] if len(choices) > 1 else [f"always {choice}" for choice in choices]
     parts = ", ".join(unit + one_of + limits)
     return f"[{parts}]" if parts else ""
 
@@ -100,9 +100,10 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _sentence(text: str | None) -> str:
-    """Return the text with a full stop."""
-    return f"{(text or '').rstrip('.')}."
+    """Return the text as a sentence, with a capital and a full stop."""
+    text = (text or "").rstrip(".")
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _comment(text: str) -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ")
+    return textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)

@@ -242,8 +242,8 @@ def test_error_suggests_the_unit_of_the_columns(capture, tmp_path, capsys):
 
 def test_missing_and_implausible_temperatures_are_reported(tmp_path, capsys):
     for cell_c, words in (
-        (297.0, "10 implausible values: the band is wider"),
-        (math.nan, "not measured: the band is wider"),
+        (297.0, "10 implausible values: SOC std is larger"),
+        (math.nan, "not measured: SOC std is larger"),
     ):
         table = tmp_path / "warm.csv"
         lines = [f"{j},0.1,3.8,{cell_c}" for j in range(10)]

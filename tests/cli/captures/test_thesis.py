@@ -231,7 +231,7 @@ def test_user_errors_end_with_code_2(tmp_path, capsys, data):
     for arguments, words in (
         (("--table", "14"), "no table 14: tables are 1 to 13"),
         (("--figure", "51"), "no figure 51"),
-        ((steps,), "captures need --cell"),
+        ((steps,), "captures require --cell"),
         ((rests, "--cell", "ncr18650"), "the protocol needs a constant load"),
         ((steps, "--cell", "leaf"), "the protocol needs a voltage relaxation test"),
     ):

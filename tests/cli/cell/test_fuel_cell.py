@@ -113,8 +113,8 @@ def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path
 @pytest.mark.parametrize(
     ("celsius", "message"),
     [
-        ("-300", "--temperature-c -300: must lie within -60 and 120 C"),
-        ("121", "--temperature-c 121: must lie within -60 and 120 C"),
+        ("-300", "--temperature-c -300: must be between -60 and 120 °C"),
+        ("121", "--temperature-c 121: must be between -60 and 120 °C"),
         ("nan", "'nan': no decimal number"),
     ],
 )
@@ -259,9 +259,12 @@ def test_error_names_the_unusable_file(capsys, curve: Path, steps: Path, tmp_pat
         (short, "2 usable points"),
         (hole, "a value is missing"),
         (tmp_path / "none.csv", "none.csv"),
-        (one_cell, "0 usable points: give at least 3 within 2 to 18 V and up to 15 A of pem_30w"),
-        (reversed_curve, "the current is negative, but a fuel cell takes no charge: is --current-sign right?"),
-        (reversed_steps, "the current is negative, but a fuel cell takes no charge: is --current-sign right?"),
+        (
+            one_cell,
+            "only 0 usable points: at least 3 are needed within the limits of pem_30w, 2 to 18 V and up to 15 A",
+        ),
+        (reversed_curve, "the current is negative, but a fuel cell cannot be charged: is --current-sign right?"),
+        (reversed_steps, "the current is negative, but a fuel cell cannot be charged: is --current-sign right?"),
     ):
         code, _, err = run(capsys, "identify", path, "--cell", "pem_30w", "--out", tmp_path / "out.toml")
         assert code == 2

@@ -127,7 +127,11 @@ def test_invalid_input_ends_with_code_2(tmp_path, capsys, why):
     ("volt", "options", "why"),
     [
         (lambda v: 0.0 * v + 3.7, (), "bad.csv: the voltage is 3.7 V throughout: is the sensor connected?"),
-        (lambda v: 1e3 * v, (), "cells in series: are these millivolts? If not, give --series"),
+        (
+            lambda v: 1e3 * v,
+            (),
+            "cells in series; if the column is in millivolts, convert it to volts, otherwise give --series",
+        ),
         (lambda v: v, ("--series", 4), "V per cell"),
     ],
     ids=["dead", "millivolts", "too many cells"],
@@ -255,7 +259,7 @@ def test_curve_that_falls_to_0_v_is_rejected(tmp_path, capsys, shared_data):
     capture = shared_data / "panasonic18650pf" / "25_hppc.csv.gz"
     code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "4", "--out", tmp_path / "large.toml")
     assert code == 2
-    assert "at SOC 0: give captures down to empty, or the right capacity; 4 Ah is too much" in err
+    assert "at SOC 0: give captures down to empty; if the cell was emptied, the capacity of 4 Ah is too large" in err
     assert not (tmp_path / "large.toml").exists()
 
 

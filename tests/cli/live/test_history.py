@@ -55,7 +55,7 @@ async def test_history_is_read_while_the_service_runs(pack, capsys):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["--step", "90"], "must be whole minutes"), (["--folder", "/nonexistent"], "no history there")],
+    [(["--step", "90"], "must be a multiple of 60 s"), (["--folder", "/nonexistent"], "no history there")],
 )
 def test_invalid_arguments_are_reported(pack, capsys, arguments, message):
     code, out, err = run(capsys, "history", pack, *arguments)

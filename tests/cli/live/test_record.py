@@ -117,7 +117,9 @@ def test_killed_recorder_leaves_complete_records(board, tmp_path, capsys):
         assert reads(truncated) == all_reads[:-1]
         code, result, err = replay(capsys, truncated)
         assert code == 0
-        assert err.endswith(" bytes are no complete record: truncated, or a length is damaged\n")
+        assert err.endswith(
+            " bytes are no complete record: the file is truncated, or the length in a record is damaged\n"
+        )
         assert result["samples"] == samples(truncated) > 50
 
 

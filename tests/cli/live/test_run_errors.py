@@ -76,7 +76,7 @@ def test_options_of_one_board_are_rejected_for_several_packs(options, tmp_path, 
     packs = [tmp_path / "one.toml", tmp_path / "two.toml"]
     for pack in packs:
         pack.write_text("")
-    assert run(capsys, "run", *packs, *options) == (2, "", "error: --port, --record and --view are for one pack\n")
+    assert run(capsys, "run", *packs, *options) == (2, "", "error: --port, --record and --view require a single pack\n")
 
 
 def test_help_lists_all_commands_and_version_prints_the_version(capsys):

@@ -41,7 +41,7 @@ def test_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys):
 def test_port_option_is_rejected_without_a_serial_source(command, options, pack, capsys):
     code, _, err = run(capsys, command, *options, write_linux_settings(pack), "--port", "/dev/ttyACM0")
     assert code == 2
-    assert "port: applies to a serial port, but the settings have another [source]" in err
+    assert "port: applies to a serial device, but [source] in the settings is another device" in err
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_settings_without_a_broker_are_an_error(tmp_path: Path, capsys: pytest.C
     assert run(capsys, "top", pack) == (
         2,
         "",
-        f"error: {pack}: has no [mqtt]: name the broker there, or with --mqtt mqtt://host:port\n",
+        f"error: {pack}: has no section [mqtt]; name the broker there, or give --mqtt mqtt://host:port\n",
     )
     code, _, err = run(capsys, "top", "--mqtt", "http://house")
     assert code == 2

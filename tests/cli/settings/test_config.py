@@ -123,17 +123,17 @@ def test_init_does_not_overwrite_a_file(pack, capsys):
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),
         ('[page]\nlisten = "0.0.0.0:8765"\n', ["page: listen", "open to other machines: name a token_file"]),
         ('[page]\nlisten = "8765"\n', ["page.listen = '8765'", "host:port"]),
-        ('[pack]\ncell = ""\n', ["pack.cell = ''", "at least 1 character", "shipped cell's name"]),
+        ('[pack]\ncell = ""\n', ["pack.cell = ''", "at least 1 character", "name of a shipped cell"]),
         ("[pack]\nparallel = 20000\n", ["pack.parallel = 20000", "less than or equal to 10000"]),
         ("[sensor]\nbaud = 20_000_000\n", ["sensor.baud = 20000000", "less than or equal to 10000000"]),
         ("[state]\ncheckpoint_s = 0.1\n", ["state.checkpoint_s = 0.1", "greater than or equal to 1"]),
         ("[identifier]\nmap_memory_h = 0.5\n", ["identifier.map_memory_h = 0.5", "greater than or equal to 1"]),
-        ('[mqtt]\nbase_topic = "/bms"\n', ["mqtt.base_topic = '/bms'", "no / at either end"]),
-        ('[mqtt]\nbase_topic = "home/bms/"\n', ["mqtt.base_topic = 'home/bms/'", "no / at either end"]),
+        ('[mqtt]\nbase_topic = "/bms"\n', ["mqtt.base_topic = '/bms'", "nor begin or end with /"]),
+        ('[mqtt]\nbase_topic = "home/bms/"\n', ["mqtt.base_topic = 'home/bms/'", "nor begin or end with /"]),
         ("[source]\nchip = 5\n", ["source.kind", "missing"]),
         (
             '[sensor]\nport = "/dev/ttyUSB0"\nprotocol = "jbd"\n[source]\nkind = "linux"\n',
-            ["sensor.port, sensor.protocol: ", "which [source] replaces"],
+            ["sensor.port, sensor.protocol: ", "[source] describes another source"],
         ),
         (
             '[source]\nkind = "linux"\nshunt_ohm = 0\n',
@@ -141,7 +141,7 @@ def test_init_does_not_overwrite_a_file(pack, capsys):
         ),
         ('[pack]\ncell = "nonsense"\n', ["nonsense", "ncr18650", "lfp"]),
         ('[pack]\ncell = "lfp"\n', ["lfp is a generic cell", "capacity_ah of [pack]"]),
-        ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "capacity of one"]),
+        ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "capacity of the cell"]),
     ],
 )
 def test_error_names_the_setting_and_the_allowed_values(text, message, pack, capsys):

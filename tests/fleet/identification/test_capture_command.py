@@ -43,8 +43,8 @@ def test_capture_has_each_block_once_in_order(cluster, tmp_path, capsys, name):
         f"{out}: 300 samples in 5 blocks of house, 2023-11-14T22:14:20.000Z to 2023-11-14T22:20:19.000Z\n",
     )
     assert err.splitlines() == [
-        "warning: house: blocks 5 are missing: lost, or yet to be sent again by the edge",
-        "warning: house: 1 messages are not blocks",
+        "warning: house: blocks 5 are missing: they are lost, or the edge has yet to send them again",
+        "warning: house: 1 messages are damaged and were skipped",
     ]
     expected = np.concatenate([samples(60.0, 240), samples(360.0)])
     read = load_capture(out)
@@ -62,5 +62,5 @@ def test_time_span_is_cut_and_missing_data_are_reported(cluster, tmp_path, capsy
     assert (code, stdout.startswith(f"{out}: 40 samples in 1 blocks of house")) == (0, True)
     assert "the stored samples begin at 2023-11-14T22:14:20.000Z" in err
     code, _, err = run(capsys, "fleet", "capture", "nobody", tmp_path / "no.csv", "--server", cluster.url)
-    assert (code, "nobody: the server has no samples of it in this period" in err) == (2, True)
+    assert (code, "nobody: the server has no samples of this pack in this period" in err) == (2, True)
     assert "must end in" in run(capsys, "fleet", "capture", "house", tmp_path / "no.xls", "--server", cluster.url)[2]

@@ -64,7 +64,7 @@ def test_rows_are_removed_on_request_and_by_name(url, table, capsys):
     )
     code, _, err = run(capsys, "fleet", "packs", "remove", "shed", "boat", "--server", url)
     assert (code, err) == (2, "error: boat: not in the table of packs; `fleet packs list` prints it\n")
-    assert run(capsys, "fleet", "packs", "remove", "shed", "--server", url) == (0, "1 removed\n", "")
+    assert run(capsys, "fleet", "packs", "remove", "shed", "--server", url) == (0, "removed from the table: shed\n", "")
     assert run(capsys, "fleet", "packs", "list", "--server", url)[1] == "pack\n"
 
 

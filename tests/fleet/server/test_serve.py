@@ -272,10 +272,10 @@ async def test_three_nodes_have_three_replicas(tmp_path: Path, authority: Author
             "is open to other machines: add [tls] and [tenants.NAME], or listen on 127.0.0.1",
         ),
         (["--mqtt", "here"], "--mqtt here: must be host:port"),
-        (["--node", "2"], "--node 2: name all nodes"),
+        (["--node", "2"], "--node 2: requires --of"),
         (["--of", "a,b"], "must name 3 or 5 distinct nodes"),
         (["--of", "a,b,c"], "--of a,b,c is open to other machines"),
-        (["--of", "127.0.0.1:1,127.0.0.1:2,127.0.0.1:3", "--node", "4"], "--of names 3"),
+        (["--of", "127.0.0.1:1,127.0.0.1:2,127.0.0.1:3", "--node", "4"], "--of names only 3 nodes"),
         (["none.toml"], "none.toml: cannot be read"),
     ],
 )

@@ -211,7 +211,7 @@ V, I = {"signal": "V"}, {"signal": "I"}  # noqa: E741
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"profile": "pylontech"}, "'pylontech' is none of pylontech-can"),
+        ({"profile": "pylontech"}, "'pylontech' must be one of pylontech-can"),
         ({"voltage": {}, "current": I, "dbc": "x"}, "voltage.signal\n  Field required"),
         ({"voltage": V, "current": I}, "dbc: missing"),
         (

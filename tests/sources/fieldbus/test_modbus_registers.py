@@ -150,9 +150,9 @@ V, I = {"address": 0}, {"address": 1}  # noqa: E741
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"profile": "victron"}, "profile: 'victron' is none of victron-gx, seplos-v3"),
-        ({"voltage": V, "current": I, "port": "/dev/ttyUSB0"}, "and not both"),
-        ({"voltage": V, "current": I, "host": None}, "give host"),
+        ({"profile": "victron"}, "profile: 'victron' must be one of victron-gx, seplos-v3"),
+        ({"voltage": V, "current": I, "port": "/dev/ttyUSB0"}, "give either host"),
+        ({"voltage": V, "current": I, "host": None}, "give either host"),
         ({"voltage": V, "current": I, "host": None, "port": "/dev/x", "framing": "tcp"}, "serial line"),
         ({"voltage": V}, "current"),
         ({"voltage": V | {"scale": 0.0}, "current": I}, "must not be 0"),

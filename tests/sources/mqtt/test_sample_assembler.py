@@ -309,7 +309,7 @@ def test_no_topic_is_subscribed_twice() -> None:
 @pytest.mark.parametrize(
     ("table", "reason"),
     [
-        ({}, "voltage: missing; give its path, or a profile: batmon-ha"),
+        ({}, "voltage: missing; give its path, or choose a profile: batmon-ha"),
         ({"profile": "venus"}, "profile venus: prefix: missing (VRM portal ID"),
         ({"profile": "tasmota"}, "profile tasmota: prefix: missing (Topic of the device"),
         ({"voltage": "u", "current": "i"}, "voltage.topic: missing, and source.topic is not set"),
@@ -318,7 +318,7 @@ def test_no_topic_is_subscribed_twice() -> None:
             "voltage.unit = A: must be one of V, mV",
         ),
         ({"topic": "t", "voltage": {"path": "u", "scale": 0}, "current": "i"}, "voltage.scale = 0: must not be 0"),
-        ({"topic": "t", "voltage": "u", "current": "i", "username": "me"}, "are for a broker at url"),
+        ({"topic": "t", "voltage": "u", "current": "i", "username": "me"}, "apply to the broker in source.url"),
     ],
 )
 def test_invalid_settings_are_rejected_with_a_reason(table: dict[str, Any], reason: str) -> None:

@@ -403,7 +403,7 @@ def test_accept_is_rejected_if_the_settings_contain_the_serial_number(
     pack.write_text('[sensor]\nserial = "0000002a"\n')
     code, _, err = run(capsys, "board", "--accept", pack)
     assert code == 2
-    assert "sensor.serial = 0000002a: the settings name the board; change it there" in err
+    assert "sensor.serial = 0000002a: the settings name the board; change sensor.serial instead of --accept" in err
 
 
 def test_accept_uses_the_given_folder_and_requires_a_stored_board(
@@ -415,7 +415,7 @@ def test_accept_uses_the_given_folder_and_requires_a_stored_board(
     memory.save({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
     code, _, err = run(capsys, "board", "--accept", pack)
     assert code == 2
-    assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is stored there" in err
+    assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is stored in this file" in err
     assert run(capsys, "board", "--folder", memory.path.parent, "--accept", pack)[0] == 0
     assert memory.load() == NO_BOARD
     code, _, err = run(capsys, "board", "--folder", tmp_path)
