@@ -37,13 +37,13 @@ def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v:
     s.lock = 1
     s.adapting = 1
     s.started = 1
-    if p.capacity_as == 0.0:  # a fuel cell has neither SOC nor margins
+    if p.capacity_as == 0.0:  # a fuel cell has neither SOC nor stability margins
         s.soc = s.soc_coulomb = s.delta_1 = s.delta_2 = math.nan
         return
     s.soc = p.soc_initial
     if math.isnan(s.soc):
-        ohmic = current_a * r_s(1.0, s.a)  # R_s at full charge, because the SOC is not known yet
-        s.soc = soc_from_ocv(voltage_v + ohmic, p.ocv_v, p.ocv_slope_v)
+        ohmic_v = current_a * r_s(1.0, s.a)  # R_s at full charge, because the SOC is not known yet
+        s.soc = soc_from_ocv(voltage_v + ohmic_v, p.ocv_v, p.ocv_slope_v)
     s.soc_coulomb = s.soc
     s.voltage_estimate_v = ocv(s.soc, p.ocv_v, p.ocv_slope_v)  # (4.1), x2 = x3 = 0
     s.innovation_v = voltage_v - s.voltage_estimate_v
@@ -68,12 +68,12 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     s.adapting = 1 if s.soc > stability_floor(s, p) else 0
     soc = max(s.soc, stability_floor(s, p))
     ohm_s = p.output_r_s * r_s(soc, s.a) if p.output_r_s > 0.0 else 0.0
-    loop = max(1.0 + s.gain * ohm_s, MIN_LOOP_GAIN)
-    e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop  # (3.15) with (3.14) or (4.1)
+    loop_gain = max(1.0 + s.gain * ohm_s, MIN_LOOP_GAIN)  # y^ contains R_s u, and u = -N e
+    e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop_gain  # (3.15) with (3.14) or (4.1)
     s.innovation_v = e
 
     tau_ts, tau_tl = r_ts(soc, s.a) * c_ts(soc, s.a), r_tl(soc, s.a) * c_tl(soc, s.a)
-    rate_e = states_step(s, s.gain / loop, voltage_v - e_o, tau_ts, tau_tl, dt_s)
+    rate_e = states_step(s, s.gain / loop_gain, voltage_v - e_o, tau_ts, tau_tl, dt_s)
     mean_square = integral_of_exponential(2.0 * rate_e * dt_s, 1.0)  # mean of e^2 over the sample / e^2 at its start
 
     if s.adapting:
@@ -86,7 +86,7 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
         s.gain = nussbaum_gain(s.k, p)
     s.voltage_estimate_v = e_o - s.v_ts - s.v_tl  # (4.1)
     if p.output_r_s > 0.0:
-        s.voltage_estimate_v = voltage_v - (voltage_v - s.voltage_estimate_v) / loop  # (3.14), u = -N e
+        s.voltage_estimate_v = voltage_v - (voltage_v - s.voltage_estimate_v) / loop_gain  # (3.14), u = -N e
     track_lock(s, p, dt_s, voltage_v, e_o)
 
 
@@ -128,7 +128,7 @@ def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: fl
     """
     mean = -gain - 0.5 * (1.0 / tau_ts + 1.0 / tau_tl)
     half = 0.5 * (1.0 / tau_tl - 1.0 / tau_ts)
-    q = max(math.sqrt(half * half + gain * gain), 1e-300)
+    q = max(math.sqrt(half * half + gain * gain), 1e-300)  # not 0, because it is a divisor
     low, high = mean - q, mean + q
     phi_low = integral_of_exponential(low, dt_s)
     phi_high = integral_of_exponential(high, dt_s)
@@ -147,7 +147,7 @@ def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: fl
 def integral_of_exponential(rate: float, dt_s: float) -> float:
     """Return the integral of e^(rate t) over 0..dt_s [s]."""
     x = rate * dt_s
-    if abs(x) < 1e-8:
+    if abs(x) < 1e-8:  # expm1(x) / rate would be 0 / 0 at rate 0
         return dt_s * (1.0 + 0.5 * x)
     return math.expm1(x) / rate
 
