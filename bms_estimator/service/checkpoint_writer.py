@@ -112,7 +112,7 @@ class CheckpointWriter:
             self._publisher.saved_flow = None
             return False
         self._publisher.checkpoint, self._saved = "saved", progress
-        self._publisher.saved_flow = ChargeEnergy.of(counters.total)
+        self._publisher.saved_flow = ChargeEnergy.from_totals(counters.total)
         return True
 
     def _update_counters(self, *, clean: bool) -> Callable[[], None]:
