@@ -30,7 +30,7 @@ ELEMENTS = {
 }
 """Index of the first parameter, key of the amplitude and key of the offset, by element."""
 DEFAULT_RATE = 100.0
-"""Default rate lambda_x + lambda_y of (3.18), that of the shipped cell ``chen_mora`` [1/s]."""
+"""Default rate lambda_x + lambda_y of (3.18), that of most parameters of the shipped cell ``chen_mora`` [1/s]."""
 CAPACITANCE_NUMBERS = (2, 3)
 """Positions of C_ts and C_tl in ``ELEMENTS``."""
 

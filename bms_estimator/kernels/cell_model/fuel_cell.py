@@ -104,13 +104,13 @@ def steady_overpotential(theta: Floats, given: Floats, current_a: float, slope: 
     remainder = 1.0 - reaction_a / limit_a
     is_limited = remainder < MIN_REMAINDER
     remainder = max(remainder, MIN_REMAINDER)
-    gain = 0.0 if is_limited else b_v * reaction_a / (limit_a * remainder)  # d v_inf / d ln I of the last term
+    last_slope = 0.0 if is_limited else b_v * reaction_a / (limit_a * remainder)  # d / d ln I of the last term of v_inf
     slope[:] = 0.0
     slope[TAFEL] = tafel_v * math.log(reaction_a)
     slope[ACTIVATION] = activation_v
     slope[B] = -b_v * math.log(remainder)
-    slope[LIMIT] = -gain
-    slope[INTERNAL] = (tafel_v + gain) * internal_a / reaction_a
+    slope[LIMIT] = -last_slope
+    slope[INTERNAL] = (tafel_v + last_slope) * internal_a / reaction_a
     return activation_v + slope[TAFEL] + slope[B]
 
 

@@ -1,6 +1,7 @@
 """High-gain adaptive observer, Algorithm 1 of the thesis.
 
-Numbers in parentheses are equations of the thesis, and errata are listed in docs/theory/thesis.md.
+Numbers in parentheses are equations of the thesis, and errata are listed in docs/theory/thesis.md. The states x2 and x3 of
+the thesis are ``v_ts`` and ``v_tl``.
 
 y, i, N and a_i are constant over a sample period. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix and
 is solved exactly. e is taken to decay with the eigenvalue that [1, 1] belongs to if both time constants are equal. (3.18)
@@ -10,7 +11,7 @@ every N >= 0 and every period. ``s`` is a record of OBSERVER_STATE, ``p`` of OBS
 
 import math
 
-from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, soc_from_ocv
+from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, soc_from_ocv
 from bms_estimator.kernels.cell_model.current_interpolation import MAX_FLOW_S, interpolated_current
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.arrays import Record
@@ -29,7 +30,7 @@ def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v:
     """Set the initial conditions of Algorithm 1 at the first sample."""
     s.time_s = time_s
     s.current_a = current_a
-    for i in range(1, 16):
+    for i in range(1, PARAMETERS):
         s.a[i] = p.a_initial[i]
         s.target[i] = p.target[i]
     s.k = p.k0
@@ -95,16 +96,16 @@ def adapt_parameters(s: Record, p: Record, dt_s: float, e_squared: float) -> Non
     """Apply the adaptive law (3.16), (3.17) or (3.18), a' = drive e^2 + rate (target - a), exactly for a constant e^2."""
     if dt_s != s.decay_dt_s:
         s.decay_dt_s = dt_s
-        for i in range(1, 16):
+        for i in range(1, PARAMETERS):
             s.decay[i] = math.exp(-p.rate[i] * dt_s)
             s.settle[i] = integral_of_exponential(-p.rate[i], dt_s)
-    for i in range(1, 16):
+    for i in range(1, PARAMETERS):
         s.a[i] = s.target[i] + (s.a[i] - s.target[i]) * s.decay[i] + p.drive[i] * e_squared * s.settle[i]
 
 
 @njit(cache=True)
 def update_margins(s: Record) -> None:
-    """Update delta1 (2.11) and delta2 (2.12) by the present parameters."""
+    """Compute delta1 (2.11) and delta2 (2.12), the SOCs below which C_ts and C_tl are negative, from the parameters."""
     s.delta_1 = delta(s.a[8], s.a[9], s.a[7])
     s.delta_2 = delta(s.a[11], s.a[12], s.a[10])
 
@@ -214,7 +215,7 @@ def reinitialize_from_measurement(s: Record, p: Record, voltage_v: float, e_o: f
     s.gain = nussbaum_gain(s.k, p)
     s.v_ts = 0.5 * (e_o - voltage_v)
     s.v_tl = s.v_ts
-    for i in range(1, 16):
+    for i in range(1, PARAMETERS):
         s.a[i] = s.target[i]
     s.voltage_estimate_v = voltage_v
     update_margins(s)
