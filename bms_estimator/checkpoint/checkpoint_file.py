@@ -255,7 +255,7 @@ def _read_counters(file: Mapping[str, NDArray[Any]]) -> RunCounters:
     datetime.fromisoformat(total.since)
     restarts, crashes = int(file["restarts"]) + 1, total.crashes + (not file["clean"])
     values = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
-    values |= ChargeEnergy.of(total)._asdict()
+    values |= ChargeEnergy.from_totals(total)._asdict()
     implausible = [f"{name} = {value}" for name, value in values.items() if not 0 <= value <= MAX_COUNT]
     if implausible:
         raise ValueError(", ".join(implausible))

@@ -26,7 +26,7 @@ TraceBlock = NDArray[np.void]
 SAMPLE_OUTCOMES = tuple(SampleOutcome)
 """Outcomes by their integer values. Indexing a tuple is faster than ``SampleOutcome(value)``, which takes nearly as long as
 the kernel."""
-IDENTIFIER = IdentifierSettings()
+DEFAULT_IDENTIFIER = IdentifierSettings()
 """Default settings of the identifier."""
 
 
@@ -37,9 +37,9 @@ class Estimator:
 
     Args:
         cell: The pack as one two-terminal object (``CellModel.pack``). A fuel cell has no SOC (NaN), and its
-            parameters are always learned, under any law.
+            parameters are always learned, whatever ``observer.law`` is.
         observer: The adaptive observer's settings.
-        identifier: The identifier's settings; None: identifier disabled, the thesis's method alone.
+        identifier: Settings of the identifier, the Kalman filter; None: only the adaptive observer runs.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
         initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
@@ -57,7 +57,7 @@ class Estimator:
         cell: PackModel,
         observer: ObserverSettings | None = None,
         *,
-        identifier: IdentifierSettings | None = IDENTIFIER,
+        identifier: IdentifierSettings | None = DEFAULT_IDENTIFIER,
         voltage_resolution_v: float = 1e-3,
         voltage_noise_v: float | None = None,
         initial_soc: float | None = None,
@@ -134,9 +134,10 @@ class Estimator:
         if self.identifying:
             f, c = self.record[0]["filter"], self.record[0]["checks"]
             set_soc(f, self.settings_record[0]["filter"], soc)
-            c["outliers"] = 0.0
+            c["outliers"] = 0.0  # a wrong SOC may have caused them
             if not c["suspects"] & UNUSABLE:
-                c["last_v"] = 0.0  # a sensor that freezes later must not restore an earlier state
+                # no previous sample: if the sensor freezes now, the SOC before this call must not be restored
+                c["last_v"] = 0.0
             store_last_good_state(c, f)
 
     def resume(self, unseen_s: float) -> None:
@@ -146,6 +147,7 @@ class Estimator:
             unseen_s: Duration of the gap before the next sample [s]; infinite if unknown. The load may have changed in
                 the gap.
         """
+        # inf: the next sample begins a time base of its own
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
         if self.identifying:
             self.record["filter"]["soc"] = self.state["soc"]
@@ -171,7 +173,7 @@ def make_estimator(settings: Settings, cell: PackModel) -> Estimator:
 
 
 def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
-    """Create the estimator of a pack after loading its kernels, so that nothing compiles once samples arrive."""
+    """Create the estimator of a pack, and compile or load all its kernels, so that nothing compiles once samples arrive."""
     make_estimator(settings, cell).run(np.zeros(1, dtype=SAMPLE))
     return make_estimator(settings, cell)
 
@@ -186,12 +188,12 @@ def estimate(
     Args:
         capture: Rows of dtype ``SAMPLE``.
         cell: The pack as one two-terminal object (``CellModel.pack``).
-        initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
+        initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
         voltage_resolution_v: One step of the capture's voltage [V].
 
     Returns:
-        The columns of dtype ``TRACE``, one row for each accepted sample: ``soc`` with ``soc_std``, the elements with
-        their standard deviations, the observer's values. Unknown values are NaN.
+        The columns of dtype ``TRACE``, one row for each accepted sample: ``soc`` with ``soc_std``, the circuit elements
+        with their standard deviations, and the observer's values. Unknown values are NaN.
     """
     estimator = Estimator(cell, initial_soc=initial_soc, voltage_resolution_v=voltage_resolution_v)
     return Columns(estimator.run(capture.rows), capture.name)

@@ -1,6 +1,6 @@
 """Settings record of the Kalman filter from cell file and settings.
 
-(2.5)-(2.9) are equations of the thesis.
+(2.5)-(2.9) are equations of the thesis: the circuit elements as functions of SOC with parameters a1..a15.
 """
 
 from dataclasses import fields, replace
@@ -21,11 +21,11 @@ CURVE_ERROR_V = 0.004
 CURVE_ERROR_SOC = 0.007
 """Default std of the OCV along SOC, for a cell file without an error column."""
 MAX_SLOPE_V = 5.0
-"""Upper limit of the slope per cell that converts an error of SOC to one of the OCV [V]. The steep ends of the curve have a
-better defined SOC."""
-LEARNED = 0.97
+"""Upper limit of the slope per cell that converts an error of SOC to one of the OCV [V]. The SOC is better defined at the
+steep ends of the curve."""
+LEARNED_FRACTION = 0.97
 """Fraction of the OCV's error variance that is constant and is learned."""
-LEARNED_SLOPE_V = 0.15
+MIN_LEARNED_SLOPE_V = 0.15
 """Minimum slope dOCV/dSOC per cell over the whole curve for learning the OCV's error [V]. On a plateau the voltage
 cannot distinguish an error of the curve from an error of the SOC, and the knees move."""
 CURVE_SOC = 0.3
@@ -33,24 +33,24 @@ CURVE_SOC = 0.3
 KNEE_V = 1.0
 """Slope dOCV/dSOC per cell that counts as an angle of 45 degrees [V]."""
 KNEE_DECORRELATION = 4.0
-"""Loss of correlation of the OCV's error per radian of slope angle. On a plateau the error is one of voltage, at a knee
-one of SOC. The correlation of both is e^-(KNEE_DECORRELATION x angle)."""
+"""Loss of correlation of the OCV's error per radian of slope angle. On a plateau the error is an error of voltage, at a
+knee an error of SOC. The correlation of both is e^-(KNEE_DECORRELATION x angle)."""
 COUNT_ERROR_SOC = 0.004
 """Minimum std of the OCV curve in SOC, because the SOC of the cell that was measured has an error."""
-BEYOND_BRANCHES = 0.2
+SLOW_DIFFUSION = 0.2
 """Resistance of diffusion slower than both RC pairs, as a fraction of each pair's resistance."""
 BRANCHES_STD = 0.35
 """Relative std of resistances derived from two RC pairs."""
-BIAS_OF_STD = 0.15
+MIN_BIAS_OF_R_STD = 0.15
 """Minimum of ``bias_relative``, as a fraction of the resistances' relative std, because the ratios of uncertain
 resistances are uncertain, too."""
 ROOM_C = 15.0, 35.0
 """Lower and upper end of the temperature range of resistances without a declared range, as in a room [C]."""
-MIN_SHARE = 1e-4
-"""Minimum resistance of an RC pair, as a fraction of the sum at SOC 0.5. Equivalent time constants are weighted by resistance
+MIN_RESISTANCE = 1e-4
+"""Minimum of each resistance, as a fraction of the sum at SOC 0.5. Equivalent time constants are weighted by resistance
 and need weights above 0."""
 MIN_CAPACITANCE = 0.05
-"""Lower limit of C_ts and C_tl, as fractions of a9 and a12. Below delta1 and delta2 they would be negative."""
+"""Lower limit of C_ts and C_tl, as fractions of their offsets a9 and a12, because their functions are negative near empty."""
 
 SOC_GRID = np.linspace(0.0, 1.0, GRID)
 """SOC grid of the resistances and of the OCV's error. Shape (GRID,)."""
@@ -58,7 +58,7 @@ SOC_GRID = np.linspace(0.0, 1.0, GRID)
 
 def filter_settings(
     cell: CellModel,
-    grid: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ocv_and_slope_v: tuple[NDArray[np.float64], NDArray[np.float64]],
     identifier: IdentifierSettings,
     voltage_resolution_v: float,
     voltage_noise_v: float | None,
@@ -68,7 +68,7 @@ def filter_settings(
 
     Args:
         cell: The pack as one two-terminal object.
-        grid: Open-circuit voltage and its slope, from ``settings_records.ocv_grid`` [V].
+        ocv_and_slope_v: Open-circuit voltage and its slope, from ``settings_records.ocv_grid`` [V].
         identifier: Section ``[identifier]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
@@ -80,14 +80,14 @@ def filter_settings(
     record = np.zeros(1, dtype=EKF_SETTINGS)
     p, series = record[0], cell.cell.series_count
     p["capacity_as"], p["series"] = 3600.0 * cell.cell.capacity_ah, series
-    p["ocv_v"], p["ocv_slope_v"] = grid
+    p["ocv_v"], p["ocv_slope_v"] = ocv_and_slope_v
     _open_circuit(p, cell, identifier.hysteresis_v)
-    weak_ohm, strong_ohm, r_std, (p["low_c"], p["high_c"]) = _ladder(cell)
+    weak_ohm, strong_ohm, r_std, (p["low_c"], p["high_c"]) = _ladder_resistances(cell)
     mid_soc = GRID // 2
     p["middle_ohm"] = weak_ohm[mid_soc].sum() + strong_ohm[mid_soc].sum()
-    p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, MIN_SHARE * p["middle_ohm"]), strong_ohm
+    p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, MIN_RESISTANCE * p["middle_ohm"]), strong_ohm
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
-    p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
+    p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0  # noise and rounding
     p["unmeasured_s"] = unmeasured_s(sampling)
     p["current_step_a"], p["dead_band_a"] = sampling.current_resolution_a, sampling.current_dead_band_a
     noise = Noise(r_std=r_std)
@@ -97,10 +97,10 @@ def filter_settings(
     for name, configured in (("capacity_std", capacity_std), ("soc_std", identifier.soc_std)):
         if configured is not None:
             noise = replace(noise, **{name: configured})
-    noise = replace(noise, bias_relative=max(noise.bias_relative, BIAS_OF_STD * r_std))
+    noise = replace(noise, bias_relative=max(noise.bias_relative, MIN_BIAS_OF_R_STD * r_std))
     for field in fields(noise):
         p[field.name] = getattr(noise, field.name)
-    p["model_v"] *= series
+    p["model_v"] *= series  # it is configured for one cell
     return record
 
 
@@ -132,14 +132,14 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
                 p["curve_error_v" if name == "error_v" else name] = np.interp(SOC_GRID, ocv.soc, column)
         if ocv.error_v is not None:
             p["curve_error_v"] = np.hypot(p["curve_error_v"], COUNT_ERROR_SOC * slope_v)
-    p["learned"] = LEARNED if slope_v.min() >= LEARNED_SLOPE_V * series else 0.0
+    p["learned"] = LEARNED_FRACTION if slope_v.min() >= MIN_LEARNED_SLOPE_V * series else 0.0
     if hysteresis_v is not None:
         p["hysteresis_v"] = 0.5 * hysteresis_v * series
-        if not is_mean_curve:  # a curve without hysteresis is that after discharge
+        if not is_mean_curve:  # a curve without hysteresis was measured after discharge
             p["ocv_v"] += 0.5 * hysteresis_v * series
 
 
-def _ladder(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:
+def _ladder_resistances(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:
     """Return the resistances of the RC ladder.
 
     Returns:
@@ -173,5 +173,5 @@ def ladder_of_branches(cell: CellModel) -> NDArray[np.float64]:
             k = min(int(position), BRANCHES - 2)
             ohm[i, 1 + k] += r * (k + 1 - position)
             ohm[i, 2 + k] += r * (position - k)
-            ohm[i, BRANCHES] += BEYOND_BRANCHES * r
+            ohm[i, BRANCHES] += SLOW_DIFFUSION * r  # the slowest RC pair
     return ohm

@@ -24,18 +24,18 @@ MAX_FACTORS = {
     "limiting_current_a": 2.0,
     "internal_current_a": 4.0,
 }
-"""Maximum factor between a parameter and its value in the file, and the inverse of the minimum factor. A factor of 1.3 in the activation loss at 1 A corresponds
-to about 8 in the exchange current."""
+"""Maximum ratio of each parameter to its value in the file. The minimum ratio is the inverse. A ratio of 1.3 of the
+activation loss at 1 A corresponds to about 8 of the exchange current."""
 
 
-def fuel_cell_settings(cell: FuelCellModel, of_observer: np.void) -> NDArray[np.void]:
+def fuel_cell_settings(cell: FuelCellModel, observer_record: np.void) -> NDArray[np.void]:
     """Return the learning law's settings record.
 
     The output error is not injected as a voltage offset, because a constant voltage error indicates the exchange current.
 
     Args:
         cell: The stack as one two-terminal object.
-        of_observer: Record of dtype ``OBSERVER_SETTINGS``.
+        observer_record: Record of dtype ``OBSERVER_SETTINGS``.
 
     Returns:
         Shape (1,), dtype ``LEARNING_SETTINGS``.
@@ -45,9 +45,9 @@ def fuel_cell_settings(cell: FuelCellModel, of_observer: np.void) -> NDArray[np.
     q["enabled"], q["model"], q["count"], q["file"] = 1, Model.FUEL_CELL, n, cell.a
     q["upper"][:n] = [math.log(MAX_FACTORS[name]) for name in NAMES]
     q["lower"] = -q["upper"]
-    q["told_v"], q["cells"] = of_observer["epsilon_v"], cell.cell.series_count
+    q["told_v"], q["cells"] = observer_record["epsilon_v"], cell.cell.series_count
     q["leak_v2s"][:n] = LEAK_S * float(q["told_v"]) ** 2 / q["upper"][:n] ** 2
     q["memory_s"], q["offset_s"], q["settle_s"] = MEMORY_S, math.inf, SETTLE_S
     q["rate"], q["reach"] = RATE_HZ, REACH
-    q["soc_floor"] = -math.inf
+    q["soc_floor"] = -math.inf  # a fuel cell has no SOC
     return record

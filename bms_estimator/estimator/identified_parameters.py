@@ -20,7 +20,7 @@ from bms_estimator.model.cell import CellModel, TableOcv
 MAX_CAPACITY_STD = 0.3
 """Maximum relative std of the capacity that a cell file may contain."""
 EVEN_SOC = tuple(np.round(np.linspace(0.0, 1.0, 101), 2).tolist())
-"""SOC nodes of a table that is computed from (2.10) of the thesis."""
+"""SOC nodes of an OCV table that is computed from the function (2.10) of the thesis."""
 MIN_RISE_V = 1e-6
 """Minimum rise of the OCV between two SOCs of its table [V]."""
 
@@ -44,12 +44,13 @@ def present_elements(record: np.void) -> dict[str, IdentifiedValue]:
     Args:
         record: Record of dtype ESTIMATOR_STATE, after a sample, with the identifier enabled.
     """
-    elements, ages = record["elements"], record["unlearned_s"]
-    order = R_TS, R_TL, C_TS, C_TL, R_S
-    values = elements["value"][list(order)]
-    stds = values * np.sqrt(elements["ln_variance"][list(order)])
+    elements, ages_s = record["elements"], record["unlearned_s"]
+    indices = [R_TS, R_TL, C_TS, C_TL, R_S]  # in the order of ELEMENT_NAMES
+    values = elements["value"][indices]
+    stds = values * np.sqrt(elements["ln_variance"][indices])
     return {
-        name: IdentifiedValue(*map(float, one)) for name, *one in zip(ELEMENT_NAMES, values, stds, ages, strict=True)
+        name: IdentifiedValue(float(value), float(std), float(age_s))
+        for name, value, std, age_s in zip(ELEMENT_NAMES, values, stds, ages_s, strict=True)
     }
 
 
@@ -79,7 +80,7 @@ def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
 
 def relative_capacity(record: np.void) -> IdentifiedValue:
     """Return the ratio of the estimated to the declared capacity."""
-    ln_q, std = _bias(record, LN_Q)
+    ln_q, std = _state_and_std(record, LN_Q)
     return IdentifiedValue(math.exp(ln_q), math.exp(ln_q) * std, 0.0)
 
 
@@ -90,8 +91,8 @@ def relative_series_resistance(record: np.void, settings: np.void) -> Identified
         record: Record of dtype ESTIMATOR_STATE, after a sample, with the identifier enabled.
         settings: Record of dtype ESTIMATOR_SETTINGS.
     """
-    ratio, variance = ln_r_s_ratio(record["filter"], settings["filter"])
-    value = math.exp(ratio)
+    ln_ratio, variance = ln_r_s_ratio(record["filter"], settings["filter"])
+    value = math.exp(ln_ratio)
     return IdentifiedValue(
         value, value * math.sqrt(variance), float(record["unlearned_s"][ELEMENT_NAMES.index("r_s_ohm")])
     )
@@ -99,14 +100,14 @@ def relative_series_resistance(record: np.void, settings: np.void) -> Identified
 
 def current_offset(record: np.void) -> IdentifiedValue:
     """Return the offset of the current sensor: measured less true current [A]."""
-    return IdentifiedValue(*_bias(record, OFFSET), 0.0)
+    return IdentifiedValue(*_state_and_std(record, OFFSET), 0.0)
 
 
-def _bias(record: np.void, j: int) -> tuple[float, float]:
+def _state_and_std(record: np.void, j: int) -> tuple[float, float]:
     """Return the mean and standard deviation of state ``j`` over the mixture of hypotheses."""
     f = record["filter"]
     n = f["count"]
-    if n == 1:  # the usual case, without the cost of the general one
+    if n == 1:  # the usual case, which is cheaper
         return float(f["mean"][0, j]), math.sqrt(f["covariance"][0, j, j])
     weight = np.exp(f["ln_weight"][:n] - f["ln_weight"][f["best"]])
     weight /= weight.sum()
@@ -130,27 +131,27 @@ def ocv_correction_with_std(
     """
     f, p = record["filter"], settings["filter"]
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]][NODE:, NODE:]
-    rows, own_v = _on_nodes(p.tobytes(), soc.tobytes())
-    variance_v2 = ((rows @ covariance) * rows).sum(axis=1) + (1.0 - p["learned"]) * own_v**2
+    rows, curve_error_v = _node_weights(p.tobytes(), soc.tobytes())
+    variance_v2 = ((rows @ covariance) * rows).sum(axis=1) + (1.0 - p["learned"]) * curve_error_v**2
     return rows @ mean[NODE:], np.sqrt(variance_v2)
 
 
 @lru_cache(maxsize=64)
-def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the weight of each node of the correction at each SOC, and the error of the curve there [V].
+def _node_weights(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the weight of each node of the correction at each SOC [V], and the std of the cell file's curve there [V].
 
     Args:
         settings: Bytes of a record of EKF_SETTINGS, a hashable argument for the cache.
         socs: Bytes of an array of SOCs, float64.
     """
     p, soc = np.frombuffer(bytearray(settings), EKF_SETTINGS)[0], np.frombuffer(socs)
-    rows, own_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
+    rows, curve_error_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
     for n, x in enumerate(soc):
         i, t = node_position(x)
         volts = node_error_scale(p, x, t)
         rows[n, i], rows[n, i + 1] = volts * (1.0 - t), volts * t
-        own_v[n] = on_grid(x, p["curve_error_v"])
-    return rows, own_v
+        curve_error_v[n] = on_grid(x, p["curve_error_v"])
+    return rows, curve_error_v
 
 
 def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
@@ -163,27 +164,27 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
     """
     record, settings = estimator.record[0], estimator.settings_record[0]
     capacity = relative_capacity(record)
-    (ln_r0, r0_std), (ln_r, r_std) = _bias(record, LN_R0), _bias(record, LN_R)
-    ohm, branch_ohm = math.exp(ln_r0), math.exp(ln_r)
+    (ln_r0, r0_std), (ln_r, r_std) = _state_and_std(record, LN_R0), _state_and_std(record, LN_R)
+    r0_factor, pair_factor = math.exp(ln_r0), math.exp(ln_r)
     values = cell.model_dump()
     values["cell"]["capacity_ah"] *= capacity.value
     values["cell"]["capacity_std"] = min(capacity.relative_std, MAX_CAPACITY_STD)
-    for name, factor in (("r_s", ohm), ("r_ts", branch_ohm), ("r_tl", branch_ohm)):
+    for name, factor in (("r_s", r0_factor), ("r_ts", pair_factor), ("r_tl", pair_factor)):
         values[name] |= {key: factor * values[name][key] for key in ("amplitude_ohm", "offset_ohm")}
     for name in ("c_ts", "c_tl"):  # the time constants do not change
-        values[name] |= {key: values[name][key] / branch_ohm for key in ("amplitude_farad", "offset_farad")}
+        values[name] |= {key: values[name][key] / pair_factor for key in ("amplitude_farad", "offset_farad")}
     if cell.ladder is not None:
-        factors = [ohm, *(len(cell.ladder.weak_ohm) - 1) * [branch_ohm]]
+        factors = [r0_factor, *(len(cell.ladder.weak_ohm) - 1) * [pair_factor]]
         for name in ("weak_ohm", "strong_ohm"):
             rows = zip(factors, values["ladder"][name], strict=True)
             values["ladder"][name] = [[factor * r for r in row] for factor, row in rows]
         values["ladder"]["std"] = max(r0_std, r_std)
     if settings["filter"]["learned"] > 0.0:
-        values["ocv"] = _corrected(record, settings, cell, series)
+        values["ocv"] = _corrected_ocv(record, settings, cell, series)
     return CellModel.model_validate(values)
 
 
-def _corrected(record: np.void, settings: np.void, cell: CellModel, series: int) -> dict[str, Any]:
+def _corrected_ocv(record: np.void, settings: np.void, cell: CellModel, series: int) -> dict[str, Any]:
     """Return the corrected OCV of a cell as a table, with the other columns of the given table."""
     table = cell.ocv.model_dump() if isinstance(cell.ocv, TableOcv) else {"form": "table", "soc": EVEN_SOC}
     soc = np.array(table["soc"])

@@ -13,7 +13,7 @@ from bms_estimator.settings.pack import Settings
 
 MAX_CAPACITY_AH = 2000.0
 """Maximum plausible capacity of a cell [Ah]. The largest Li-ion cells on sale have some 1300 Ah."""
-CELL_V = 1.5, 4.5
+PLAUSIBLE_CELL_V = 1.5, 4.5
 """Lowest and highest plausible nominal voltage of a Li-ion cell [V]. Titanate has 2.3 V, NMC 3.7 V."""
 SMALL_CELL_AH = 5.5
 """Maximum capacity of a 18650 or 21700 cell [Ah]."""
@@ -31,12 +31,12 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
         cell: The pack as one two-terminal object (``CellModel.pack``).
     """
     if isinstance(cell, FuelCellModel):
-        found = [_voltage_out_of_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
+        lines = [_voltage_out_of_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
     else:
         checks = _too_large_capacity, _series_counted_twice, _implausible_cell_voltage, _missing_parallel
         full_v = float(ocv_grid(cell)[0][-1])
-        found = [*(check(settings, cell) for check in checks), _voltage_out_of_range(settings, full_v, "when full")]
-    return [line for line in found if line]
+        lines = [*(check(settings, cell) for check in checks), _voltage_out_of_range(settings, full_v, "when full")]
+    return [line for line in lines if line]
 
 
 def _no_load_v(cell: FuelCellModel) -> float:
@@ -63,7 +63,7 @@ def _too_large_capacity(settings: Settings, cell: CellModel) -> str | None:
 
 def _series_counted_twice(settings: Settings, cell: CellModel) -> str | None:
     series = settings.pack.series
-    file_series = cell.cell.series_count // series
+    file_series = cell.cell.series_count // series  # ``cell`` is the whole pack
     if series == 1 or file_series == 1:
         return None
     return (
@@ -74,11 +74,11 @@ def _series_counted_twice(settings: Settings, cell: CellModel) -> str | None:
 
 def _implausible_cell_voltage(_: Settings, cell: CellModel) -> str | None:
     cell_v = cell.cell.nominal_voltage_v / cell.cell.series_count
-    if CELL_V[0] <= cell_v <= CELL_V[1]:
+    if PLAUSIBLE_CELL_V[0] <= cell_v <= PLAUSIBLE_CELL_V[1]:
         return None
     return (
         f"{cell.cell.nominal_voltage_v:g} V nominal of {cell.cell.series_count} in series: {cell_v:.3g} V a cell, but "
-        f"Li-ion cells have {CELL_V[0]:g} to {CELL_V[1]:g} V; is series_count of the cell file right?"
+        f"Li-ion cells have {PLAUSIBLE_CELL_V[0]:g} to {PLAUSIBLE_CELL_V[1]:g} V; is series_count of the cell file right?"
     )
 
 

@@ -25,9 +25,13 @@ DEAD_ZONE_STEPS = 2.0
 of 2."""
 LOCK_FRACTION = 0.02
 """Default error above which the observer loses the lock, as a fraction of the nominal voltage."""
+MIN_LOCK_STEPS = 10.0
+"""Minimum of the default error above which the observer loses the lock, in steps of the voltage converter."""
+CONVERGED_ERROR = 2.0
+"""Default error below which the observer counts as converged, in multiples of the larger of dead zone and converter step."""
 GAP_S = 5.0
 """Duration of a step above which it counts as a gap [s]; for a slow source, ``PERIODS`` of its periods."""
-IMPROVED = range(1, 13)
+IMPROVED_INDICES = range(1, 13)
 """Indices of the a_i that the improved method adapts (Algorithm 1 of the thesis). a13..a15 follow from (4.2)."""
 
 
@@ -79,10 +83,8 @@ def estimator_settings(
     _period_limits(p["observer"], sampling)
     p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
-    p["hand_over"] = observer.law in (
-        "improved",
-        "scheme-3",
-    )  # (3.16) and (3.17) have no limit that the identifier could set
+    # only these laws have the form (3.18); (3.16) and (3.17) have no limit that the identifier could set
+    p["hand_over"] = observer.law in ("improved", "scheme-3")
     p["series_resistance"] = observer.law == "improved" and not identifier.enabled
     p["map_memory_s"] = identifier.map_memory_h * 3600.0
     p["configured"][1:] = cell.a[1:PARAMETERS]
@@ -113,6 +115,7 @@ def observer_settings(
     p["capacity_as"] = cell.cell.capacity_ah * 3600.0
     p["ocv_v"], p["ocv_slope_v"] = ocv_grid(cell)
     _adaptation(p, cell, observer)
+    # the improved method has the output (4.1), which does not contain R_s
     p["output_r_s"] = 0.0 if observer.law == "improved" else 1.0
     p["margin_guard"] = observer.margin_guard
     p["soc_initial"] = np.nan if initial_soc is None else initial_soc
@@ -135,11 +138,11 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
     p["ml_decay"], p["ml_decay_slope"] = decay_table(observer.alpha)
     p["k0"] = observer.k0
     p["gain_limit"] = observer.gain_limit
-    p["rearm_gain"] = -np.inf if observer.rearm_gain is None else observer.rearm_gain
+    p["rearm_gain"] = -np.inf if observer.rearm_gain is None else observer.rearm_gain  # -inf: k is never reset
     dead_zone_v = DEAD_ZONE_STEPS * voltage_resolution_v if observer.dead_zone_v is None else observer.dead_zone_v
     p["dead_zone_v"] = dead_zone_v
-    p["epsilon_v"] = observer.epsilon_v or 2.0 * max(dead_zone_v, voltage_resolution_v)
-    lock_error_v = max(LOCK_FRACTION * cell.nominal_voltage_v, 10.0 * voltage_resolution_v)
+    p["epsilon_v"] = observer.epsilon_v or CONVERGED_ERROR * max(dead_zone_v, voltage_resolution_v)
+    lock_error_v = max(LOCK_FRACTION * cell.nominal_voltage_v, MIN_LOCK_STEPS * voltage_resolution_v)
     p["lock_error_v"] = observer.lock_error_v or lock_error_v
     p["lock_time_s"] = observer.lock_time_s
     p["voltage_min_v"] = cell.voltage_min_v
@@ -155,17 +158,19 @@ def _period_limits(p: np.void, sampling: Sampling) -> None:
 
 
 def _adaptation(p: np.void, cell: CellModel, observer: ObserverSettings) -> None:
-    """Write the adaptive law (3.16), (3.17) or (3.18) as a' = drive e^2 + rate (target - a)."""
+    """Write the adaptive law (3.16), (3.17) or (3.18) as a' = drive e^2 + rate (target - a), with the output error e."""
     a = cell.a
     initial, target, rate, drive = (np.zeros(PARAMETERS) for _ in range(4))
     initial[1:] = target[1:] = a[1:PARAMETERS]
-    adapted = IMPROVED if observer.law == "improved" else range(1, PARAMETERS)
+    adapted = IMPROVED_INDICES if observer.law == "improved" else range(1, PARAMETERS)
     for i in adapted:
         drive[i] = 1.0
         if observer.law in ("improved", "scheme-3"):  # (3.18)
             bounds = cell.bounds(i)
             target[i], rate[i] = bounds.limit, bounds.rate
             initial[i] = bounds.limit if bounds.initial is None else bounds.initial
-        elif observer.law == "scheme-2" and a[i] <= observer.scheme_2_epsilon:  # (3.17), i in q
+        elif (
+            observer.law == "scheme-2" and a[i] <= observer.scheme_2_epsilon
+        ):  # (3.17) for i in the set q of the thesis
             rate[i] = observer.scheme_2_lambda
     p["a_initial"], p["target"], p["rate"], p["drive"] = initial, target, rate, drive

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from bms_estimator.model.cell import Bounds, CellModel
 
+CAPACITANCE_INDICES = (7, 9), (10, 12)
+"""Indices of the parameters amplitude and offset of C_ts and of C_tl."""
+
 
 @dataclass(frozen=True)
 class Condition:
@@ -16,13 +19,15 @@ class Condition:
 
 
 def lemma_conditions(cell: CellModel) -> list[Condition]:
-    """Check the conditions of Lemma 4.1.1 on bounds, weights and initial values of (a7, a9) and (a10, a12).
+    """Check the conditions of Lemma 4.1.1 on bounds, weights and initial values of amplitude and offset of C_ts and C_tl.
+
+    The name of each condition begins with 1 for C_ts (a7, a9), and with 2 for C_tl (a10, a12).
 
     The list also contains conditions that are not required. A condition is not required if the capacitance is positive
     over SOC 0..1 both at the beginning and at the end of the adaptation. ``failed_conditions`` omits such conditions.
     """
     conditions = []
-    for number, (amplitude, offset) in enumerate(((7, 9), (10, 12)), start=1):
+    for number, (amplitude, offset) in enumerate(CAPACITANCE_INDICES, start=1):
         amplitude_bounds, offset_bounds = cell.bounds(amplitude), cell.bounds(offset)
         a, b = f"a{amplitude}", f"a{offset}"
         products = _weighted_bounds(offset_bounds), _weighted_bounds(amplitude_bounds)
@@ -36,12 +41,12 @@ def lemma_conditions(cell: CellModel) -> list[Condition]:
 
 def failed_conditions(cell: CellModel) -> list[Condition]:
     """Return the required conditions that fail."""
-    required = []
-    for (amplitude, offset), number in zip(((7, 9), (10, 12)), "12", strict=True):
+    required_numbers = []
+    for (amplitude, offset), number in zip(CAPACITANCE_INDICES, "12", strict=True):
         amplitude_bounds, offset_bounds = cell.bounds(amplitude), cell.bounds(offset)
         if amplitude_bounds.limit >= offset_bounds.limit or _initial(amplitude_bounds) >= _initial(offset_bounds):
-            required.append(number)
-    return [c for c in lemma_conditions(cell) if not c.holds and c.name[0] in required]
+            required_numbers.append(number)
+    return [c for c in lemma_conditions(cell) if not c.holds and c.name[0] in required_numbers]
 
 
 def _below(name: str, left: float, right: float) -> Condition:
@@ -53,5 +58,5 @@ def _initial(bounds: Bounds) -> float:
 
 
 def _weighted_bounds(bounds: Bounds) -> float:
-    """Return P_i . lambda_i = lambda_x a_u + lambda_y a_l."""
+    """Return the sum of both bounds, each times its weight: P_i . lambda_i = lambda_x a_u + lambda_y a_l of the thesis."""
     return bounds.limit * bounds.rate

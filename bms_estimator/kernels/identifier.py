@@ -74,18 +74,20 @@ def identifier_step(
     integrate_current(f, p.filter, dt_s, gap, current_a, temperature_c)
     if dt_s > p.filter.unmeasured_s:
         s.unlearned_s[:] += dt_s
-    unknown = f.window.unknown_as / p.filter.capacity_as
-    if gap and unknown > MAX_SINGLE_STD and not c.suspects & UNUSABLE:
+    unknown_soc = f.window.unknown_as / p.filter.capacity_as
+    if gap and unknown_soc > MAX_SINGLE_STD and not c.suspects & UNUSABLE:  # one hypothesis does not suffice
         prepare_transition(f, p.filter)
         predict(f, p.filter, f.best)
-        restart_filter(s, p, math.hypot(f.soc_std, unknown), current_a, voltage_v)
+        restart_filter(s, p, math.hypot(f.soc_std, unknown_soc), current_a, voltage_v)
         s.fit_age_s += dt_s
         return
-    sound = detect_frozen_input(c, f, p.filter, dt_s, current_a, voltage_v)
+    voltage_usable = detect_frozen_input(c, f, p.filter, dt_s, current_a, voltage_v)
     track_current_sign(c, p.filter, dt_s, current_a, voltage_v)
     if c.suspects & UNUSABLE:
         coast_without_voltage(c, f, p.filter, dt_s, current_a)
-    elif sound and passes_innovation_gate(c, s.counters, f, p.filter, s.elements, dt_s, change_a, current_a, voltage_v):
+    elif voltage_usable and passes_innovation_gate(
+        c, s.counters, f, p.filter, s.elements, dt_s, change_a, current_a, voltage_v
+    ):
         detect_current_step(f, p.filter, dt_s, change_a, voltage_v)
         add_to_window(f, current_a, voltage_v)
     else:
@@ -100,7 +102,7 @@ def identifier_step(
 
 @njit(cache=True)
 def update_from_window(s: Record, p: Record) -> None:
-    """Update the filter, the input checks, the elements and the map by the samples of the window."""
+    """Update the filter, the input checks, the elements and the map with the samples of the window."""
     f, c = s.filter, s.checks
     dt_s = f.window.time_s
     c.mean_a = f.window.sum_a / f.window.samples
@@ -130,45 +132,44 @@ def add_elements_to_map(s: Record, p: Record, dt_s: float) -> None:
     f = s.filter
     exciting_a = MIN_EXCITATION_C * p.filter.capacity_as / 3600.0
     loaded = f.rms_a2 > exciting_a * exciting_a
-    branches = loaded and scale_is_identified(f, p.filter, LN_R)
-    # the second argument is the row of the map
-    add_element_to_map(s, 0, R_TS, branches, dt_s)
-    add_element_to_map(s, 1, R_TL, branches, dt_s)
-    add_element_to_map(s, 2, C_TS, branches, dt_s)
-    add_element_to_map(s, 3, C_TL, branches, dt_s)
-    add_element_to_map(
-        s, 4, R_S, loaded and (r_s_identified_by_steps(f, p.filter) or scale_is_identified(f, p.filter, LN_R0)), dt_s
-    )
+    pairs_identified = loaded and scale_is_identified(f, p.filter, LN_R)
+    r_s_identified = loaded and (r_s_identified_by_steps(f, p.filter) or scale_is_identified(f, p.filter, LN_R0))
+    # the second argument is the row of the map, an index of ELEMENT_NAMES
+    add_element_to_map(s, 0, R_TS, pairs_identified, dt_s)
+    add_element_to_map(s, 1, R_TL, pairs_identified, dt_s)
+    add_element_to_map(s, 2, C_TS, pairs_identified, dt_s)
+    add_element_to_map(s, 3, C_TL, pairs_identified, dt_s)
+    add_element_to_map(s, 4, R_S, r_s_identified, dt_s)
 
 
 @njit(cache=True)
-def add_element_to_map(s: Record, e: int, j: int, identified: bool, dt_s: float) -> None:
+def add_element_to_map(s: Record, row: int, j: int, identified: bool, dt_s: float) -> None:
     """Add one element to the map if it is identified, and update the age of its data.
 
     Args:
         s: Record of ESTIMATOR_STATE.
-        e: Row of the map.
+        row: Row of the map.
         j: Index of the element in ``s.elements``.
         identified: True if the present data determine the element.
         dt_s: Time since the last update [s].
     """
     learned = identified and add_observation(
-        s.map, e, s.filter.soc, math.log(s.elements.value[j]), s.elements.ln_variance[j], dt_s
+        s.map, row, s.filter.soc, math.log(s.elements.value[j]), s.elements.ln_variance[j], dt_s
     )
-    s.unlearned_s[e] = 0.0 if learned else s.unlearned_s[e] + dt_s
+    s.unlearned_s[row] = 0.0 if learned else s.unlearned_s[row] + dt_s
 
 
 @njit(cache=True)
 def set_adaptation_targets(s: Record, p: Record, e: int) -> None:
     """Set the fitted parameters of an element, within the configured bounds, as limits of (3.18).
 
-    By Lemma 4.1.3, (3.18) depends on its bounds only through this limit. Parameters that no law adapts (a13..a15 of the
-    improved method) get the fitted values at once. A capacitance that is negative at the present SOC is not set, because
-    it would end the adaptation (erratum 14).
+    ``e`` is the row of the map. By Lemma 4.1.3 of the thesis, (3.18) depends on its bounds only through the limit to which
+    a parameter converges. Parameters that no law adapts (a13..a15 of R_s in the improved method) get the fitted values at
+    once. A capacitance that is negative at the present SOC is not set, because it would end the adaptation (erratum 14).
     """
     if p.hand_over == 0 or s.fit.bins[e] < MIN_BINS:
         return
-    i = 3 * e + 1
+    i = 3 * e + 1  # index of the amplitude: a1, a4, a7, a10 or a13
     amplitude, exponent, offset = fit_within(s.fit, e, p.lower, p.upper)
     if e in CAPACITANCES and delta(exponent, offset, amplitude) + p.observer.margin_guard >= s.observer.soc:
         return
@@ -179,7 +180,10 @@ def set_adaptation_targets(s: Record, p: Record, e: int) -> None:
 
 @njit(cache=True)
 def set_target(s: Record, p: Record, i: int, value: float) -> None:
-    """Set ``value`` as the limit of a_i, and as a_i itself if no law adapts it. Records are those of the observer."""
+    """Set ``value`` as the limit of a_i, and as a_i itself if no law adapts a_i.
+
+    ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+    """
     s.target[i] = value
     if p.drive[i] == 0.0:
         s.a[i] = value

@@ -35,39 +35,42 @@ def symmetry_map(dtype: np.dtype[Any]) -> SymmetryMap:
     Raises:
         ValueError: A field does not consist of whole words, or the record has padding.
     """
-    mirror = np.full(dtype.itemsize // WORD_BYTES, -1, np.int32)
+    earlier_word = np.full(dtype.itemsize // WORD_BYTES, -1, np.int32)
     words = 0
     for first, shape in _fields(dtype, 0):
         size = math.prod(shape)
         words += size
         if len(shape) > 1 and shape[-1] == shape[-2]:
             n = shape[-1]
-            place = np.arange(n * n).reshape(n, n)
+            index = np.arange(n * n).reshape(n, n)
             row, column = np.tril_indices(n, -1)
-            for matrix in range(first, first + size, n * n):
-                mirror[matrix + place[row, column]] = matrix + place[column, row]
+            for first_of_matrix in range(first, first + size, n * n):
+                earlier_word[first_of_matrix + index[row, column]] = first_of_matrix + index[column, row]
     if words * WORD_BYTES != dtype.itemsize:
         raise ValueError(
             f"{dtype.itemsize - words * WORD_BYTES} bytes of the record are no words of {WORD_BYTES} bytes"
         )
-    mirror.flags.writeable = False
-    return mirror
+    earlier_word.flags.writeable = False  # the result is cached and shared by all callers
+    return earlier_word
 
 
 def _fields(dtype: np.dtype[Any], offset: int) -> Iterator[tuple[int, tuple[int, ...]]]:
     """Yield the index of the first word and the shape of each field, with the fields of nested records.
 
+    ``offset`` is the position of this record in the outermost one [bytes].
+
     Raises:
         ValueError: A field does not consist of whole words, or is an array of records.
     """
     for name in dtype.names or ():
-        field, at = dtype.fields[name][:2]  # type: ignore[index]
+        field, offset_in_record = dtype.fields[name][:2]  # type: ignore[index]
+        field_offset = offset + offset_in_record
         if field.names:
-            yield from _fields(field, offset + at)
-        elif field.base.str[1:] not in _WORD_TYPES or (offset + at) % WORD_BYTES:
-            raise ValueError(f"{name}: {field} at {offset + at} does not consist of whole words")
+            yield from _fields(field, field_offset)
+        elif field.base.str[1:] not in _WORD_TYPES or field_offset % WORD_BYTES:
+            raise ValueError(f"{name}: {field} at {field_offset} does not consist of whole words")
         else:
-            yield (offset + at) // WORD_BYTES, field.shape
+            yield field_offset // WORD_BYTES, field.shape
 
 
 def packed_buffer(words: int) -> Words:
@@ -76,60 +79,60 @@ def packed_buffer(words: int) -> Words:
 
 
 @njit(cache=True)
-def pack(words: Words, mirror: SymmetryMap, out: Words) -> int:
+def pack(words: Words, earlier_word: SymmetryMap, out: Words) -> int:
     """Write a record to ``out`` without redundant words.
 
     Args:
-        words: Shape (n,).
-        mirror: Symmetry map of the record's layout.
+        words: Shape (n,), the record's words.
+        earlier_word: Symmetry map of the record's layout.
         out: Result of ``packed_buffer``; written.
 
     Returns:
         Number of words written to ``out``.
     """
     n = words.shape[0]
-    bitmap = (n + WORD_BITS - 1) // WORD_BITS
-    at = bitmap
-    for b in range(bitmap):
+    bitmap_words = (n + WORD_BITS - 1) // WORD_BITS
+    end = bitmap_words
+    for b in range(bitmap_words):
         bits = np.uint64(0)
         for w in range(b * WORD_BITS, min((b + 1) * WORD_BITS, n)):
             word = words[w]
-            if word != (words[mirror[w]] if mirror[w] >= 0 else np.uint64(0)):
+            if word != (words[earlier_word[w]] if earlier_word[w] >= 0 else np.uint64(0)):
                 bits |= np.uint64(1) << np.uint64(w - b * WORD_BITS)
-                out[at] = word
-                at += 1
+                out[end] = word
+                end += 1
         out[b] = bits
-    return at
+    return end
 
 
 @njit(cache=True)
-def unpack(packed: Words, mirror: SymmetryMap, words: Words) -> bool:
+def unpack(packed: Words, earlier_word: SymmetryMap, words: Words) -> bool:
     """Unpack a record into ``words``.
 
     Args:
         packed: Words written by ``pack``.
-        mirror: Symmetry map of the record's layout.
+        earlier_word: Symmetry map of the record's layout.
         words: Shape (n,), the record's words; written.
 
     Returns:
         True, or False if ``packed`` does not have this layout; ``words`` are then undefined.
     """
     n = words.shape[0]
-    bitmap = (n + WORD_BITS - 1) // WORD_BITS
-    at, size = bitmap, packed.shape[0]
-    if size < bitmap:
+    bitmap_words = (n + WORD_BITS - 1) // WORD_BITS
+    position, size = bitmap_words, packed.shape[0]
+    if size < bitmap_words:
         return False
-    for b in range(bitmap):
+    for b in range(bitmap_words):
         bits = packed[b]
         for w in range(b * WORD_BITS, min((b + 1) * WORD_BITS, n)):
-            word = words[mirror[w]] if mirror[w] >= 0 else np.uint64(0)
+            word = words[earlier_word[w]] if earlier_word[w] >= 0 else np.uint64(0)
             if bits & np.uint64(1):
-                if at == size or packed[at] == word:  # too short, or stored although it is redundant
+                if position == size or packed[position] == word:  # too short, or stored although it is redundant
                     return False
-                word = packed[at]
-                at += 1
+                word = packed[position]
+                position += 1
             words[w] = word
             bits >>= np.uint64(1)
         if bits:  # set bits beyond the last word
             return False
-    return at == size
+    return position == size

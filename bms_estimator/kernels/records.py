@@ -19,9 +19,9 @@ ESTIMATOR_SETTINGS = np.dtype(
         ("observer", OBSERVER_SETTINGS),
         ("learning", LEARNING_SETTINGS),
         ("filter", EKF_SETTINGS),
-        ("identify", "i8"),  # 0: SOC by coulomb counting, parameters as configured
+        ("identify", "i8"),  # 1: the filter runs; 0: SOC by coulomb counting, parameters as configured
         ("series_resistance", "i8"),  # 1: R_s by (4.2), step 3 of the thesis
-        ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
+        ("hand_over", "i8"),  # 1: identified parameters become the limits of the adaptive law (3.18)
         ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
         ("lower", "f8", PARAMETERS),  # configured lower bounds of the parameters that become limits of (3.18)
         ("upper", "f8", PARAMETERS),  # upper bounds

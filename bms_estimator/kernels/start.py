@@ -27,7 +27,7 @@ MAX_SOC_STD_AFTER_GAP = 0.3
 
 @njit(cache=True)
 def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """Initialize the filter at the observer's initial SOC and update it by the first sample."""
+    """Initialize the filter at the observer's initial SOC and update it with the first sample."""
     initialize_filter(s.filter, p.filter, s.observer.soc, current_a, temperature_c)
     s.unlearned_s[:] = math.inf
     first_update(s, p, current_a, voltage_v)
@@ -41,16 +41,16 @@ def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, volta
     update_arrhenius_factors(f)
     spawn_hypotheses(f, p.filter, f.soc, min(soc_std, MAX_SOC_STD_AFTER_GAP))
     reset_window(f)
-    s.checks.slow_v = 0.0
+    s.checks.slow_v = 0.0  # no slow means yet
     s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
     if not s.checks.suspects & UNUSABLE:
-        s.checks.last_v = 0.0
+        s.checks.last_v = 0.0  # no previous sample
         first_update(s, p, current_a, voltage_v)
 
 
 @njit(cache=True)
 def first_update(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
-    """Update the newly initialized filter by its first sample."""
+    """Update the newly initialized filter with its first sample."""
     f = s.filter
     store_last_good_state(s.checks, f)
     add_to_window(f, current_a, voltage_v)

@@ -20,6 +20,7 @@ from bms_estimator.kernels.observer.series_resistance import (
 )
 from bms_estimator.kernels.start import initialize_state, restart_after_unknown_gap, store_temperature
 from bms_estimator.model.arrays import Record, Records
+from bms_estimator.model.sample import SampleStatus
 from bms_estimator.numba_cache import njit
 
 
@@ -33,12 +34,13 @@ class SampleOutcome(IntEnum):
     SATURATED = 4
 
 
+# constants of the compiled functions, plain integers
 _ACCEPTED = int(SampleOutcome.ACCEPTED)
 _NOT_FINITE = int(SampleOutcome.NOT_FINITE)
 _OUT_OF_RANGE = int(SampleOutcome.OUT_OF_RANGE)
 _REPEATED = int(SampleOutcome.REPEATED)
 _SATURATED = int(SampleOutcome.SATURATED)
-_SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED
+_SATURATED_BITS = int(SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED)
 
 
 @njit(cache=True)
@@ -98,10 +100,10 @@ def step(
     store_temperature(state[0].learning, temperature_c)
     dt_s = time_s - s.time_s
     s.time_s = time_s
-    new_clock = dt_s == -math.inf
+    new_clock = dt_s == -math.inf  # ``Estimator.resume`` has set the time of the last sample to infinity
     if new_clock:
         dt_s = state[0].unseen_s
-        settle_s = settings[0].learning.settle_s  # the load in the gap is unknown
+        settle_s = settings[0].learning.settle_s  # RC voltages are unknown, because the load in the gap is unknown
         state[0].learning.settle_s = state[0].series_resistance.settle_s = settle_s
     if not 0.0 <= dt_s < math.inf:  # the clock was set back, or the duration of the gap is unknown
         s.current_a = state[0].filter.current_a = current_a
@@ -112,18 +114,18 @@ def step(
             s.time_steps_back += 1
         return outcome
     gap = new_clock or is_gap(s, p, dt_s)
-    before_a, before_soc = s.current_a, s.soc
+    previous_a, previous_soc = s.current_a, s.soc
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
         identifier_step(state[0], settings[0], dt_s, gap, current_a, voltage_v, temperature_c)
     else:
         s.soc = s.soc_coulomb
     if settings[0].learning.enabled:
-        learning_step(state[0], settings[0], dt_s, before_a, voltage_v)
+        learning_step(state[0], settings[0], dt_s, previous_a, voltage_v)
     else:
         observer_step(s, p, dt_s, voltage_v)
     if settings[0].series_resistance:
-        series_resistance_step(state[0], settings[0], dt_s, before_a, before_soc, voltage_v)
+        series_resistance_step(state[0], settings[0], dt_s, previous_a, previous_soc, voltage_v)
     return outcome
 
 
@@ -191,8 +193,9 @@ def write_observer_trace(row: Record, s: Record, p: Record, x: Record) -> None:
 def write_filter_trace(row: Record, s: Record, p: Record) -> None:
     """Write the filter's columns. ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 
-    Without the filter, the columns contain the observer's e, R_s by (4.2) if enabled, and NaN. ``soc_ocv`` is then NaN,
-    because the observer's v_ts and v_tl absorb any error of the SOC, so that (7.1) would return the observer's own SOC.
+    Without the filter, ``innovation_v`` is the observer's output error e, ``r_s_ohm`` is R_s by (4.2) if enabled, and the
+    other columns are NaN. ``soc_ocv`` is then NaN, because the observer's v_ts and v_tl absorb any error of the SOC, so that
+    the inverted OCV (7.1) would return the observer's own SOC.
     """
     if not p.identify:
         row.innovation_v = s.observer.innovation_v
@@ -215,5 +218,5 @@ def write_filter_trace(row: Record, s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def value_and_std(e: Record, j: int) -> tuple[float, float]:
-    """Return an element of a record of EQUIVALENT and its standard deviation, in its unit."""
+    """Return element ``j`` of a record of EQUIVALENT and its standard deviation, both in the unit of the element."""
     return e.value[j], e.value[j] * math.sqrt(e.ln_variance[j])

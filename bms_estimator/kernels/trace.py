@@ -20,11 +20,11 @@ TRACE = np.dtype(
         ("tracking_error_v", "f8"),  # the observer's e (3.15)
         ("nussbaum_gain", "f8"),  # N(k) (3.12) of a law of the thesis, or NaN
         ("adaptation_gain_hz", "f8"),  # gamma k of the learning law, or NaN [1/s]
-        ("k", "f8"),
-        ("delta_1", "f8"),
-        ("delta_2", "f8"),
+        ("k", "f8"),  # adaptive gain state (3.13)
+        ("delta_1", "f8"),  # SOC below which C_ts of the model is negative (2.11)
+        ("delta_2", "f8"),  # SOC below which C_tl of the model is negative (2.12)
         ("stability_margin", "f8"),  # soc - max(delta_1, delta_2)
-        ("lock", "i8"),
+        ("lock", "i8"),  # 1 while the observer tracks the voltage
         ("converged", "i8"),  # 1: |e| < eps2 of Algorithm 1
         ("soc_coulomb", "f8"),  # by coulomb counting alone
         (

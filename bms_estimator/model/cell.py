@@ -1,6 +1,7 @@
 """Cell model: contents of a cell file, with a1..a21.
 
-Numbers in parentheses are equations of the thesis, and Lemma 4.1.1 and Lemma 4.1.3 are lemmas of the thesis.
+Numbers in parentheses are equations of the thesis, and Lemma 4.1.1 and Lemma 4.1.3 are lemmas of the thesis. a1..a15 are the
+parameters of the circuit elements over SOC, and a16..a21 those of the open-circuit voltage.
 
 The values describe ``series_count`` cells in series as one two-terminal object. ``CellModel.pack`` scales them to packs
 of such objects in series and parallel.
@@ -27,7 +28,11 @@ ELEMENTS = {
     "c_tl": (10, "amplitude_farad", "offset_farad"),  # (2.8)
     "r_s": (13, "amplitude_ohm", "offset_ohm"),  # (2.9)
 }
-"""Element -> index of its first parameter, key of its amplitude, key of its offset."""
+"""Index of the first parameter, key of the amplitude and key of the offset, by element."""
+DEFAULT_RATE = 100.0
+"""Default rate lambda_x + lambda_y of (3.18), that of most parameters of the shipped cell ``chen_mora`` [1/s]."""
+CAPACITANCE_NUMBERS = (2, 3)
+"""Positions of C_ts and C_tl in ``ELEMENTS``."""
 
 
 class Resistance(Strict):
@@ -145,7 +150,7 @@ class Ladder(Strict):
 
 
 class Bounds(Strict):
-    """Settings of (3.18) for one parameter: bounds, weight of each bound, and initial value."""
+    """Settings of the adaptive law (3.18) for one parameter: bounds, weight of each bound, and initial value."""
 
     upper: Positive = Field(description="a_iu")
     lower: Positive = Field(description="a_il")
@@ -168,7 +173,7 @@ class Bounds(Strict):
 
     @property
     def limit(self) -> float:
-        """Limit of the parameter for any data: Lemma 4.1.3."""
+        """Value to which the parameter converges, whatever the data are (Lemma 4.1.3)."""
         return (self.weight_upper * self.upper + self.weight_lower * self.lower) / self.rate
 
 
@@ -238,7 +243,7 @@ class CellModel(Strict):
         if configured is not None:
             return configured
         value = float(self.a[index])
-        rate = 100.0
+        rate = DEFAULT_RATE
         if index in (9, 12) and self.a[index - 2] > value:
             # Lemma 4.1.1: the rate of a9 (a12) must exceed that of a7 (a10), but by less than the ratio of both values
             rate *= float(np.sqrt(self.a[index - 2] / value))
@@ -252,7 +257,10 @@ class CellModel(Strict):
 
 
 def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
-    """Return the model of ``series`` x ``parallel`` cells. The factor of a value follows from the unit in its name."""
+    """Return the model of ``series`` x ``parallel`` cells. The unit in the name of a value determines its factor.
+
+    ``parallel`` need not be an integer, because generic cells of 1 Ah are scaled to a capacity.
+    """
     ohm, farad = series / parallel, parallel / series
 
     def scaled_by_unit(part: Strict, factor: dict[str, float]) -> dict[str, object]:
@@ -267,8 +275,8 @@ def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
     elements = {name: scaled_by_unit(getattr(model, name), factor) for name in ELEMENTS}
     adaptation = {}
     for name, bounds in model.adaptation.items():
-        element, coefficient = divmod(int(name[1:]) - 1, 3)  # coefficient 1 is the exponent, elements 2, 3 capacitances
-        scale = 1.0 if coefficient == 1 else farad if element in (2, 3) else ohm
+        element, coefficient = divmod(int(name[1:]) - 1, 3)  # coefficient 0: amplitude, 1: exponent, 2: offset
+        scale = 1.0 if coefficient == 1 else farad if element in CAPACITANCE_NUMBERS else ohm
         table = bounds.model_dump()
         adaptation[name] = table | {k: table[k] * scale for k in ("upper", "lower", "initial") if table[k] is not None}
     cell = scaled_by_unit(model.cell, factor) | {"series_count": model.cell.series_count * series}
@@ -285,17 +293,17 @@ def _product(value: Any, factor: float) -> Any:
 
 def shipped_cells() -> list[str]:
     """Return the names of the shipped cells."""
-    return _names("cells")
+    return _shipped_names("cells")
 
 
 def generic_cells() -> list[str]:
     """Return the names of the generic cells, one for each chemistry."""
-    return _names("cells/generic")
+    return _shipped_names("cells/generic")
 
 
 def shipped_fuel_cells() -> list[str]:
     """Return the names of the shipped fuel cells."""
-    return _names("cells/fuel_cell")
+    return _shipped_names("cells/fuel_cell")
 
 
 def is_fuel_cell(name_or_path: str | Path) -> bool:
@@ -308,7 +316,8 @@ def is_fuel_cell(name_or_path: str | Path) -> bool:
         return False  # read_toml reports errors of the file later
 
 
-def _names(folder: str) -> list[str]:
+def _shipped_names(folder: str) -> list[str]:
+    """Return the names of the shipped files in ``folder``, without ``.toml``."""
     entries = (resources.files("bms_estimator.model") / folder).iterdir()
     return sorted(Path(entry.name).stem for entry in entries if entry.name.endswith(".toml"))
 
@@ -335,19 +344,21 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
     if text in generic_cells():
         if capacity_ah is None:
             raise UserError(f"{text} is a generic cell: give its capacity, capacity_ah of [pack] or --capacity-ah")
-        return _scaled(_packaged(f"cells/generic/{text}.toml"), 1, capacity_ah)
-    cell = _packaged(f"cells/{text}.toml") if text in shipped_cells() else read_toml(cell_file_path(text), CellModel)
+        return _scaled(_read_shipped(f"cells/generic/{text}.toml"), series=1, parallel=capacity_ah)
+    is_shipped = text in shipped_cells()
+    cell = _read_shipped(f"cells/{text}.toml") if is_shipped else read_toml(cell_file_path(text), CellModel)
     return cell if capacity_ah is None else with_capacity(cell, capacity_ah)
 
 
 def with_capacity(cell: CellModel, capacity_ah: float) -> CellModel:
-    """Return the cell with another capacity [Ah] and unchanged resistances."""
+    """Return the cell with another capacity [Ah], whose std is unknown, and unchanged resistances."""
     return cell.model_copy(
         update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": None})}
     )
 
 
-def _packaged(name: str) -> CellModel:
+def _read_shipped(name: str) -> CellModel:
+    """Read a shipped cell file; ``name`` is its path within the folder of this module."""
     with resources.as_file(resources.files("bms_estimator.model") / name) as path:
         return read_toml(path, CellModel)
 

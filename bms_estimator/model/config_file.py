@@ -22,11 +22,11 @@ NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-def _number(value: object) -> object:
+def _require_number(value: object) -> object:
     """Return a number unchanged.
 
     Raises:
-        ValueError: The value is a boolean or a string, which pydantic would convert: ``true`` to 1 and "3_9" to 39.
+        ValueError: The value is a boolean or a string. Pydantic would convert ``true`` to 1 and "3_9" to 39.
     """
     if isinstance(value, bool):
         raise ValueError("must be a number")  # noqa: TRY004 - pydantic handles ValueError as an invalid value
@@ -37,13 +37,13 @@ def _number(value: object) -> object:
 
 def _make_strict(schema: Any) -> None:
     """Restrict numbers and booleans within a schema to their exact types."""
-    kind = schema.get("type") if isinstance(schema, dict) else None
-    if kind == "bool":
+    schema_type = schema.get("type") if isinstance(schema, dict) else None
+    if schema_type == "bool":
         schema["strict"] = True
-    elif kind in ("int", "float"):
-        lax = dict(schema)
+    elif schema_type in ("int", "float"):
+        lax_schema = dict(schema)
         schema.clear()
-        schema.update(no_info_before_validator_function(_number, lax))
+        schema.update(no_info_before_validator_function(_require_number, lax_schema))
     else:
         parts = schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ()
         for part in parts:
@@ -105,30 +105,33 @@ def parse_toml(text: str, model: type[T], path: str) -> T:
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        raise UserError("\n".join(_line(path, model, table, detail) for detail in error.errors())) from None
+        raise UserError("\n".join(_error_line(path, model, table, detail) for detail in error.errors())) from None
 
 
-def _line(path: str, model: type[BaseModel], table: object, detail: Any) -> str:
-    """Return the message of one error: ``pack.toml: cell.capacity_ah = -6.6: must be above 0 (rated capacity ...)``."""
-    keys = _keys(table, detail)
-    where = ".".join(keys)
+def _error_line(path: str, model: type[BaseModel], table: object, detail: Any) -> str:
+    """Return the message of one error: ``pack.toml: cell.capacity_ah = -6.6: must be above 0 (rated capacity ...)``.
+
+    ``table`` is the content of the file, and ``detail`` an error of pydantic.
+    """
+    keys = _key_path(table, detail)
+    full_key = ".".join(keys)
     described = _description(model, keys)
     hint = f" ({described})" if described else ""
     if detail["type"] in ("missing", "union_tag_not_found"):
-        return f"{path}: {where}: missing{hint}"
+        return f"{path}: {full_key}: missing{hint}"
     if detail["type"] == "extra_forbidden":
-        return f"{path}: {where}: unknown key{_suggestion(model, keys)}"
+        return f"{path}: {full_key}: unknown key{_suggestion(model, keys)}"
     if detail["type"] == "union_tag_invalid":
-        return f"{path}: {where}.{_discriminator(detail)} = {detail['ctx']['tag']!r}: must be one of {detail['ctx']['expected_tags']}"
+        return f"{path}: {full_key}.{_discriminator(detail)} = {detail['ctx']['tag']!r}: must be one of {detail['ctx']['expected_tags']}"
     message = MESSAGES.get(detail["type"], detail["msg"].removeprefix("Value error, "))
     if detail["type"] == "string_pattern_mismatch" and not hint:
-        message = detail["msg"]
-    if isinstance(detail["input"], dict):
-        return ": ".join(filter(None, (path, where, message)))
-    return f"{path}: {where} = {without_secrets(repr(detail['input']))}: {message}{hint}"
+        message = detail["msg"]  # without a description of the form, the pattern is better than nothing
+    if isinstance(detail["input"], dict):  # a whole section is too long for the message
+        return ": ".join(filter(None, (path, full_key, message)))
+    return f"{path}: {full_key} = {without_secrets(repr(detail['input']))}: {message}{hint}"
 
 
-def _keys(table: object, detail: Any) -> list[str]:
+def _key_path(table: object, detail: Any) -> list[str]:
     """Return the path of keys in the file to an error, without the model names that pydantic inserts."""
     keys, location = [], detail["loc"]
     for key in location[:-1]:
@@ -138,9 +141,11 @@ def _keys(table: object, detail: Any) -> list[str]:
         elif isinstance(table, list) and isinstance(key, int):
             keys.append(str(key))
             table = table[key] if key < len(table) else None
-    kind = [_discriminator(detail)] if detail["type"] == "union_tag_not_found" else []
-    last = [] if detail["type"] == "value_error" and location and not _has(table, location[-1]) else location[-1:]
-    return [*keys, *map(str, last), *kind]
+    missing_key = [_discriminator(detail)] if detail["type"] == "union_tag_not_found" else []
+    # the last part of the location of a whole model's error may be the name of the model
+    is_model = detail["type"] == "value_error" and location and not _can_contain(table, location[-1])
+    last_key = [] if is_model else location[-1:]
+    return [*keys, *map(str, last_key), *missing_key]
 
 
 def _discriminator(detail: Any) -> str:
@@ -150,14 +155,14 @@ def _discriminator(detail: Any) -> str:
 
 def _suggestion(model: type[BaseModel], keys: list[str]) -> str:
     """Return a suggestion for an unknown key: a similar key, or all keys if they are few; otherwise an empty text."""
-    models = _within(model, keys[:-1])
+    models = _models_at(model, keys[:-1])
     known = list(dict.fromkeys(field.alias or name for m in models for name, field in m.model_fields.items()))
     if close := get_close_matches(keys[-1], known, n=1):
         return f"; is {close[0]} meant?"
     return f"; there are {', '.join(known)}" if len(models) == 1 and 0 < len(known) <= MAX_LISTED_KEYS else ""
 
 
-def _within(model: type[BaseModel], keys: list[str]) -> list[type[BaseModel]]:
+def _models_at(model: type[BaseModel], keys: list[str]) -> list[type[BaseModel]]:
     """Return the models at the end of a path of keys."""
     current = [model]
     for key in keys:
@@ -166,7 +171,7 @@ def _within(model: type[BaseModel], keys: list[str]) -> list[type[BaseModel]]:
     return current
 
 
-def _has(table: object, key: object) -> bool:
+def _can_contain(table: object, key: object) -> bool:
     """Return True if ``table`` can contain ``key``."""
     return key in table if isinstance(table, dict) else isinstance(table, list)
 

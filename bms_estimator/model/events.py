@@ -13,7 +13,7 @@ MIN_UNSEEN_S = 1.0
 NOT_SAVED = ("cannot be saved", "not saved")
 """Prefixes of ``health.checkpoint`` that report a failed checkpoint."""
 
-Name = Literal[
+EventName = Literal[
     "start",
     "unseen",
     "sensor_offline",
@@ -33,12 +33,12 @@ class Event(Payload):
     """Topic ``event``, not retained: one event of a pack."""
 
     time: str = Field(description="time of detection, ISO 8601, UTC")
-    name: Name = Field(description="kind of event")
+    name: EventName = Field(description="kind of event")
     text: str = Field(description="description: reason and remedy")
 
 
 class _EventText(NamedTuple):
-    name: Name
+    name: EventName
     text: str
 
 
@@ -53,80 +53,84 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
     if before is None:
         started = _EventText("start", f"checkpoint: {health.checkpoint}")
         # at the start ``health.unseen_s`` is the gap between the runs; None: no gap, or an unknown length
-        found = [started, *_unseen(health.unseen_s or 0.0), *_sensor(None, health)]
-        found += [*_input_faults([], health.suspects), *_checkpoint("", health)]
+        texts = [started, *_gap_event(health.unseen_s or 0.0), *_sensor_events(None, health)]
+        texts += [*_input_fault_events([], health.suspects), *_checkpoint_events("", health)]
     elif before.health is health:
-        found = []
+        texts = []
     else:
-        was = before.health
+        previous = before.health
         # the total counts all gaps since the previous snapshot; ``health.unseen_s`` is only the last gap
-        unseen = _unseen(health.total.unseen_s - was.total.unseen_s)
-        found = [*unseen, *_sensor(was, health), *_input_faults(was.suspects, health.suspects)]
-        found += _checkpoint(was.checkpoint, health)
-    of_health = [Event(time=health.publish_time, name=name, text=text) for name, text in found]
-    seen = snapshot.estimate.publish_time if snapshot.estimate else health.publish_time
-    return of_health + [Event(time=seen, name=name, text=text) for name, text in _alarms(before, snapshot)]
+        gaps = _gap_event(health.total.unseen_s - previous.total.unseen_s)
+        texts = [*gaps, *_sensor_events(previous, health), *_input_fault_events(previous.suspects, health.suspects)]
+        texts += _checkpoint_events(previous.checkpoint, health)
+    health_events = [Event(time=health.publish_time, name=name, text=text) for name, text in texts]
+    # alarms are evaluated for each snapshot, but several snapshots may share one ``health``
+    alarm_time = snapshot.estimate.publish_time if snapshot.estimate else health.publish_time
+    return health_events + [
+        Event(time=alarm_time, name=name, text=text) for name, text in _alarm_events(before, snapshot)
+    ]
 
 
-def _alarms(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
+def _alarm_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
     """Yield raised and cleared alarms.
 
     An alarm that was cleared and raised again between the snapshots has another ``since``. Alarms that were raised before
     the start are skipped, because the previous run reported them.
     """
-    was = {alarm.name: alarm.since for alarm in before.alarms} if before else {}
+    previous_since = {alarm.name: alarm.since for alarm in before.alarms} if before else {}
     for alarm in snapshot.alarms:
-        since = was.get(alarm.name)
+        since = previous_since.get(alarm.name)
         if since is not None and since != alarm.since:
             yield _EventText("alarm_cleared", alarm.name)
         if alarm.since is not None and since != alarm.since and alarm.since >= snapshot.info.started:
             yield _EventText("alarm_raised", f"{alarm.name}: {alarm.text}")
-    yield from _watched(before, snapshot)
+    yield from _watch_events(before, snapshot)
 
 
-def _watched(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
+def _watch_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
     """Yield alarms whose quantity has become unavailable or available."""
-    was = {alarm.name: alarm.watched for alarm in before.alarms} if before else {}
+    was_watched = {alarm.name: alarm.watched for alarm in before.alarms} if before else {}
     for alarm in snapshot.alarms:
-        if was.get(alarm.name, True) and not alarm.watched:
+        if was_watched.get(alarm.name, True) and not alarm.watched:
             yield _EventText("alarm_unwatched", f"{alarm.name}: {alarm.unwatched_reason}")
-        elif alarm.watched and not was.get(alarm.name, True):
+        elif alarm.watched and not was_watched.get(alarm.name, True):
             yield _EventText("alarm_watched", alarm.name)
 
 
-def _unseen(unseen_s: float) -> Iterator[_EventText]:
-    if unseen_s >= MIN_UNSEEN_S:
-        yield _EventText("unseen", f"no measurements for {unseen_s:.1f} s")
+def _gap_event(gap_s: float) -> Iterator[_EventText]:
+    if gap_s >= MIN_UNSEEN_S:
+        yield _EventText("unseen", f"no measurements for {gap_s:.1f} s")
 
 
-def _sensor(was: Health | None, health: Health) -> Iterator[_EventText]:
-    if was is not None and was.sensor_online == health.sensor_online:
+def _sensor_events(previous: Health | None, health: Health) -> Iterator[_EventText]:
+    if previous is not None and previous.sensor_online == health.sensor_online:
         return
     if health.sensor_online:
         yield _EventText("sensor_online", "samples arrive")
-    elif was is not None:  # an offline sensor at the start causes no event
+    elif previous is not None:  # an offline sensor at the start causes no event
         yield _EventText("sensor_offline", health.sensor_message or "")
 
 
-def _input_faults(was: list[str], now: list[str]) -> Iterator[_EventText]:
+def _input_fault_events(previous: list[str], present: list[str]) -> Iterator[_EventText]:
     """Yield input faults that began and ended. The numbers in a fault's text may change without an event."""
-    before, after = ({_kind(sentence): sentence for sentence in sentences} for sentences in (was, now))
-    for kind, sentence in after.items():
-        if kind not in before:
+    before, after = ({_fault_text(sentence): sentence for sentence in sentences} for sentences in (previous, present))
+    for fault_text, sentence in after.items():
+        if fault_text not in before:
             yield _EventText("suspicion", sentence)
-    for kind, sentence in before.items():
-        if kind not in after:
+    for fault_text, sentence in before.items():
+        if fault_text not in after:
             yield _EventText("suspicion_cleared", sentence)
 
 
-def _kind(sentence: str) -> str:
+def _fault_text(sentence: str) -> str:
     """Return the constant part of an input fault's text."""
     return next((fault.text for fault in InputFault if sentence.endswith(fault.text)), sentence)
 
 
-def _checkpoint(was: str, health: Health) -> Iterator[_EventText]:
-    failed, fails = was.startswith(NOT_SAVED), health.checkpoint.startswith(NOT_SAVED)
-    if fails and not failed:
+def _checkpoint_events(previous: str, health: Health) -> Iterator[_EventText]:
+    """Yield a change between success and failure of checkpoints; ``previous`` is the earlier ``health.checkpoint``."""
+    failed_before, fails = previous.startswith(NOT_SAVED), health.checkpoint.startswith(NOT_SAVED)
+    if fails and not failed_before:
         yield _EventText("checkpoint_fails", health.checkpoint)
-    elif failed and not fails:
+    elif failed_before and not fails:
         yield _EventText("checkpoint_saved", health.checkpoint)

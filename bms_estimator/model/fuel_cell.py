@@ -34,6 +34,8 @@ Parameter = Literal[
     "internal_current_a",
 ]
 """Identified parameters of a stack, in the order of ``kernels.cell_model.fuel_cell.NAMES``."""
+CONSTANTS = 16
+"""Length of an array with the kernels' constants."""
 
 
 class FuelCell(Strict):
@@ -43,6 +45,7 @@ class FuelCell(Strict):
     tafel_slope_v: Positive = Field(
         description="Tafel slope: increase of the activation loss if the current increases by a factor of e"
     )
+    # below 1 A, so that the activation loss at 1 A is positive; the logarithm of this loss is learned
     exchange_current_a: Annotated[float, Field(gt=0, lt=1)] = Field(
         description="current at which Tafel's line has an activation loss of 0 V"
     )
@@ -70,18 +73,18 @@ class FuelCellModel(Strict):
 
     @property
     def a(self) -> NDArray[np.float64]:
-        """Constants of the kernels, shape (16,).
+        """Constants of the kernels, shape (16,), the size of a1..a15 of a battery cell with index 0 unused.
 
         Index 1..7: parameters in the order of ``kernels.cell_model.fuel_cell.NAMES``. Index 8..11: cells in series,
-        temperature [C], partial pressures of hydrogen and oxygen [atm].
+        temperature [C], partial pressures of hydrogen and oxygen [atm]. All other elements are 0 and not used.
         """
         f = self.fuel_cell
-        learned = (f.r_ohm, f.tafel_slope_v, self.activation_v, f.c_dl_farad, f.concentration_v)
+        losses = (f.r_ohm, f.tafel_slope_v, self.activation_v, f.c_dl_farad, f.concentration_v)
         currents = (f.limiting_current_a, f.internal_current_a)
         conditions = (self.cell.series_count, f.temperature_c, f.hydrogen_atm, f.oxygen_atm)
-        values = np.zeros(16)
-        values[1:12] = *learned, *currents, *conditions
-        return values
+        constants = np.zeros(CONSTANTS)
+        constants[1:12] = *losses, *currents, *conditions
+        return constants
 
     @property
     def activation_v(self) -> float:
@@ -105,9 +108,9 @@ class FuelCellModel(Strict):
             "limiting_current_a": limit,
             "internal_current_a": internal,
         }
-        losses = FuelCell.model_validate(self.fuel_cell.model_dump() | values)
-        rounded = {name: float(f"{value:.2g}") for name, value in std.items()}
-        return self.model_copy(update={"fuel_cell": losses, "std": rounded})
+        fuel_cell = FuelCell.model_validate(self.fuel_cell.model_dump() | values)
+        rounded_std = {name: float(f"{value:.2g}") for name, value in std.items()}
+        return self.model_copy(update={"fuel_cell": fuel_cell, "std": rounded_std})
 
     def pack(self, series: int, parallel: int) -> "FuelCellModel":
         """Return the model of ``series`` x ``parallel`` stacks, with all values scaled.
@@ -124,15 +127,15 @@ class FuelCellModel(Strict):
                 f"{self.cell.name}: exchange_current_a of {parallel} in parallel is {exchange_a:g}: must be less than 1"
             )
 
-        def scaled(part: Strict) -> dict[str, object]:
+        def scaled_by_unit(part: Strict) -> dict[str, object]:
             return {
                 key: value * factor[unit] if (unit := key.rpartition("_")[2]) in factor else value
                 for key, value in part.model_dump().items()
             }
 
-        count = {"series_count": self.cell.series_count * series}
+        cell = scaled_by_unit(self.cell) | {"series_count": self.cell.series_count * series}
         return FuelCellModel.model_validate(
-            {"cell": scaled(self.cell) | count, "fuel_cell": scaled(self.fuel_cell), "std": self.std}
+            {"cell": cell, "fuel_cell": scaled_by_unit(self.fuel_cell), "std": self.std}
         )
 
 

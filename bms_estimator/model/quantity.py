@@ -73,8 +73,8 @@ class Quantity:
 
 def quantity(model: type[BaseModel], name: str) -> Quantity:
     """Return the annotation of a field, or the defaults of a field without one."""
-    found = (each for each in model.model_fields[name].metadata if isinstance(each, Quantity))
-    return next(found, Quantity())
+    annotations = (each for each in model.model_fields[name].metadata if isinstance(each, Quantity))
+    return next(annotations, Quantity())
 
 
 def field_entities(model: type[BaseModel], packs: str) -> dict[str, Entity]:

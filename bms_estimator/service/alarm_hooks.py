@@ -14,7 +14,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, HookHealth
 from bms_estimator.process.backoff import Backoff
 from bms_estimator.protocols.base.relay import Relay
-from bms_estimator.service.hook_process import StartError, environment, run
+from bms_estimator.service.hook_process import StartError, program_environment, run_program
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms import Change
@@ -28,7 +28,8 @@ RELAY_RETRY_S = 0.5
 CLOSE_S = 2.0
 """Timeout of running hooks at shutdown [s]."""
 FIRST_RETRY_S = 0.5
-"""First delay before the retry of a program that could not be started [s]. Each retry doubles the delay, up to 30 s."""
+"""First delay before the retry of a program that could not be started [s]. Each retry doubles the delay, up to 30 s. Delay
+after an internal error of a hook [s]."""
 
 PublishRaw = Callable[[str, bytes], None]
 """Publishes a payload on a topic."""
@@ -99,7 +100,7 @@ class AlarmHooks:
 
     async def __aenter__(self) -> Self:
         """Start a task for each hook."""
-        self._tasks = [asyncio.create_task(hook.supervise(), name="alarm hook") for hook in self._hooks]
+        self._tasks = [asyncio.create_task(hook.run(), name="alarm hook") for hook in self._hooks]
         return self
 
     async def __aexit__(self, *_error: object) -> None:
@@ -157,21 +158,21 @@ class _Hook:
         self._closing = True
         self._wake.set()
 
-    async def supervise(self) -> None:
+    async def run(self) -> None:
         """Run jobs until the hook is closed. An internal error is logged and counted and does not end the hook."""
         while True:
             try:
-                return await self.work()
+                return await self._run_jobs()
             except Exception as error:
                 self.failures, self.error = self.failures + 1, f"internal error: {error!r}"
                 log.exception("alarm hook: internal error", hook=self.description)
                 await asyncio.sleep(FIRST_RETRY_S)
 
-    async def work(self) -> None:
+    async def _run_jobs(self) -> None:
         """Run jobs until the hook is closed."""
         while not self._closing or self._jobs:
             await self._wake.wait()
-            if not self._closing:
+            if not self._closing:  # while it closes, the event stays set and nothing waits
                 self._wake.clear()
             while self._jobs:
                 job = self._jobs.popleft()
@@ -189,7 +190,7 @@ class _Hook:
         is_raised = _counts_as_raised(alarm)
         if is_raised == (alarm.name in self._raised):
             return None
-        self._raised ^= {alarm.name}
+        self._raised ^= {alarm.name}  # add it if it is absent, otherwise remove it
         self._wake.set()
         return Job(alarm, "raised" if is_raised else "cleared")
 
@@ -209,7 +210,7 @@ class _Hook:
 
 
 def _counts_as_raised(alarm: Alarm) -> bool:
-    """Return True for a raised alarm. A critical alarm that cannot be watched also counts as raised, to be safe."""
+    """Return True for a raised alarm, and for a critical alarm that cannot be watched and might have to be raised."""
     return alarm.active or (alarm.severity == "critical" and not alarm.watched)
 
 
@@ -240,11 +241,11 @@ class _CommandHook(_Hook):
 
     async def _run(self, job: Job) -> bool:
         """Run the program once. Return False if it could not be started."""
-        values = _values(job, self._device)
-        text, timeout_s = values.pop("json").encode(), self._settings.timeout_s
-        variables = environment(self._settings.pass_environment, values)
+        fields = _job_fields(job, self._device)
+        text, timeout_s = fields.pop("json").encode(), self._settings.timeout_s
+        variables = program_environment(self._settings.pass_environment, fields)
         try:
-            code = await run(self._settings.run or (), text, variables, timeout_s)
+            code = await run_program(self._settings.run or (), text, variables, timeout_s)
         except StartError as error:
             self._fail(job, f"cannot be started: {error}")
             log.warning("alarm hook: the program cannot be started", hook=self.description, error=str(error))
@@ -273,7 +274,7 @@ class _PublishHook(_Hook):
         return f"publish on {self._topic}"
 
     async def _run_job(self, job: Job) -> None:
-        self._publish(self._topic, Template(self._settings.payload).substitute(_values(job, self._device)).encode())
+        self._publish(self._topic, Template(self._settings.payload).substitute(_job_fields(job, self._device)).encode())
         self._succeed()
 
 
@@ -310,7 +311,7 @@ class _RelayHook(_Hook):
                 "relay", dry_run=self._settings.dry_run, hook=self.description, alarm=job.alarm.name, state=job.state
             )
 
-    async def work(self) -> None:
+    async def _run_jobs(self) -> None:
         """Send the level repeatedly until the hook is closed."""
         while not self._settings.dry_run and not self._closing:
             self._wake.clear()
@@ -336,7 +337,7 @@ def hook_warnings(settings: Settings) -> list[str]:
     """
     hooks = settings.alarms.hook
     AlarmHooks(  # raises UserError for a hook that cannot work
-        hooks, settings.pack.name, (lambda *_: None) if settings.mqtt else None, select_relay(settings, _ignore_relay)
+        hooks, settings.pack.name, _ignore_message if settings.mqtt else None, select_relay(settings, _ignore_relay)
     )
     return [
         f"alarms.hook.{i}.run = {hook.run[0]}: no such program here, or it may not be run"
@@ -355,11 +356,20 @@ def select_relay(settings: Settings, set_relay: SetRelay | None) -> SetRelay | N
     return set_relay if settings.sensor.protocol == "binary" else None
 
 
+def _ignore_message(_topic: str, _payload: bytes) -> None:
+    """Do nothing. This function replaces the broker while the hooks are only checked."""
+
+
 async def _ignore_relay(_: Relay) -> None:
     """Do nothing. This function replaces the relay while the hooks are only checked."""
 
 
 def _make_hook(i: int, hook: AlarmHook, device: str, publish: PublishRaw | None, set_relay: SetRelay | None) -> _Hook:
+    """Return the hook with index ``i`` in the settings.
+
+    Raises:
+        UserError: The hook needs a missing broker or relay.
+    """
     if hook.topic:
         if publish is None:
             raise UserError(f"alarms.hook.{i}.topic = {hook.topic}: there is no broker; add the section [mqtt]")
@@ -373,10 +383,10 @@ def _make_hook(i: int, hook: AlarmHook, device: str, publish: PublishRaw | None,
     return _CommandHook(hook, device)
 
 
-def _values(job: Job, device: str) -> dict[str, str]:
+def _job_fields(job: Job, device: str) -> dict[str, str]:
     """Return the fields for a program or a payload; a field without a value is empty."""
     alarm = job.alarm
-    fields = {name: getattr(alarm, name) for name in ("name", "severity", "since", "value", "limit", "unit")}
-    values = {name: "" if value is None else str(value) for name, value in fields.items()}
+    values = {name: getattr(alarm, name) for name in ("name", "severity", "since", "value", "limit", "unit")}
+    fields = {name: "" if value is None else str(value) for name, value in values.items()}
     text = alarm.text or alarm.unwatched_reason or ""
-    return values | {"text": text, "device": device, "state": job.state, "json": alarm.json_bytes.decode()}
+    return fields | {"text": text, "device": device, "state": job.state, "json": alarm.json_bytes.decode()}

@@ -20,7 +20,7 @@ from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarms import AlarmEvaluator, Change, SampleCounts
 from bms_estimator.telemetry.health import sample_counters, suspicions
 
-UNUSABLE = "not_finite", "range", "saturated"
+UNUSABLE_KINDS = "not_finite", "range", "saturated"
 """Kinds of dropped samples that indicate a sensor fault."""
 EVALUATION_S = 0.1
 """Interval between two evaluations [s]. An evaluation of each block would take as long as the estimate."""
@@ -37,7 +37,7 @@ class AlarmMonitor:
         settings: The pack's settings.
         cell: The pack as one object.
         estimator: Estimator; read only.
-        source: Supplies counters, cells and message.
+        source: Supplies counters, cell voltages, and the reason why no samples arrive.
         clock: The clocks.
         on_alarm: Called with each change of an alarm, as soon as it occurs.
         hooks: Successes and failures of alarm hooks; None without hooks.
@@ -67,10 +67,8 @@ class AlarmMonitor:
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
         self.alarms = AlarmEvaluator(watched(settings, cell), charging_a(cell), gap_s, inputs, silent_limit_s(settings))
         self.report = self.alarms.report()
-        self._last_sample_s, self._arrival_s = (
-            clock.monotonic(),
-            clock.wall(),
-        )  # times of the last sample, accepted or not
+        # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
+        self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
 
     def add(self, block: SampleBlock, trace: TraceBlock, now_s: float) -> bool:
@@ -124,13 +122,16 @@ class AlarmMonitor:
         self.report = self.alarms.report()
 
     def _counts(self) -> SampleCounts:
-        """Return the sample counters. A damaged frame also counts as missing in a numbered sequence."""
+        """Return the sample counters.
+
+        The larger one of lost frames and errors counts, because a damaged frame is also missing in the sequence of frames.
+        """
         line, samples = self._source.counters, sample_counters(self._estimator.state[0])
         lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
-        return SampleCounts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))
+        return SampleCounts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE_KINDS))
 
     def _report_changes(self) -> bool:
-        """Update the report, log the changes and pass them on. Return True if there are any."""
+        """Update the report, log all new changes and pass them to the callback. Return True if there are any."""
         self.report = self.alarms.report()
         changes = self.alarms.changes()
         for change in changes:

@@ -53,13 +53,14 @@ class CheckpointWriter:
         self._totals, self._restarts = totals, restarts
         self._saved_alarms = self._alarms.saved_state
         publisher.saved_flow = totals.flow
-        self._saved: tuple[int, float] | None = None
+        self._saved_progress: tuple[int, float] | None = None
         """Samples and SOC (``_progress``) of the last saved state; None: this run has not saved a state."""
 
     async def run(self) -> None:
         """Save at each interval, and earlier after the first sample, a change of the SOC, or a change of a latching alarm."""
         # until the final save marks the file as clean, the next start counts this run as crashed
-        await self._write(self._update_counters(clean=False))
+        counters = self._counters(clean=False)
+        await self._write(lambda: self._checkpoint.update_counters(counters))
         loop = asyncio.get_running_loop()
         tried_s, failed = -math.inf, False
         while True:
@@ -87,9 +88,9 @@ class CheckpointWriter:
     @property
     def _needs_save(self) -> bool:
         """True if the state has changed enough to be saved before the interval ends."""
-        if self._saved is None or self._saved_alarms != self._alarms.saved_state:
+        if self._saved_progress is None or self._saved_alarms != self._alarms.saved_state:
             return True
-        return bool(abs(self._estimator.state["soc"][0] - self._saved[1]) >= SOC_CHANGE)
+        return bool(abs(self._estimator.state["soc"][0] - self._saved_progress[1]) >= SOC_CHANGE)
 
     @property
     def _progress(self) -> tuple[int, float]:
@@ -98,32 +99,27 @@ class CheckpointWriter:
         return int(state["samples"]), float(np.nan_to_num(state["soc"]))
 
     async def _save(self, *, clean: bool = False) -> bool:
-        """Save unsaved state. Return False if it cannot be written.
+        """Save the state if it has changed. Return False if it cannot be written.
 
         An unchanged state is not saved again: a new save time would hide the gap since the last sample.
         """
         progress, counters = self._progress, self._counters(clean=clean)
-        if not progress[0] or progress == self._saved:
+        if not progress[0] or progress == self._saved_progress:
             if clean or self._saved_alarms != counters.alarms:
-                return await self._write_counters(counters, lambda: self._checkpoint.update_counters(counters))
+                return await self._write_with_counters(counters, lambda: self._checkpoint.update_counters(counters))
             return True
         state = self._estimator.record.copy()
-        if not await self._write_counters(counters, lambda: self._checkpoint.save(state, counters)):
-            self._publisher.saved_flow = None
+        if not await self._write_with_counters(counters, lambda: self._checkpoint.save(state, counters)):
+            self._publisher.saved_flow = None  # the unsaved totals are published
             return False
-        self._publisher.checkpoint, self._saved = "saved", progress
-        self._publisher.saved_flow = ChargeEnergy.of(counters.total)
+        self._publisher.checkpoint, self._saved_progress = "saved", progress
+        self._publisher.saved_flow = ChargeEnergy.from_totals(counters.total)
         return True
-
-    def _update_counters(self, *, clean: bool) -> Callable[[], None]:
-        """Return a call that writes the counters only."""
-        counters = self._counters(clean=clean)
-        return lambda: self._checkpoint.update_counters(counters)
 
     def _counters(self, *, clean: bool) -> RunCounters:
         return RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state)
 
-    async def _write_counters(self, counters: RunCounters, write: Callable[[], None]) -> bool:
+    async def _write_with_counters(self, counters: RunCounters, write: Callable[[], None]) -> bool:
         """Call ``write``, which also writes the counters. Return False if it fails."""
         written = await self._write(write)
         if written:

@@ -50,40 +50,44 @@ async def serve_edge(
     set_level(name, settings.log.level)
     source = open_line_source(settings) or SerialSource(settings.sensor, memory=KnownBoardFile(folder, name))
     with instance_lock(folder, name):
-        async with BlockSender(settings.edge, name, folder) as edge, source:
+        async with BlockSender(settings.edge, name, folder) as sender, source:
             notifier.ready(name)
             try:
                 await until_first_ends(
-                    _send_samples(source, edge), _keep_alive(source, edge, notifier, name), _report(edge), stop.wait()
+                    _send_samples(source, sender),
+                    _notify_alive(source, sender, notifier, name),
+                    _log_blocks(sender),
+                    stop.wait(),
                 )
             finally:
                 notifier.stopping(name)
 
 
-async def _send_samples(source: Source, edge: BlockSender) -> None:
+async def _send_samples(source: Source, sender: BlockSender) -> None:
     """Pass all samples of the source to the block sender."""
     async for samples in source:
-        edge.take(samples)
+        sender.take(samples)
         await asyncio.sleep(0)  # a source that always has samples must not starve the sender
 
 
-async def _keep_alive(
-    source: SerialSource | LineSource, edge: BlockSender, notifier: SystemdNotifier, name: str
+async def _notify_alive(
+    source: SerialSource | LineSource, sender: BlockSender, notifier: SystemdNotifier, name: str
 ) -> None:
     """Notify the watchdog while the source's task runs, and report the status."""
     sent_status = ""
     while True:
         if source.health().task_idle_s <= SOURCE_HUNG_S:
             notifier.alive(name)
-        status = f"no samples: {source.message}" if source.message else f"{edge.store.waiting} blocks not sent"
+        status = f"no samples: {source.message}" if source.message else f"{sender.store.waiting} blocks not sent"
         if status != sent_status:
             notifier.status(name, status)
             sent_status = status
+        # three notifications within the watchdog's timeout; 0: no watchdog
         await asyncio.sleep(min(MAX_WATCHDOG_S, notifier.watchdog_s / 3.0 or MAX_WATCHDOG_S))
 
 
-async def _report(edge: BlockSender) -> None:
+async def _log_blocks(sender: BlockSender) -> None:
     """Log the state of the blocks at intervals."""
     while True:
         await asyncio.sleep(REPORT_S)
-        log.info("blocks of samples", **edge.health().model_dump())
+        log.info("blocks of samples", **sender.health().model_dump())

@@ -14,9 +14,9 @@ import signal
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-INHERITED = ("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "TZ", "TMPDIR")
+INHERITED_VARIABLES = ("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "TZ", "TMPDIR")
 """Environment variables of the service that every program inherits, besides ``LC_*``. Others may hold secrets."""
-MARK = "BMS_HOOK_RUN"
+MARK_VARIABLE = "BMS_HOOK_RUN"
 """Environment variable with a random value that marks all processes of one run."""
 POLL_S = 0.05
 """Interval between two searches for descendants [s]."""
@@ -28,20 +28,22 @@ class StartError(Exception):
     """The program could not be started."""
 
 
-def environment(passed: Collection[str], fields: Mapping[str, str]) -> dict[str, str]:
+def program_environment(passed: Collection[str], fields: Mapping[str, str]) -> dict[str, str]:
     """Return the environment of a program.
 
     Args:
-        passed: Names of further variables of the service that the program inherits.
+        passed: Names of variables of the service that the program inherits besides ``INHERITED_VARIABLES``.
         fields: Fields of the alarm; each becomes a variable named ``BMS_`` and the name in capitals. A null character
             becomes a space, because no program can be started with it.
     """
-    names = {*INHERITED, *passed}
+    names = {*INHERITED_VARIABLES, *passed}
     inherited = {name: value for name, value in os.environ.items() if name in names or name.startswith("LC_")}
     return inherited | {f"BMS_{name.upper()}": value.replace("\0", " ") for name, value in fields.items()}
 
 
-async def run(command: Sequence[str], text: bytes, variables: Mapping[str, str], timeout_s: float) -> int | None:
+async def run_program(
+    command: Sequence[str], text: bytes, variables: Mapping[str, str], timeout_s: float
+) -> int | None:
     """Run a program until it and all its descendants have ended.
 
     Args:
@@ -63,30 +65,32 @@ async def run(command: Sequence[str], text: bytes, variables: Mapping[str, str],
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL,
-            env={**variables, MARK: mark},
+            env={**variables, MARK_VARIABLE: mark},
             start_new_session=True,
         )
     except (OSError, ValueError, RuntimeError, MemoryError) as error:
         raise StartError(str(error) or repr(error)) from None
-    entry = f"{MARK}={mark}".encode()
+    marked_variable = f"{MARK_VARIABLE}={mark}".encode()
     try:
         async with asyncio.timeout(timeout_s):
             await process.communicate(text)
-            while await _find(process.pid, entry) != []:  # noqa: ASYNC110 - the end of a grandchild causes no event
+            # polled, because the end of a grandchild causes no event
+            while await _find_processes(process.pid, marked_variable) != []:  # noqa: ASYNC110
                 await asyncio.sleep(POLL_S)
     except TimeoutError:
         return None
     finally:
-        await _kill(process, entry)
+        await _kill(process, marked_variable)
     return process.returncode
 
 
-async def _kill(process: asyncio.subprocess.Process, entry: bytes) -> None:
+async def _kill(process: asyncio.subprocess.Process, marked_variable: bytes) -> None:
     """Kill the program and its descendants."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(KILL_S):
-            while (pids := await _find(process.pid, entry)) != []:
-                if pids is None and process.returncode is None:  # the process group exists while the program runs
+            while (pids := await _find_processes(process.pid, marked_variable)) != []:
+                # without a list, kill the process group, which exists while the program runs
+                if pids is None and process.returncode is None:
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.killpg(process.pid, signal.SIGKILL)
                 for pid in pids or ():
@@ -96,16 +100,16 @@ async def _kill(process: asyncio.subprocess.Process, entry: bytes) -> None:
             await process.wait()
 
 
-async def _find(leader: int, entry: bytes) -> list[int] | None:
+async def _find_processes(leader: int, marked_variable: bytes) -> list[int] | None:
     """Return the processes of a run; None if no list can be made at the moment."""
     try:
-        return await asyncio.to_thread(_processes, leader, entry)
+        return await asyncio.to_thread(_list_processes, leader, marked_variable)
     except (OSError, RuntimeError):  # no file descriptor or thread is available
         return None
 
 
-def _processes(leader: int, entry: bytes) -> list[int]:
-    """Return the processes in the session of ``leader`` or with ``entry`` in their environment, and their descendants.
+def _list_processes(leader: int, marked_variable: bytes) -> list[int]:
+    """Return the processes in the session of ``leader``, those with ``marked_variable``, and the descendants of both.
 
     Raises:
         OSError: No file descriptor is free.
@@ -121,9 +125,9 @@ def _processes(leader: int, entry: bytes) -> list[int]:
             if state in "ZX":  # zombie or dead
                 continue
             parents[pid] = int(parent)
-            if int(session) == leader or entry in (folder / "environ").read_bytes().split(b"\0"):
+            if int(session) == leader or marked_variable in (folder / "environ").read_bytes().split(b"\0"):
                 found.add(pid)
-        except OSError as error:
+        except OSError as error:  # the process has ended, or belongs to another user
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 raise
     while new := {pid for pid, parent in parents.items() if parent in found and pid not in found}:

@@ -16,7 +16,9 @@ from bms_estimator.settings.pack import Settings
 
 
 async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None:
-    """Run the services of several packs until SIGINT, SIGTERM or SIGHUP. If one ends, all end, so that systemd restarts all.
+    """Run the services of several packs until SIGINT, SIGTERM or SIGHUP.
+
+    If one service ends, all end, so that systemd restarts all.
 
     Args:
         packs: Settings and model of each pack.
@@ -28,6 +30,7 @@ async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None
     _require_unique("pack.name", names)
     sensors = [settings.sensor for settings, _ in packs if settings.source is None]
     _require_unique("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
+    # several packs may share the port "auto" if each has the serial number of its board
     _require_unique("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
     _require_unique("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
     stop, notifier, pages = stop_on_signal(), SystemdNotifier(names), Pages()

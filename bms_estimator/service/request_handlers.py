@@ -82,9 +82,11 @@ class RequestHandlers:
         Raises:
             UserError: There is no such alarm.
         """
-        name, watched = arguments.get("name"), self._publisher.alarm_monitor.alarms.names()
-        if name is not None and name not in watched:
-            raise UserError(f"name = {reprlib.repr(name)}: must be one of {', '.join(watched)}, or left out for all")
+        name, alarm_names = arguments.get("name"), self._publisher.alarm_monitor.alarms.names()
+        if name is not None and name not in alarm_names:
+            raise UserError(
+                f"name = {reprlib.repr(name)}: must be one of {', '.join(alarm_names)}, or left out for all"
+            )
         acknowledged = self._publisher.alarm_monitor.acknowledge(name)
         log.info("alarms acknowledged on request", alarms=acknowledged)
         return {"acknowledged": acknowledged}

@@ -27,11 +27,11 @@ class _Input:
     """State of one measured quantity.
 
     Attributes:
-        measured: Largest number of values in a sample so far; 0: the quantity was never measured.
+        max_count: Largest number of values in a sample so far; 0: the quantity was never measured.
         lost: True after values were missing for longer than the delay.
     """
 
-    measured: int = 0
+    max_count: int = 0
     lost: bool = False
     _missing_s: float | None = None
     """Time since the first of the latest samples without a value [s]; None: the last sample had all values."""
@@ -40,8 +40,8 @@ class _Input:
 
     def update(self, times_s: Floats, steps_s: Floats, counts: Counts, lost_s: float) -> list[float]:
         """Process the number of values in each sample. Return the times at which the quantity was lost or measured again [s]."""
-        expected = np.maximum.accumulate(np.concatenate(([self.measured], counts)))[1:]
-        self.measured = int(expected[-1])
+        expected = np.maximum.accumulate(np.concatenate(([self.max_count], counts)))[1:]
+        self.max_count = int(expected[-1])
         present = counts >= expected
         if not self.lost and bool(present.all()):
             self._missing_s = None
@@ -51,14 +51,14 @@ class _Input:
 
     def _step(self, step_s: float, lost_s: float, *, present: bool) -> bool:
         """Process one sample. Return True if ``lost`` has changed."""
-        before = self.lost
+        was_lost = self.lost
         self._missing_s = None if present else 0.0 if self._missing_s is None else self._missing_s + step_s
         if self._missing_s is not None and self._missing_s >= lost_s:
             self.lost, self._back_s = True, None
         elif self.lost and (present or self._back_s is not None):
             self._back_s = 0.0 if self._back_s is None else self._back_s + step_s
             self.lost = self._back_s < lost_s
-        return self.lost != before
+        return self.lost != was_lost
 
 
 @dataclass
@@ -83,11 +83,11 @@ class Inputs:
     @property
     def saved_state(self) -> dict[str, Any]:
         """State for ``restore`` after a restart."""
-        return {name: [each.measured, each.lost] for name, each in self._inputs.items() if each.measured}
+        return {name: [each.max_count, each.lost] for name, each in self._inputs.items() if each.max_count}
 
-    def measured(self, names: Collection[Quantity]) -> bool:
+    def were_measured(self, names: Collection[Quantity]) -> bool:
         """Return True if all these quantities were measured at some time."""
-        return all(self._inputs[name].measured for name in names)
+        return all(self._inputs[name].max_count for name in names)
 
     def update(self, times_s: Floats, steps_s: Floats, counts: Mapping[Quantity, Counts]) -> list[float]:
         """Process the number of values in each sample.
@@ -114,12 +114,12 @@ class Inputs:
             ValueError, TypeError: ``saved`` is damaged.
         """
         for name, each in self._inputs.items():
-            measured, lost = saved.get(name, (0, False))
-            if not 0 <= int(measured) <= max(self.series, 1) or not isinstance(lost, bool):
-                raise ValueError(f"{name}: measured = {measured}, lost = {lost}")
-            each.measured, each.lost = int(measured), lost
+            max_count, lost = saved.get(name, (0, False))
+            if not 0 <= int(max_count) <= max(self.series, 1) or not isinstance(lost, bool):
+                raise ValueError(f"{name}: measured = {max_count}, lost = {lost}")
+            each.max_count, each.lost = int(max_count), lost
 
 
-def counted(values: Floats) -> Counts:
+def count_values(values: Floats) -> Counts:
     """Return 1 for each sample with a value, otherwise 0; shape (n,)."""
     return np.isfinite(values).astype(np.int64)

@@ -15,9 +15,9 @@ from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
 INITIAL_ROWS = 256
 """Initial capacity of a buffer [rows]."""
 RECENT_STEPS = 4.0
-"""Maximum time between two long intervals that count as regular, in multiples of their length."""
+"""Maximum time between two long intervals that count as regular, in multiples of the longer interval."""
 _NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
-"""Row of ``_extremes`` for a sample without cell voltages."""
+"""Result of ``_cell_extremes`` for a sample without cell voltages."""
 
 
 @dataclass
@@ -37,34 +37,34 @@ class SampleIntervals:
     _longest_s: float = 0.0
     """Longest recent interval [s]."""
     _longest_at_s: float = -math.inf
-    """Time of the last interval of about this length [s]."""
+    """Time of the last interval that is about as long as ``_longest_s`` [s]."""
 
     def measure(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """Return two arrays of shape (n,) for the interval before each sample.
+        """Return the interval before each sample, and the time in it for which a value holds.
 
         Returns:
-            The interval, 0 where the clock was set back [s]; and the part of the interval during which values held, 0 in
-            gaps [s].
+            Two arrays of shape (n,) [s]. The interval is 0 after the clock was set back. A value holds for the whole
+            interval, or for 0 s in a gap.
         """
         passed_s = np.diff(times_s, prepend=self._last_s)
         passed_s = np.where(passed_s > 0.0, passed_s, 0.0)
         before_s = np.concatenate(([self._step_s], passed_s[:-1]))
         observed_s = np.where(passed_s > np.maximum(self.gap_s, GAP_RATIO * before_s), 0.0, passed_s)
         for i in np.flatnonzero(passed_s > self.gap_s).tolist():
-            if self._is_usual(float(times_s[i]), float(passed_s[i])):
+            if self._is_regular(float(times_s[i]), float(passed_s[i])):
                 observed_s[i] = passed_s[i]
         self._last_s, self._step_s = float(times_s[-1]), float(passed_s[-1]) or self._step_s
         return passed_s, observed_s
 
-    def _is_usual(self, at_s: float, step_s: float) -> bool:
+    def _is_regular(self, at_s: float, step_s: float) -> bool:
         """Return True if an interval of about this length occurred recently, and record the interval."""
         is_recent = abs(at_s - self._longest_at_s) <= RECENT_STEPS * self._longest_s
-        is_usual = is_recent and step_s <= GAP_RATIO * self._longest_s
+        is_regular = is_recent and step_s <= GAP_RATIO * self._longest_s
         if not is_recent or step_s >= self._longest_s:
             self._longest_s, self._longest_at_s = step_s, at_s
         elif GAP_RATIO * step_s >= self._longest_s:
             self._longest_at_s = at_s
-        return is_usual
+        return is_regular
 
 
 class SampleBuffer:
@@ -86,7 +86,7 @@ class SampleBuffer:
         """Append a block."""
         self._samples.add(block, block.size)
         self._traces.add(trace, trace.size)
-        self._extremes.add(_extremes(cells) if len(cells) == block.size else _NO_EXTREMES, block.size)
+        self._extremes.add(_cell_extremes(cells) if len(cells) == block.size else _NO_EXTREMES, block.size)
 
     def take(self) -> tuple[SampleBlock, TraceBlock, Floats]:
         """Remove and return all rows.
@@ -96,21 +96,22 @@ class SampleBuffer:
             and the number of cell voltages, shape (n, 3).
         """
         samples, trace, extremes_v = self._samples.take(), self._traces.take(), self._extremes.take()
-        timed = np.isfinite(samples["time_s"])
-        return (samples, trace, extremes_v) if timed.all() else (samples[timed], trace, extremes_v[timed])
+        has_time = np.isfinite(samples["time_s"])
+        return (samples, trace, extremes_v) if has_time.all() else (samples[has_time], trace, extremes_v[has_time])
 
 
 class _Rows:
     """Buffer of rows of one dtype. Rows are copied in place, because joining hundreds of short arrays takes milliseconds."""
 
-    def __init__(self, dtype: Any, columns: tuple[int, ...] = ()) -> None:
-        self._rows = np.zeros((INITIAL_ROWS, *columns), dtype=dtype)
+    def __init__(self, dtype: Any, row_shape: tuple[int, ...] = ()) -> None:
+        self._rows = np.zeros((INITIAL_ROWS, *row_shape), dtype=dtype)
         self.size = 0
 
     def add(self, values: Any, count: int) -> None:
         """Append ``count`` rows."""
         end = self.size + count
         if end > len(self._rows):
+            # more than twice the capacity, so that rows are rarely moved
             more = np.zeros((end, *self._rows.shape[1:]), dtype=self._rows.dtype)
             self._rows = np.concatenate((self._rows, more))
         self._rows[self.size : end] = values
@@ -122,8 +123,11 @@ class _Rows:
         return rows
 
 
-def _extremes(cells: CellBlock) -> Floats:
-    """Return the minimum and maximum cell voltage of each sample [V] (NaN without any) and their number, shape (n, 3)."""
+def _cell_extremes(cells: CellBlock) -> Floats:
+    """Return minimum and maximum cell voltage [V] and number of cell voltages of each sample, shape (n, 3).
+
+    The voltages of a sample without cell voltages are NaN.
+    """
     if not cells.shape[1]:
         return np.tile(_NO_EXTREMES, (len(cells), 1))
     measured = np.count_nonzero(np.isfinite(cells), axis=1)

@@ -16,7 +16,7 @@ class RaisedAlarm(NamedTuple):
     since_s: float
     """Time on the wall clock at which the alarm was raised [s since 1970]."""
     value: float | None
-    """Value in the unit of the alarm; None without a number."""
+    """Value in the unit of the alarm; None if the alarm has no number."""
 
 
 class AlarmTransition(NamedTuple):
@@ -52,20 +52,21 @@ class AlarmState:
     _held_s: float | None = None
     """Time for which the condition of the next state has held [s]; None: it does not hold."""
 
-    def update(self, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float) -> list[AlarmTransition]:
+    def update(self, times_s: Floats, steps_s: Floats, values: Floats, wall_offset_s: float) -> list[AlarmTransition]:
         """Process values in the order of their arrival.
 
         Args:
             times_s: Times on the samples' clock [s], shape (n,).
             steps_s: Interval since the previous sample [s], 0 after a gap, which does not count toward delays; shape (n,).
             values: Values in the unit of the limit, shape (n,). NaN (not measured) neither raises nor ends the alarm.
-            wall_s: Wall clock minus the samples' clock [s].
+            wall_offset_s: Wall clock minus the samples' clock [s].
 
         Returns:
             Transitions, oldest first.
         """
-        sign = 1.0 if self.definition.kind.is_upper_limit else -1.0
+        sign = 1.0 if self.definition.kind.is_upper_limit else -1.0  # lower limits are upper limits of negative values
         signed = sign * values
+        # the usual case: no value reaches the limit
         if self.raised is None and self._held_s is None and not bool((signed >= sign * self.definition.limit).any()):
             self.has_value = self.has_value or not bool(np.isnan(values).all())
             return []
@@ -77,7 +78,7 @@ class AlarmState:
             self.has_value = True
             missing_s, self._missing_s = self._missing_s, 0.0
             if self._is_due(value, step_s + (missing_s if missing_s < self.lost_s else 0.0), sign):
-                transitions += self._next_state(at_s, sign * value, wall_s)
+                transitions += self._next_state(at_s, sign * value, wall_offset_s)
         return transitions
 
     def raise_at(self, at_s: float, raised: RaisedAlarm) -> list[AlarmTransition]:
@@ -102,21 +103,21 @@ class AlarmState:
 
     def _is_due(self, signed: float, step_s: float, sign: float) -> bool:
         """Return True if the condition of the next state has held long enough."""
-        raised = self.raised is not None and not self.cause_cleared
-        holds = signed < sign * self.definition.clear if raised else signed >= sign * self.definition.limit
+        ends_next = self.raised is not None and not self.cause_cleared
+        holds = signed < sign * self.definition.clear if ends_next else signed >= sign * self.definition.limit
         if not holds:
             self._held_s = None
             return False
         self._held_s = 0.0 if self._held_s is None else self._held_s + step_s
-        if self._held_s < (self.definition.clear_delay_s if raised else self.definition.delay_s):
+        if self._held_s < (self.definition.clear_delay_s if ends_next else self.definition.delay_s):
             return False
         self._held_s = None
         return True
 
-    def _next_state(self, at_s: float, value: float, wall_s: float) -> list[AlarmTransition]:
+    def _next_state(self, at_s: float, value: float, wall_offset_s: float) -> list[AlarmTransition]:
         """Go to the next state. Return the transition if the alarm is raised or ends."""
         if self.raised is None:
-            return self.raise_at(at_s, RaisedAlarm(at_s + wall_s, value if math.isfinite(value) else None))
+            return self.raise_at(at_s, RaisedAlarm(at_s + wall_offset_s, value if math.isfinite(value) else None))
         if self.cause_cleared:  # the cause has returned
             self.cause_cleared = False
             return []

@@ -20,7 +20,7 @@ from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarm_limits import AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
-from bms_estimator.telemetry.alarm_inputs import LOSS_TEXTS, Inputs, counted
+from bms_estimator.telemetry.alarm_inputs import LOSS_TEXTS, Inputs, count_values
 from bms_estimator.telemetry.alarm_samples import SampleBuffer, SampleIntervals
 from bms_estimator.telemetry.alarm_state import AlarmState, AlarmTransition, RaisedAlarm
 from bms_estimator.telemetry.alarm_text import alarm_text
@@ -47,7 +47,7 @@ class SampleCounts(NamedTuple):
     good: int
     """Samples that the estimator accepted."""
     bad: int
-    """Lost on the line, damaged, or rejected by the estimator."""
+    """Samples that were lost on the line, damaged, or rejected by the estimator."""
 
 
 class Change(NamedTuple):
@@ -91,11 +91,11 @@ class AlarmEvaluator:
     """Evaluator of all alarms of one pack.
 
     Args:
-        watched: Definitions of the alarms.
+        definitions: Definitions of the alarms.
         charging_a: Minimum current into the pack that counts as charging [A].
         gap_s: Minimum length of a gap between samples [s].
         inputs: State of the measured quantities.
-        silent_s: Time without a sample after which no alarm is watched [s].
+        silence_limit_s: Time without a sample after which no alarm is watched [s].
 
     Attributes:
         rows: Number of samples that wait for ``evaluate``.
@@ -103,19 +103,23 @@ class AlarmEvaluator:
     """
 
     def __init__(
-        self, watched: Sequence[AlarmDefinition], charging_a: float, gap_s: float, inputs: Inputs, silent_s: float
+        self,
+        definitions: Sequence[AlarmDefinition],
+        charging_a: float,
+        gap_s: float,
+        inputs: Inputs,
+        silence_limit_s: float,
     ) -> None:
-        self._states = {each.name: AlarmState(each, lost_s=inputs.lost_s) for each in watched}
+        self._states = {each.name: AlarmState(each, lost_s=inputs.lost_s) for each in definitions}
         self._charging_a = charging_a
-        self._inputs, self._silent_s = inputs, silent_s
-        self._silence = ""  # reason why no samples arrive; empty while they do
+        self._inputs, self._silence_limit_s = inputs, silence_limit_s
+        self._silence_reason = ""  # reason why no samples arrive; empty while they do
         self._has_samples = False  # since the start of this run
-        self._unwatched: dict[AlarmName, str] = {}  # reason by alarm
-        self._sample_intervals, self._trace_intervals, self._loss_intervals = (
-            SampleIntervals(gap_s),
-            SampleIntervals(gap_s),
-            SampleIntervals(math.inf),
-        )
+        self._unwatched_reasons: dict[AlarmName, str] = {}
+        self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
+        self._loss_intervals = SampleIntervals(
+            math.inf
+        )  # no interval is a gap, because losses are counted in gaps, too
         self._buffer = SampleBuffer()
         self._counts: SampleCounts | None = None
         self._counted_s = -math.inf
@@ -152,9 +156,9 @@ class AlarmEvaluator:
         self._update_reasons("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._update_reasons("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
         if samples.size:
-            wall_s = arrival_s - float(samples["time_s"][-1])
-            self._evaluate_samples(samples, extremes_v, wall_s)
-            self._evaluate_bad_fraction(float(samples["time_s"][-1]), counts, suspects, wall_s)
+            wall_offset_s = arrival_s - float(samples["time_s"][-1])
+            self._evaluate_samples(samples, extremes_v, wall_offset_s)
+            self._evaluate_bad_fraction(float(samples["time_s"][-1]), counts, suspects, wall_offset_s)
         if trace.size:
             self._evaluate_estimates(trace, suspects, arrival_s - float(trace["time_s"][-1]))
         self._save_state()
@@ -168,9 +172,9 @@ class AlarmEvaluator:
             reason: Reason for the silence; empty if unknown.
         """
         # a silence restored from an earlier run lasts until the first sample of this run
-        lasts = bool(self._silence) and not self._has_samples
-        if (silent_s >= self._silent_s or lasts) != bool(self._silence):
-            self._silence = "" if self._silence else reason or "no samples arrive"
+        is_restored = bool(self._silence_reason) and not self._has_samples
+        if (silent_s >= self._silence_limit_s or is_restored) != bool(self._silence_reason):
+            self._silence_reason = "" if self._silence_reason else reason or "no samples arrive"
             self._update_unwatched(self._at_s)
             self._save_state()
         state = self._states.get("link_lost")
@@ -204,12 +208,12 @@ class AlarmEvaluator:
         Args:
             name: Name of the alarm; None: all.
         """
-        found = [state for key, state in self._states.items() if state.raised and name in (None, key)]
-        for state in found:
+        raised = [state for key, state in self._states.items() if state.raised and name in (None, key)]
+        for state in raised:
             if state.acknowledge():
                 self._changes.append(Change(self._at_s, self._alarm(state)))
         self._save_state()
-        return [state.definition.name for state in found]
+        return [state.definition.name for state in raised]
 
     def names(self) -> tuple[AlarmName, ...]:
         """Return the names of all alarms."""
@@ -221,9 +225,9 @@ class AlarmEvaluator:
         return tuple(name for name, state in self._states.items() if state.raised is not None)
 
     @property
-    def unwatched(self) -> tuple[AlarmName, ...]:
+    def unwatched_critical(self) -> tuple[AlarmName, ...]:
         """Names of critical alarms that cannot be watched although their quantities were measured before."""
-        return tuple(name for name in self._unwatched if self._states[name].definition.severity == "critical")
+        return tuple(name for name in self._unwatched_reasons if self._states[name].definition.severity == "critical")
 
     def changes(self) -> list[Change]:
         """Return the changes since the last call, oldest first."""
@@ -241,7 +245,7 @@ class AlarmEvaluator:
             if state.raised is None and name in unreported
             else self._alarm(state)
             for name, state in self._states.items()
-            if state.has_value or state.raised is not None or name in self._unwatched or name in ALWAYS
+            if state.has_value or state.raised is not None or name in self._unwatched_reasons or name in ALWAYS
         )
 
     def restore(self, saved_state: str) -> None:
@@ -252,37 +256,37 @@ class AlarmEvaluator:
         """
         entries = json.loads(saved_state or "{}")
         self._inputs.restore(entries.pop(INPUTS, {}))
-        self._silence = str(entries.pop(SILENCE, ""))
-        self._unwatched = self._reasons_unwatched()
+        self._silence_reason = str(entries.pop(SILENCE, ""))
+        self._unwatched_reasons = self._find_unwatched_reasons()
         for name, saved in entries.items():
             state = self._states.get(name)
             if state is None or (saved["gone"] and not state.definition.latch):
                 continue
             since_s, value = float(saved["since_s"]), saved["value"]
-            iso_utc(since_s)
+            iso_utc(since_s)  # raises ValueError for a time that cannot be published
             if value is not None and not math.isfinite(value):
                 raise ValueError(f"{name}: value = {value}")
             raised = RaisedAlarm(since_s, None if value is None else float(value))
             state.restore(raised, cause_cleared=bool(saved["gone"]), acknowledged=bool(saved["acknowledged"]))
         self._save_state()
 
-    def _evaluate_samples(self, samples: SampleBlock, extremes_v: Floats, wall_s: float) -> None:
+    def _evaluate_samples(self, samples: SampleBlock, extremes_v: Floats, wall_offset_s: float) -> None:
         """Evaluate the alarms on measured values.
 
         Args:
             samples: Shape (n,), dtype SAMPLE.
             extremes_v: Minimum and maximum cell voltage [V] and number of cell voltages, shape (n, 3).
-            wall_s: Wall clock minus the samples' clock [s].
+            wall_offset_s: Wall clock minus the samples' clock [s].
         """
         times_s, lowest_v, highest_v = samples["time_s"], extremes_v[:, 0], extremes_v[:, 1]
         self._at_s = float(times_s[-1])
         passed_s, observed_s = self._sample_intervals.measure(times_s)
         voltage_v, temperature_c = samples["voltage_v"], samples["temperature_c"]
-        at_end = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
-        current_a = np.where(at_end, np.copysign(np.inf, samples["current_a"]), samples["current_a"])
+        is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
+        current_a = np.where(is_saturated, np.copysign(np.inf, samples["current_a"]), samples["current_a"])
         # the temperature while charging; infinite while not charging, NaN if a quantity is not measured
-        charged_c = np.where(current_a <= -self._charging_a, temperature_c, np.inf)
-        charged_c[np.isnan(current_a) | np.isnan(temperature_c)] = np.nan
+        charging_c = np.where(current_a <= -self._charging_a, temperature_c, np.inf)
+        charging_c[np.isnan(current_a) | np.isnan(temperature_c)] = np.nan
         values: dict[AlarmName, Floats] = {
             "pack_over_voltage": voltage_v,
             "pack_under_voltage": voltage_v,
@@ -293,83 +297,93 @@ class AlarmEvaluator:
             "charge_over_current": -current_a,
             "over_temperature": temperature_c,
             "under_temperature": temperature_c,
-            "charging_below_freezing": charged_c,
+            "charging_below_freezing": charging_c,
         }
         for name, series in values.items():
-            self._evaluate_values(name, times_s, observed_s, series, wall_s)
-        self._evaluate_values("link_lost", times_s, passed_s, np.where(observed_s < passed_s, passed_s, 0.0), wall_s)
-        counts = {name: counted(samples[column]) for name, column in _COLUMNS.items()}
+            self._evaluate_values(name, times_s, observed_s, series, wall_offset_s)
+        gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # values hold for less than the interval only in a gap
+        self._evaluate_values("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
+        counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
         cells = extremes_v[:, 2].astype(np.int64)
         for at_s in self._inputs.update(times_s, observed_s, counts | {"cells": cells}):
             self._update_unwatched(at_s)
             if self._is_blinded():
-                self._raise_sensor_fault(at_s, wall_s)
+                self._raise_sensor_fault(at_s, wall_offset_s)
 
     def _update_unwatched(self, at_s: float) -> None:
         """Update the alarms that cannot be watched at ``at_s`` on the samples' clock [s], and record the changes."""
-        before, self._unwatched = self._unwatched, self._reasons_unwatched()
-        for name in sorted(before.keys() ^ self._unwatched.keys()):
+        before, self._unwatched_reasons = self._unwatched_reasons, self._find_unwatched_reasons()
+        for name in sorted(before.keys() ^ self._unwatched_reasons.keys()):
             self._changes.append(Change(at_s, self._alarm(self._states[name]), "watched"))
 
-    def _reasons_unwatched(self) -> dict[AlarmName, str]:
+    def _find_unwatched_reasons(self) -> dict[AlarmName, str]:
         """Return the alarms that cannot be watched, each with its reason: silence, or the loss of a quantity."""
         lost = self._inputs.lost
-        found: dict[AlarmName, str] = {}
+        reasons: dict[AlarmName, str] = {}
         for name in self._states:
             needed = ALARM_KINDS[name].needs
             missing = [LOSS_TEXTS[each] for each in needed if each in lost]
             if missing:
-                found[name] = "; ".join(missing)
-            elif self._silence and needed and self._inputs.measured(needed):
-                found[name] = self._silence
-        return found
+                reasons[name] = "; ".join(missing)
+            elif self._silence_reason and needed and self._inputs.were_measured(needed):
+                reasons[name] = self._silence_reason
+        return reasons
 
     def _is_blinded(self) -> bool:
         """Return True if a quantity is lost that a critical alarm needs."""
         lost = set(self._inputs.lost)
-        return any(not lost.isdisjoint(ALARM_KINDS[name].needs) for name in self.unwatched)
+        return any(not lost.isdisjoint(ALARM_KINDS[name].needs) for name in self.unwatched_critical)
 
-    def _raise_sensor_fault(self, at_s: float, wall_s: float) -> None:
+    def _raise_sensor_fault(self, at_s: float, wall_offset_s: float) -> None:
         """Raise ``sensor_fault`` without its delay, because the quantity has been missing for ``lost_s`` already."""
         state = self._states.get("sensor_fault")
         if state is not None:
-            self._record(state, state.raise_at(at_s, RaisedAlarm(at_s + wall_s, None)))
+            self._record(state, state.raise_at(at_s, RaisedAlarm(at_s + wall_offset_s, None)))
 
-    def _evaluate_bad_fraction(self, at_s: float, counts: SampleCounts, suspects: InputFault, wall_s: float) -> None:
+    def _evaluate_bad_fraction(
+        self, at_s: float, counts: SampleCounts, suspects: InputFault, wall_offset_s: float
+    ) -> None:
         """Evaluate the fraction of samples that are lost or unusable."""
         if 0.0 <= at_s - self._counted_s < BAD_FRACTION_INTERVAL_S:
             return
         before, self._counts, self._counted_s = self._counts, counts, at_s
         _, observed_s = self._loss_intervals.measure(np.array([at_s]))
         good, bad = (counts.good - before.good, counts.bad - before.bad) if before else (0, 0)
-        share = bad / (good + bad) if good + bad > 0 else math.nan
+        bad_fraction = bad / (good + bad) if good + bad > 0 else math.nan
         if suspects & SENSOR_SUSPECTS or self._is_blinded():
-            share = math.inf
-        self._evaluate_values("sensor_fault", np.array([at_s]), observed_s, np.array([share]), wall_s)
+            bad_fraction = math.inf  # above every limit
+        self._evaluate_values("sensor_fault", np.array([at_s]), observed_s, np.array([bad_fraction]), wall_offset_s)
 
-    def _evaluate_estimates(self, trace: TraceBlock, suspects: InputFault, wall_s: float) -> None:
-        """Evaluate the alarms on estimates. Arguments are those of ``evaluate``; ``wall_s`` is wall minus samples' clock [s]."""
+    def _evaluate_estimates(self, trace: TraceBlock, suspects: InputFault, wall_offset_s: float) -> None:
+        """Evaluate the alarms on estimates.
+
+        Args:
+            trace: Shape (n,), dtype TRACE.
+            suspects: Input faults that the filter suspects now.
+            wall_offset_s: Wall clock minus the samples' clock [s].
+        """
         times_s = trace["time_s"]
         _, observed_s = self._trace_intervals.measure(times_s)
         soc, std = trace["soc"], trace["soc_std"]
-        lost = (trace["lock"] == 0) | self._mismatch_suspected
+        is_mismatch = (trace["lock"] == 0) | self._mismatch_suspected
         self._mismatch_suspected = bool(suspects & MODEL_SUSPECTS)
         # a new suspicion counts from the last sample on, because its start is unknown
-        lost[-1] |= self._mismatch_suspected
+        is_mismatch[-1] |= self._mismatch_suspected
         values: dict[AlarmName, Floats] = {
             "soc_low": soc - np.where(np.isnan(std), 0.0, std),
             "stability_margin_low": trace["stability_margin"],
-            "model_mismatch": np.where(lost, np.inf, np.abs(trace["innovation_v"])),
+            "model_mismatch": np.where(is_mismatch, np.inf, np.abs(trace["innovation_v"])),
         }
         for name, series in values.items():
-            self._evaluate_values(name, times_s, observed_s, series, wall_s)
+            self._evaluate_values(name, times_s, observed_s, series, wall_offset_s)
 
     def _evaluate_values(
-        self, name: AlarmName, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float
+        self, name: AlarmName, times_s: Floats, steps_s: Floats, values: Floats, wall_offset_s: float
     ) -> None:
+        """Evaluate one alarm, if it is defined. The arguments are those of ``AlarmState.update``."""
         state = self._states.get(name)
         if state is not None:
-            self._record(state, state.update(times_s, steps_s, values, wall_s))
+            self._record(state, state.update(times_s, steps_s, values, wall_offset_s))
 
     def _record(self, state: AlarmState, transitions: Iterable[AlarmTransition]) -> None:
         """Record transitions for ``changes``, and raised alarms for ``report``."""
@@ -378,8 +392,8 @@ class AlarmEvaluator:
             message = AlarmMessage(
                 transition.raised,
                 cause_cleared=False,
-                reasons=self._texts(name),
-                unwatched_reason=self._unwatched.get(name),
+                reasons=self._reason_texts(name),
+                unwatched_reason=self._unwatched_reasons.get(name),
             )
             if transition.raised is not None:
                 self._unreported[name] = message
@@ -392,6 +406,7 @@ class AlarmEvaluator:
         """
         state, before = self._states.get(name), self._reasons.get(name, _NO_REASONS)
         if state is not None and suspects != before.suspects and (suspects or state.raised is None):
+            # a suspicion is the text of its fault, after numbers if there are any
             texts = tuple(text for text in suspicions for suspect in suspects if text.endswith(suspect.text))
             self._reasons[name] = Reasons(suspects, texts)
 
@@ -401,22 +416,22 @@ class AlarmEvaluator:
         message = AlarmMessage(
             state.raised,
             cause_cleared=state.cause_cleared,
-            reasons=self._texts(name),
-            unwatched_reason=self._unwatched.get(name),
+            reasons=self._reason_texts(name),
+            unwatched_reason=self._unwatched_reasons.get(name),
         )
         latest = self._payloads.get(name)
         if latest is None or latest[0] != message:
             latest = self._payloads[name] = message, _alarm(state.definition, message)
         return latest[1]
 
-    def _texts(self, name: AlarmName) -> tuple[str, ...]:
+    def _reason_texts(self, name: AlarmName) -> tuple[str, ...]:
         """Return the known causes of an alarm, one sentence each."""
         lost = tuple(self._lost_text(each) for each in self._inputs.lost) if name == "sensor_fault" else ()
         return lost + self._reasons.get(name, _NO_REASONS).texts
 
     def _lost_text(self, quantity: Quantity) -> str:
         """Describe a lost quantity and the alarms that need it."""
-        names = ", ".join(name for name in self._unwatched if quantity in ALARM_KINDS[name].needs)
+        names = ", ".join(name for name in self._unwatched_reasons if quantity in ALARM_KINDS[name].needs)
         return f"{LOSS_TEXTS[quantity]}: {names} cannot be raised" if names else LOSS_TEXTS[quantity]
 
     def _save_state(self) -> None:
@@ -428,8 +443,8 @@ class AlarmEvaluator:
         }
         if inputs := self._inputs.saved_state:
             saved[INPUTS] = inputs
-        if self._silence:
-            saved[SILENCE] = self._silence
+        if self._silence_reason:
+            saved[SILENCE] = self._silence_reason
         self.saved_state = json.dumps(saved) if saved else ""
 
 

@@ -19,7 +19,7 @@ class ChargeEnergy(NamedTuple):
     energy_in_kwh: float = 0.0
 
     @classmethod
-    def of(cls, total: Totals) -> Self:
+    def from_totals(cls, total: Totals) -> Self:
         """Return charge and energy of ``total``."""
         return cls(*(getattr(total, name) for name in cls._fields))
 

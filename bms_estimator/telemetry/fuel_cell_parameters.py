@@ -42,11 +42,15 @@ def ln_covariance(estimator: Estimator) -> np.ndarray:
     n = int(q["count"])
     lower, leak = np.tril(m["information"][:n, :n]), q["leak_v2s"][:n]
     information = lower + np.tril(lower, -1).T + np.diag(leak)
+    # the leakage is inversely proportional to the squared bounds; this factor makes its std without data equal to the bounds
     return float(leak[0] * q["upper"][0] ** 2) * np.linalg.inv(information)
 
 
 def _exchange_current(a: np.ndarray, covariance: np.ndarray, now_s: float) -> Parameter:
-    """Return the exchange current e^(-a / A). The derivatives of its logarithm by ln a and ln A are -a / A and a / A."""
+    """Return the exchange current e^(-a / A), where a is the activation loss at 1 A and A is the Tafel slope.
+
+    The derivatives of its logarithm by ln a and ln A are -a / A and a / A.
+    """
     ln_i_0 = -float(a[1 + ACTIVATION] / a[1 + TAFEL])
     gradient = np.zeros(covariance.shape[0])
     gradient[ACTIVATION], gradient[TAFEL] = ln_i_0, -ln_i_0
@@ -54,6 +58,7 @@ def _exchange_current(a: np.ndarray, covariance: np.ndarray, now_s: float) -> Pa
 
 
 def _learned(value: float, ln_std: float, now_s: float) -> Parameter:
+    """Return the payload of a learned value; ``ln_std`` is the std of its logarithm."""
     valid = ln_std < VALID_STD
     return Parameter(
         value=finite(value),

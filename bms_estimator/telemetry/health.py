@@ -22,6 +22,7 @@ _SAMPLE_COUNTERS = [
     for name in OBSERVER_STATE.names or ()
     if name.startswith("dropped_") or name in ("samples", "gaps", "time_steps_back")
 ]
+"""Fields of OBSERVER_STATE that count samples."""
 
 
 def resident_mib() -> float | None:
@@ -44,7 +45,10 @@ def dropped_text(dropped: Mapping[str, int]) -> str:
 
 
 def identifier_counters(record: np.void) -> dict[str, int]:
-    """Return counters of the filter's rejected inputs and resets, from a record of ESTIMATOR_STATE."""
+    """Return counters of the filter's rejected inputs and resets, from a record of ESTIMATOR_STATE.
+
+    ``searched`` is the number of re-initializations of the SOC.
+    """
     counts = zip(COUNTERS.names or (), record["counters"].item(), strict=True)
     return dict(counts) | {"searched": int(record["filter"]["reopened"])}
 
@@ -162,12 +166,13 @@ def out_of_range_reason(block: SampleBlock, settings: np.void) -> str | None:
     text = (
         f"the last of them {volt:g} V, {ampere:g} A, where {low_v:g}..{high_v:g} V and up to {max_a:g} A are possible"
     )
-    for guess, v, a in (
+    # a mistake is suggested if the corrected values are in range
+    for question, corrected_v, corrected_a in (
         ("are the columns swapped?", abs(ampere), volt),
         ("are these millivolts?", 1e-3 * volt, ampere),
         ("are these milliamperes?", volt, 1e-3 * ampere),
         ("are these millivolts and milliamperes?", 1e-3 * volt, 1e-3 * ampere),
     ):
-        if low_v <= v <= high_v and abs(a) <= max_a:
-            return f"{text}: {guess}"
+        if low_v <= corrected_v <= high_v and abs(corrected_a) <= max_a:
+            return f"{text}: {question}"
     return text

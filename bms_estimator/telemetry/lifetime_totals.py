@@ -35,9 +35,9 @@ class LifetimeTotals:
     def __init__(self, estimator: Estimator, before: Totals) -> None:
         self._estimator, self._before = estimator, before
         self._gap_s = float(estimator.settings["gap_s"][0])
-        self._meter = ChargeEnergyMeter(ChargeEnergy.of(before), self._gap_s)
-        self._last_time_s, self._last_step_s, self._gaps = self._clock()
-        self._unseen_s = 0.0  # total time without samples in this run [s]
+        self._meter = ChargeEnergyMeter(ChargeEnergy.from_totals(before), self._gap_s)
+        self._last_time_s, self._last_step_s, self._gap_count = self._last_step()
+        self._gaps_s = 0.0  # total length of the gaps in this run [s]
         self.unseen_s: float | None = None
 
     @property
@@ -45,7 +45,7 @@ class LifetimeTotals:
         """Totals of all runs."""
         samples = Counter(self._before.samples)
         samples.update(sample_counters(self._estimator.state[0]))
-        changed = {"samples": dict(samples), "unseen_s": self._before.unseen_s + self._unseen_s}
+        changed = {"samples": dict(samples), "unseen_s": self._before.unseen_s + self._gaps_s}
         return self._before.model_copy(update=changed | self.flow._asdict())
 
     @property
@@ -60,15 +60,16 @@ class LifetimeTotals:
             trace: Shape (n,), dtype TRACE.
         """
         self._meter.add(trace)
-        time_s, step_s, gaps = self._clock()
-        if gaps != self._gaps or (trace.size and math.isinf(self._last_time_s)):
+        time_s, step_s, gaps = self._last_step()
+        # an infinite last time: the first sample after a restart
+        if gaps != self._gap_count or (trace.size and math.isinf(self._last_time_s)):
             restart_s = float(self._estimator.record["unseen_s"][0])
             lengths_s = gap_lengths(trace["time_s"], self._last_time_s, self._last_step_s, self._gap_s, restart_s)
-            self._unseen_s += sum(lengths_s)
+            self._gaps_s += sum(lengths_s)
             self.unseen_s = lengths_s[-1] if lengths_s else None
-        self._last_time_s, self._last_step_s, self._gaps = time_s, step_s, gaps
+        self._last_time_s, self._last_step_s, self._gap_count = time_s, step_s, gaps
 
-    def _clock(self) -> tuple[float, float, int]:
+    def _last_step(self) -> tuple[float, float, int]:
         """Return the estimator's last time stamp [s], its last step [s] and its number of gaps."""
         state = self._estimator.state[0]
         return float(state["time_s"]), float(state["step_s"]), int(state["gaps"])
@@ -91,7 +92,7 @@ def gap_lengths(
         new_clock = math.isinf(before_s)
         length_s = restart_s if new_clock else float(time_s) - before_s
         before_s = float(time_s)
-        if not 0.0 <= length_s < math.inf:
+        if not 0.0 <= length_s < math.inf:  # the clock was set back, or the length is unknown
             continue
         if new_clock or length_s > max(gap_s, GAP_RATIO * step_s):
             lengths_s.append(length_s)

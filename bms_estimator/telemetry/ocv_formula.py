@@ -12,7 +12,7 @@ POINTS = 101
 
 
 class OcvFormulaFit(NamedTuple):
-    """Fit of (2.10) to an OCV table.
+    """Fit of the polynomial and exponential (2.10) to an OCV table.
 
     Attributes:
         a: a16..a21.

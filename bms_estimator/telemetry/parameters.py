@@ -33,23 +33,24 @@ from bms_estimator.telemetry.state import finite
 
 OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
 """SOCs at which the OCV is published."""
-CONFIGURED = "configured value: no data has identified it"
-"""Reason of a configured value."""
-LEARNED = "learned by the adaptive law, which gives no std"
-"""Reason of a value of the learning law."""
+CONFIGURED_REASON = "configured value: no data has identified it"
+"""Reason why a configured value is not valid."""
+LEARNED_REASON = "learned by the adaptive law, which gives no std"
+"""Reason why a value of the learning law is not valid."""
 VALID_FIT_STD = 0.5
 """Maximum relative std of a valid a1..a15. Amplitudes and exponents can be separated only after a sweep of the SOC."""
 VALID_CAPACITY_STD = 0.02
 """Maximum std of a valid capacity, relative to the capacity of the cell file."""
 VALID_OFFSET_FRACTION = 0.5
 """Maximum std of a valid current offset, as a fraction of its std at the start."""
-_FUNCTIONS = {
+_ELEMENT_FUNCTIONS = {
     "r_s_ohm": chen_mora.r_s,  # (2.9)
     "r_ts_ohm": chen_mora.r_ts,  # (2.5)
     "c_ts_farad": chen_mora.c_ts,  # (2.7)
     "r_tl_ohm": chen_mora.r_tl,  # (2.6)
     "c_tl_farad": chen_mora.c_tl,  # (2.8)
 }
+"""Functions of SOC and a1..a15, by element."""
 
 
 def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterReport:
@@ -79,14 +80,14 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
     learning, record = bool(estimator.settings_record["learning"]["enabled"][0]), estimator.record[0]
     from_data = _is_data_driven(estimator)
     for i in range(1, 16):
-        held = parameters[f"a{i}"] = _mark_source(parameters[f"a{i}"], from_data[i], learning)
+        observer_value = parameters[f"a{i}"] = _mark_source(parameters[f"a{i}"], from_data[i], learning)
         if estimator.identifying and not learning:
-            parameters[f"a{i}"] = _with_fit_std(held, fitted_parameter(record, i), now_s)
-    for e, name in enumerate(ELEMENT_NAMES):
+            parameters[f"a{i}"] = _with_fit_std(observer_value, fitted_parameter(record, i), now_s)
+    for e, name in enumerate(ELEMENT_NAMES):  # each element has three parameters, from a1 on
         elements[name] = _mark_source(elements[name], from_data[3 * e + 1 : 3 * e + 4].any(), learning)
     if estimator.identifying:
-        for name, one in present_elements(record).items():
-            elements[name] = _identified(one, elements[name], VALID_STD, now_s)
+        for name, identified in present_elements(record).items():
+            elements[name] = _identified(identified, elements[name], VALID_STD, now_s)
         health = _state_of_health(estimator, now_s)
     if estimator.settings_record["series_resistance"][0]:
         fitted = series_resistance_parameters(estimator)
@@ -139,13 +140,13 @@ def _cell_file_ocv(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
 def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
     """Return the elements of (2.5)-(2.10) at the present SOC.
 
-    A capacitance that is not positive is null. C_ts is not positive below delta1, C_tl below delta2.
+    A capacitance that is not positive is null. C_ts is not positive up to the SOC delta1, C_tl up to delta2.
     """
     state, ocv = estimator.state[0], estimator.settings[0]
     soc = float(state["soc"])
     limits = {"c_ts_farad": "delta_1", "c_tl_farad": "delta_2"}
     elements = {}
-    for name, function in _FUNCTIONS.items():
+    for name, function in _ELEMENT_FUNCTIONS.items():
         value, limit = function(soc, a), limits.get(name, "")
         why_missing = f"SOC {soc:.4f} is not above {limit} = {state[limit]:.4f}" if limit else ""
         elements[name] = _configured(value if value > 0.0 else math.nan, why_missing)
@@ -160,16 +161,19 @@ def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]
     capacity, offset_a = relative_capacity(record), current_offset(record)
     first_std_a = float(p["offset_c"] * p["capacity_as"]) / 3600.0
     return {
-        "capacity": _bias(capacity, VALID_CAPACITY_STD, "identifier.capacity_std", now_s),
+        "capacity": _bias_parameter(capacity, VALID_CAPACITY_STD, "identifier.capacity_std", now_s),
         "r_s": _identified(ratio, _configured(1.0, ""), VALID_STD, now_s),
-        "current_offset_a": _bias(
+        "current_offset_a": _bias_parameter(
             offset_a, VALID_OFFSET_FRACTION * first_std_a, "identifier.current_offset_std_a", now_s
         ),
     }
 
 
-def _bias(learned: IdentifiedValue, limit: float, setting: str, now_s: float) -> Parameter:
-    """Return a bias of the sensor or of the capacity, valid if its std is below ``limit`` (in its unit)."""
+def _bias_parameter(learned: IdentifiedValue, limit: float, setting: str, now_s: float) -> Parameter:
+    """Return a bias of the sensor or of the capacity, valid if its std is below ``limit``.
+
+    ``setting`` is the key of its initial std in the settings.
+    """
     value, std = finite(learned.value), finite(learned.std)
     if std == 0.0:
         declared = f"{setting} is 0: the configured value counts as exact"
@@ -180,43 +184,49 @@ def _bias(learned: IdentifiedValue, limit: float, setting: str, now_s: float) ->
 
 
 def _is_data_driven(estimator: Estimator) -> np.ndarray:
-    """Return a mask of the parameters a1..a15 that data have changed, by the adaptive law or by the fit that (3.18) follows."""
+    """Return a mask of the parameters that data have changed, a1..a15 at index 1..15.
+
+    The learning law changes them itself. Otherwise the identifier sets its fit as the targets of (3.18).
+    """
     state, settings = estimator.state[0], estimator.settings_record[0]
     if settings["learning"]["enabled"]:
         return np.asarray(state["a"] != settings["learning"]["file"])
     return np.asarray(state["target"] != settings["observer"]["target"])
 
 
-def _mark_source(held: Parameter, from_data: np.bool_, learning: bool) -> Parameter:
+def _mark_source(observer_value: Parameter, from_data: np.bool_, learning: bool) -> Parameter:
     """Return a parameter of the observer, marked as identified if data have changed it."""
     if not from_data:
-        return held
-    return held.model_copy(update={"source": "identified"} | ({"reason": LEARNED} if learning else {}))
+        return observer_value
+    return observer_value.model_copy(update={"source": "identified"} | ({"reason": LEARNED_REASON} if learning else {}))
 
 
-def _with_fit_std(held: Parameter, fit: IdentifiedValue | None, now_s: float) -> Parameter:
+def _with_fit_std(observer_value: Parameter, fit: IdentifiedValue | None, now_s: float) -> Parameter:
     """Return the observer's value of a parameter with the std of the fit."""
-    if fit is None or held.source == "configured":
-        return held
-    fitted = _identified(fit, held, VALID_FIT_STD, now_s)
-    return fitted.model_copy(update={"value": held.value}) if fitted.valid else fitted
+    if fit is None or observer_value.source == "configured":
+        return observer_value
+    fitted = _identified(fit, observer_value, VALID_FIT_STD, now_s)
+    return fitted.model_copy(update={"value": observer_value.value}) if fitted.valid else fitted
 
 
-def _identified(learned: IdentifiedValue, held: Parameter, limit: float, now_s: float) -> Parameter:
-    """Return the learned value if its std is small enough, otherwise the observer's value with the progress of learning."""
+def _identified(learned: IdentifiedValue, observer_value: Parameter, limit: float, now_s: float) -> Parameter:
+    """Return the learned value if its relative std is below ``limit``.
+
+    Otherwise return the observer's value, with the progress of learning as its reason.
+    """
     if math.isinf(learned.age_s):
-        return held
+        return observer_value
     if learned.relative_std < limit:
         updated = iso_utc(max(now_s - learned.age_s, 0.0))
         return Parameter(
             value=finite(learned.value), std=finite(learned.std), valid=True, source="identified", updated=updated
         )
-    if held.value is None:
-        return held
+    if observer_value.value is None:
+        return observer_value
     reason = f"identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
     # std of the observer's value as an estimate of the true one: std and distance of the learned value
-    std = math.hypot(learned.std, learned.value - held.value)
-    return held.model_copy(update={"std": finite(std), "reason": reason})
+    std = math.hypot(learned.std, learned.value - observer_value.value)
+    return observer_value.model_copy(update={"std": finite(std), "reason": reason})
 
 
 def _configured(value: float, why_missing: str) -> Parameter:
@@ -227,5 +237,5 @@ def _configured(value: float, why_missing: str) -> Parameter:
         std=None,
         valid=False,
         source="configured",
-        reason=why_missing if number is None else CONFIGURED,
+        reason=why_missing if number is None else CONFIGURED_REASON,
     )

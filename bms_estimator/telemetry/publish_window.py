@@ -77,6 +77,7 @@ class Window:
             return None
         n, first_s, voltage, current, power, temperatures, temperature = self._sums[0].item()
         last_s = float(self._last["time_s"])
+        # the window begins at the last sample of the previous window, or at its own first sample
         steps, begin_s = (n, self.previous_end_s) if math.isfinite(self.previous_end_s) else (n - 1, first_s)
         span_s = last_s - begin_s
         summary = WindowSummary(

@@ -50,13 +50,13 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
     charge_ah = soc * capacity_ah
     usable_ah = max(soc - max(state["delta_1"], state["delta_2"]), 0.0) * capacity_ah
     open_circuit_wh = _mean_ocv(settings["ocv_v"], soc) * charge_ah
-    lost_wh = load_a * _resistance(estimator, soc) * charge_ah
-    to_empty_s = _time(charge_ah, load_a, capacity_ah)
-    to_full_s = _time(capacity_ah - charge_ah, -current_a, capacity_ah)
+    lost_wh = load_a * _total_resistance(estimator, soc) * charge_ah
+    to_empty_s = _duration_s(charge_ah, load_a, capacity_ah)
+    to_full_s = _duration_s(capacity_ah - charge_ah, -current_a, capacity_ah)
     return RemainingCharge(charge_ah, usable_ah, max(open_circuit_wh - lost_wh, 0.0), to_empty_s, to_full_s)
 
 
-def _time(charge_ah: float, current_a: float, capacity_ah: float) -> float:
+def _duration_s(charge_ah: float, current_a: float, capacity_ah: float) -> float:
     """Return the time in which the current moves ``charge_ah`` [s]; NaN if the current is negligible for ``capacity_ah``."""
     return 3600.0 * charge_ah / current_a if current_a * MAX_TIME_H > capacity_ah else math.nan
 
@@ -67,7 +67,7 @@ def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:
     return float((below.sum() - 0.5 * (below[0] + below[-1])) / (below.size - 1))
 
 
-def _resistance(estimator: Estimator, soc: float) -> float:
+def _total_resistance(estimator: Estimator, soc: float) -> float:
     """Return the total DC resistance, with all RC pairs in steady state [ohm]."""
     if estimator.identifying:
         return present_resistance(estimator.record[0])

@@ -1,4 +1,4 @@
-"""Published parameters of R_s by (4.2), step 3 of the thesis."""
+"""Published parameters of R_s by the least squares of (4.2), step 3 of the thesis."""
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.observer.series_resistance import MIN_CURRENT_C
@@ -6,8 +6,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Parameter
 from bms_estimator.telemetry.state import finite
 
-ORIGIN = "by (4.2), step 3 of the thesis; includes errors of the OCV and of a1..a12, which std does not cover"
-"""Reason of the published parameters."""
+REASON = "by (4.2), step 3 of the thesis; includes errors of the OCV and of a1..a12, which std does not cover"
+"""Reason why the published parameters are not valid."""
 
 
 def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
@@ -37,4 +37,4 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
 
 def _parameter(value: float, std: float | None) -> Parameter:
     finite_std = None if std is None else finite(std)
-    return Parameter(value=finite(value), std=finite_std, valid=False, source="identified", reason=ORIGIN)
+    return Parameter(value=finite(value), std=finite_std, valid=False, source="identified", reason=REASON)

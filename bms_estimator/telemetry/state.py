@@ -48,7 +48,7 @@ def make_state_payload(
         flow: Charge and energy at the terminals.
         capacity_ah: Rated capacity of the pack [Ah]; None for a fuel cell.
     """
-    # plain numbers, because access to a field of a numpy record takes as long as a sum
+    # a tuple of plain numbers, because reading the fields of a numpy record one by one is slow
     values = zip(TRACE.names or (), window.last.item(), strict=True)
     last = {name: value if math.isfinite(value) else None for name, value in values}
     soc = last["soc"]
@@ -70,6 +70,7 @@ def make_state_payload(
         time_to_full_s=finite(remaining.time_to_full_s),
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
+        # the learning law does not change delta1 and delta2, and only this law has an adaptation gain
         delta_configured=last["adaptation_gain_hz"] is not None and last["delta_1"] is not None,
         adaptive_gain_k=last["k"],
         converged=bool(last["converged"]),
@@ -96,27 +97,27 @@ def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def make_info_payload(
-    settings: Settings, cell: PackModel, board: Mapping[str, str], started_s: float, *, temperature_sensor: bool
+    settings: Settings, pack: PackModel, board: Mapping[str, str], started_s: float, *, temperature_sensor: bool
 ) -> Info:
     """Return the payload of topic ``info``.
 
     Args:
         settings: The pack's settings.
-        cell: The pack as one object.
+        pack: The pack as one object.
         board: Properties that the board reported.
         started_s: Wall clock at start [s since 1970].
         temperature_sensor: True if the cell temperature is measured.
     """
-    learns = settings.observer.law == "learning" or not isinstance(cell, CellModel)
+    learns = settings.observer.law == "learning" or not isinstance(pack, CellModel)  # a fuel cell always learns
     return Info(
         device=settings.pack.name,
         version=__version__,
         payload_version=PAYLOAD_VERSION,
         started=iso_utc(started_s),
-        cell=cell.cell.name,
-        capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
-        series_count=cell.cell.series_count,
-        nominal_voltage_v=cell.cell.nominal_voltage_v,
+        cell=pack.cell.name,
+        capacity_ah=pack.cell.capacity_ah if isinstance(pack, CellModel) else None,
+        series_count=pack.cell.series_count,
+        nominal_voltage_v=pack.cell.nominal_voltage_v,
         observer="learning" if learns else f"{settings.observer.law}, {settings.observer.nussbaum}",
         temperature_sensor=temperature_sensor,
         publish_rate_hz=settings.publish.rate_hz,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator import Estimator
-from bms_estimator.estimator.filter_settings import BEYOND_BRANCHES, BRANCHES_STD, SOC_GRID, ladder_of_branches
+from bms_estimator.estimator.filter_settings import BRANCHES_STD, SLOW_DIFFUSION, SOC_GRID, ladder_of_branches
 from bms_estimator.estimator.identified_parameters import present_elements
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, RESISTANCES, STRONG_J, WEAK_J, arrhenius
@@ -25,7 +25,7 @@ def test_a_file_without_a_ladder_gets_one_equivalent_to_its_rc_pairs() -> None:
     assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=1e-3)
     pairs_ohm = elements["r_ts_ohm"].value + elements["r_tl_ohm"].value
     # The tolerance covers the load that the filter assumes before the first sample.
-    assert pairs_ohm == pytest.approx((1.0 + BEYOND_BRANCHES) * (r_ts + r_tl), rel=0.05)
+    assert pairs_ohm == pytest.approx((1.0 + SLOW_DIFFUSION) * (r_ts + r_tl), rel=0.05)
     assert elements["r_ts_ohm"].value == pytest.approx(r_ts, rel=0.15)
     assert elements["c_ts_farad"].value == pytest.approx(chen_mora.c_ts(soc, a), rel=0.15)
     assert estimator.settings_record["filter"]["r_std"][0] == BRANCHES_STD
@@ -38,7 +38,7 @@ def test_a_ladder_of_two_rc_pairs_has_their_resistances_over_soc() -> None:
     for soc, row in zip(SOC_GRID, ohm, strict=True):
         branches = chen_mora.r_ts(soc, a) + chen_mora.r_tl(soc, a)
         assert row[0] == pytest.approx(chen_mora.r_s(soc, a))
-        assert row[1:].sum() == pytest.approx((1.0 + BEYOND_BRANCHES) * branches)
+        assert row[1:].sum() == pytest.approx((1.0 + SLOW_DIFFUSION) * branches)
 
 
 def test_resistances_of_two_rc_pairs_grow_in_the_cold_as_in_measured_cells() -> None:

@@ -74,10 +74,10 @@ async def test_charge_and_energy_survive_restarts(tmp_path: Path) -> None:
     async with run_with_frequent_saves(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(4.0))) as (source, sink, _):
         source.give(hour[0])
         estimate = (await sink.until(lambda s: s.estimate is not None)).estimate
-    assert ChargeEnergy.of(discharged.health.total) == pytest.approx((2.0, 0.0, 7.6e-3, 0.0))
-    assert ChargeEnergy.of(charged.health.total) == pytest.approx((2.0, 1.0, 7.6e-3, 3.8e-3))
+    assert ChargeEnergy.from_totals(discharged.health.total) == pytest.approx((2.0, 0.0, 7.6e-3, 0.0))
+    assert ChargeEnergy.from_totals(charged.health.total) == pytest.approx((2.0, 1.0, 7.6e-3, 3.8e-3))
     assert estimate
-    assert ChargeEnergy(*(getattr(estimate, name) for name in ChargeEnergy._fields)) == ChargeEnergy.of(
+    assert ChargeEnergy(*(getattr(estimate, name) for name in ChargeEnergy._fields)) == ChargeEnergy.from_totals(
         charged.health.total
     )
     assert estimate.equivalent_cycles == pytest.approx(2.0 / CELL.cell.capacity_ah)

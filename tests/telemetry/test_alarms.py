@@ -245,7 +245,11 @@ async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_pat
 def make_evaluator(alarms: dict[str, Any] | None = None) -> AlarmEvaluator:
     """Return an evaluator for ``PACK`` with these settings of the alarms."""
     return AlarmEvaluator(
-        watched(settings(alarms), PACK), charging_a=0.2, gap_s=5.0, inputs=Inputs(lost_s=10.0, series=2), silent_s=10.0
+        watched(settings(alarms), PACK),
+        charging_a=0.2,
+        gap_s=5.0,
+        inputs=Inputs(lost_s=10.0, series=2),
+        silence_limit_s=10.0,
     )
 
 
@@ -401,13 +405,13 @@ def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_a_sample_ar
     before.on_silence(10.0, WALL_S, "no cable")
     after.restore(before.saved_state)
     after.on_silence(0.0, WALL_S, "")
-    assert "pack_over_voltage" in after.unwatched, "no sample has come since the restart"
+    assert "pack_over_voltage" in after.unwatched_critical, "no sample has come since the restart"
     after.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
     after.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     after.on_silence(0.0, WALL_S, "")
     changed = {change.alarm.name: change for change in after.changes()}
     assert (changed["pack_over_voltage"].field, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
-    assert after.unwatched == ()
+    assert after.unwatched_critical == ()
     assert "silence" not in json.loads(after.saved_state)
 
 

@@ -13,7 +13,7 @@ from bms_estimator.edge.block import Block
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.estimator.identified_parameters import current_offset, relative_capacity, relative_series_resistance
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
-from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, OF_HOUR, accumulate_hour
+from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, HOURLY_FIELDS, accumulate_hour
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
@@ -45,7 +45,7 @@ def begin(sums: Sums, record: np.void) -> None:
         sums: Updated in position.
         record: The pack's record of dtype ``ESTIMATOR_STATE``.
     """
-    for name in OF_HOUR:
+    for name in HOURLY_FIELDS:
         sums[name] = 0
     sums["outliers_before"], sums["searches_before"] = record["counters"]["gated"], record["filter"]["reopened"]
 

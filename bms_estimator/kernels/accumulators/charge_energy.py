@@ -28,7 +28,7 @@ def accumulate_charge_energy(sums: Records, trace: Records, gap_s: float) -> Non
     Args:
         sums: Shape (1,), dtype FLOW_SUMS; updated in place.
         trace: Shape (n,), dtype TRACE.
-        gap_s: Minimum duration of a gap, unless the previous step was about as long [s]. ``kernels.step.is_gap`` has an equal condition.
+        gap_s: Minimum duration of a gap, unless the previous step was about as long [s]; as in ``kernels.step.is_gap``.
     """
     s = sums[0]
     for j in range(trace.shape[0]):

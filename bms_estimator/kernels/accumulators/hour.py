@@ -18,7 +18,7 @@ HOUR_SUMS = np.dtype(
         ("rest_s", "f8"),  # time with almost no current [s]
         ("outliers_before", "i8"),  # outlier counter of the estimator at the start of the hour
         ("searches_before", "i8"),  # counter of SOC re-initializations at the start of the hour
-        ("samples", "i8"),  # accepted samples; this field and all later ones restart with each hour (OF_HOUR)
+        ("samples", "i8"),  # accepted samples; this field and all later ones restart with each hour (HOURLY_FIELDS)
         ("dropped", "i8"),  # rejected samples
         ("gaps", "i8"),  # steps over which charge and energy are not counted
         ("lost_blocks", "i8"),  # blocks that were never received
@@ -44,7 +44,7 @@ HOUR_SUMS = np.dtype(
     align=True,
 )
 """Running sums of an hour. All fields are 0 before the first sample."""
-OF_HOUR = tuple(HOUR_SUMS.names or ())[(HOUR_SUMS.names or ()).index("samples") :]
+HOURLY_FIELDS = tuple(HOUR_SUMS.names or ())[(HOUR_SUMS.names or ()).index("samples") :]
 """Fields that restart with each hour."""
 
 

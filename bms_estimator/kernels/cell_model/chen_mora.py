@@ -23,6 +23,8 @@ OCV_POINTS = 401
 """Number of nodes of the OCV grid, evenly spaced over SOC 0..1."""
 INVERSE_ERROR_V = 1e-10
 """Tolerance of the voltage when the OCV is inverted [V]."""
+MAX_ITERATIONS = 50
+"""Maximum number of iterations when the OCV is inverted."""
 
 
 @njit(cache=True)
@@ -39,13 +41,13 @@ def r_tl(soc: float, a: Floats) -> float:
 
 @njit(cache=True)
 def c_ts(soc: float, a: Floats) -> float:
-    """Return the short-term capacitance C_ts(SOC) [F], (2.7); negative below delta1."""
+    """Return the short-term capacitance C_ts(SOC) [F], (2.7); negative below delta1 (``delta``)."""
     return -a[7] * math.exp(-a[8] * soc) + a[9]  # (2.7)
 
 
 @njit(cache=True)
 def c_tl(soc: float, a: Floats) -> float:
-    """Return the long-term capacitance C_tl(SOC) [F], (2.8); negative below delta2."""
+    """Return the long-term capacitance C_tl(SOC) [F], (2.8); negative below delta2 (``delta``)."""
     return -a[10] * math.exp(-a[11] * soc) + a[12]  # (2.8)
 
 
@@ -108,7 +110,7 @@ def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
     error_low, error_high = ocv_v[below] - voltage_v, ocv_v[above] - voltage_v
     side = 0
     soc = low
-    for _ in range(50):
+    for _ in range(MAX_ITERATIONS):
         soc = (low * error_high - high * error_low) / (error_high - error_low)
         error = ocv(soc, ocv_v, ocv_slope_v) - voltage_v
         if abs(error) < INVERSE_ERROR_V:
@@ -146,13 +148,13 @@ def cell_step(x: State, current_a: float, dt_s: float, capacity_as: float, a: Fl
     """
     soc, v_ts, v_tl = x
     drop = current_a * dt_s / capacity_as
-    middle = soc - 0.5 * drop
-    ohm_ts = r_ts(middle, a)
-    ohm_tl = r_tl(middle, a)
+    mid_soc = soc - 0.5 * drop
+    ohm_ts = r_ts(mid_soc, a)
+    ohm_tl = r_tl(mid_soc, a)
     return (
         soc - drop,  # (2.1)
-        rc_step(v_ts, current_a, ohm_ts, ohm_ts * c_ts(middle, a), dt_s),  # (2.2)
-        rc_step(v_tl, current_a, ohm_tl, ohm_tl * c_tl(middle, a), dt_s),  # (2.3)
+        rc_step(v_ts, current_a, ohm_ts, ohm_ts * c_ts(mid_soc, a), dt_s),  # (2.2)
+        rc_step(v_tl, current_a, ohm_tl, ohm_tl * c_tl(mid_soc, a), dt_s),  # (2.3)
     )
 
 

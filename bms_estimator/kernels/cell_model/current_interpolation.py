@@ -3,21 +3,15 @@
 from bms_estimator.numba_cache import njit
 
 SLOW_S = 2.0
-"""Interval between samples above which the current counts as a ramp, and its charge as uncertain [s].
-
-The current may deviate from a straight line between the samples.
-"""
-
+"""Interval between samples above which the current counts as a ramp, and its charge as uncertain [s]. The current may
+deviate from a straight line between the samples."""
 GAP_RATIO = 3.0
 """Minimum ratio of a gap to the previous step, so that slow sampling does not count as gaps."""
-
 UNMEASURED_S = 60.0
-"""Maximum step over which the current counts as measured [s].
-
-A source whose period exceeds ``UNMEASURED_S`` / ``PERIODS`` has a maximum of ``PERIODS`` periods.
-"""
+"""Maximum step over which the current counts as measured [s]. For a slow source the maximum is ``PERIODS`` of its periods,
+if these are longer."""
 PERIODS = 2.5
-"""Maximum regular step in sample periods, because a regular source may be late or lose a sample."""
+"""Maximum regular step in multiples of the sample period, because a regular source may be late or lose a sample."""
 MAX_FLOW_S = 3600.0
 """Maximum time over which a current is integrated without a sample [s], so that one wrong time stamp cannot empty a
 cell."""
@@ -45,7 +39,7 @@ def ramp_correction(change_a: float, taus: float, decay: float) -> float:
 
     Args:
         change_a: Change of the current between the samples [A].
-        taus: Time between the samples, in time constants of the RC pair.
+        taus: Time between the samples in multiples of the RC pair's time constant.
         decay: e^-taus.
     """
     return change_a * (0.5 * (1.0 + decay) - (1.0 - decay) / taus)

@@ -102,15 +102,15 @@ def steady_overpotential(theta: Floats, given: Floats, current_a: float, slope: 
     internal_a = given[INTERNAL] * math.exp(theta[INTERNAL])
     reaction_a = reaction_current(current_a, internal_a)
     remainder = 1.0 - reaction_a / limit_a
-    limited = remainder < MIN_REMAINDER
+    is_limited = remainder < MIN_REMAINDER
     remainder = max(remainder, MIN_REMAINDER)
-    gain = 0.0 if limited else b_v * reaction_a / (limit_a * remainder)  # d v_inf / d ln I of the last term
+    last_slope = 0.0 if is_limited else b_v * reaction_a / (limit_a * remainder)  # d / d ln I of the last term of v_inf
     slope[:] = 0.0
     slope[TAFEL] = tafel_v * math.log(reaction_a)
     slope[ACTIVATION] = activation_v
     slope[B] = -b_v * math.log(remainder)
-    slope[LIMIT] = -gain
-    slope[INTERNAL] = (tafel_v + gain) * internal_a / reaction_a
+    slope[LIMIT] = -last_slope
+    slope[INTERNAL] = (tafel_v + last_slope) * internal_a / reaction_a
     return activation_v + slope[TAFEL] + slope[B]
 
 
@@ -131,14 +131,14 @@ def advance(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: floa
     tafel_v, farad = given[TAFEL] * math.exp(theta[TAFEL]), given[C_DL] * math.exp(theta[C_DL])
     internal_a = given[INTERNAL] * math.exp(theta[INTERNAL])
     reaction_a = reaction_current(current_a, internal_a)
-    steps = dt_s * reaction_a / (tafel_v * farad)  # in time constants A C / I
-    decay = math.exp(-steps)
+    taus = dt_s * reaction_a / (tafel_v * farad)  # step in multiples of the time constant A C / I
+    decay = math.exp(-taus)
     z = (v_inf - x[0]) / tafel_v
     lag = math.expm1(z) * decay
     log_lag = math.log1p(lag)
     by_start = math.exp(z) * decay / (1.0 + lag)  # d v / d v at the start of the step
     by_end = 1.0 - by_start  # d v / d v_inf
-    by_ln_tau = tafel_v * steps * lag / (1.0 + lag)  # -d v / d ln of the time constant
+    by_ln_tau = tafel_v * taus * lag / (1.0 + lag)  # -d v / d ln of the time constant
     for j in range(len(NAMES)):
         dx[0, j] = by_start * dx[0, j] + by_end * slope[j]
     dx[0, TAFEL] += tafel_v * (by_start * z - log_lag) - by_ln_tau

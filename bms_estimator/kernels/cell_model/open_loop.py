@@ -22,7 +22,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 MIN_CAPACITANCE = 1e-3
-"""Lower limit of C_ts and C_tl, as fractions of a9 and a12. (2.7) and (2.8) are negative below delta1 and delta2."""
+"""Lower limit of C_ts and C_tl, as fractions of their offsets a9 and a12, because (2.7) and (2.8) are negative near empty."""
 
 
 @njit(cache=True)
@@ -63,12 +63,12 @@ def hysteresis(time_s: Floats, soc: Floats, length: float, first: float) -> Floa
         h, shape (n,).
     """
     h = np.full(soc.size, first)
-    lagging = soc[0]
+    filtered_soc = soc[0]
     for j in range(1, soc.size):
-        moved = (1.0 - math.exp(-(time_s[j] - time_s[j - 1]) / TAUS[TREND])) * (soc[j] - lagging)
-        lagging += moved
-        decay = math.exp(-abs(moved) / length)
-        h[j] = decay * h[j - 1] + math.copysign(1.0 - decay, moved)
+        change = (1.0 - math.exp(-(time_s[j] - time_s[j - 1]) / TAUS[TREND])) * (soc[j] - filtered_soc)
+        filtered_soc += change
+        decay = math.exp(-abs(change) / length)
+        h[j] = decay * h[j - 1] + math.copysign(1.0 - decay, change)
     return h
 
 
@@ -91,10 +91,10 @@ def two_branches(time_s: Floats, current_a: Floats, soc: Floats, a: Floats) -> F
     v_ts = v_tl = 0.0
     for j in range(time_s.size):
         if j > 0:
-            dt_s, held_a, middle = time_s[j] - time_s[j - 1], current_a[j - 1], max(0.5 * (soc[j - 1] + soc[j]), 0.0)
-            ohm_ts, ohm_tl = r_ts(middle, a), r_tl(middle, a)
-            farad_ts = max(c_ts(middle, a), MIN_CAPACITANCE * a[9])
-            farad_tl = max(c_tl(middle, a), MIN_CAPACITANCE * a[12])
+            dt_s, held_a, mid_soc = time_s[j] - time_s[j - 1], current_a[j - 1], max(0.5 * (soc[j - 1] + soc[j]), 0.0)
+            ohm_ts, ohm_tl = r_ts(mid_soc, a), r_tl(mid_soc, a)
+            farad_ts = max(c_ts(mid_soc, a), MIN_CAPACITANCE * a[9])
+            farad_tl = max(c_tl(mid_soc, a), MIN_CAPACITANCE * a[12])
             v_ts = rc_step(v_ts, held_a, ohm_ts, ohm_ts * farad_ts, dt_s)
             v_tl = rc_step(v_tl, held_a, ohm_tl, ohm_tl * farad_tl, dt_s)
         drop_v[j] = v_ts + v_tl + current_a[j] * r_s(max(soc[j], 0.0), a)

@@ -40,7 +40,7 @@ def update_offset_at_rest(s: Record, p: Record) -> None:
     """
     w, one_c = s.window, p.capacity_as / 3600.0
     moved_as2 = w.charge_as * w.charge_as + w.between_as2 + w.unknown_as * w.unknown_as
-    if not moved_as2 <= (REST_C * one_c * w.time_s) ** 2:
+    if not moved_as2 <= (REST_C * one_c * w.time_s) ** 2:  # also for NaN
         s.rest_s = s.rest_as = 0.0
         return
     s.rest_s += w.time_s
@@ -49,6 +49,7 @@ def update_offset_at_rest(s: Record, p: Record) -> None:
         return
     half_a = 0.5 * s.rest_as / s.rest_s
     s.rest_s = s.rest_as = 0.0
+    # before the first nonzero current, the dead band and the resolution are unknown
     if s.smallest_a == 0.0 or abs(half_a) > 0.5 * ZERO_C * one_c:
         return
     hidden_a = max(s.smallest_a, p.current_step_a, p.dead_band_a)

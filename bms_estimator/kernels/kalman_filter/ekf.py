@@ -28,19 +28,19 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 MIN_REACH = 0.02
-"""Minimum of half the SOC width of the secant that gives the OCV's slope. The half width is one std of the SOC."""
+"""Minimum half width of the secant that gives the OCV's slope [SOC]. The half width is one std of the SOC within limits."""
 MAX_REACH = 0.3
-"""Maximum of half the SOC width of the secant that gives the OCV's slope."""
+"""Maximum half width of the secant that gives the OCV's slope [SOC]."""
 MIN_SLOPE_V = 0.02
 """Minimum slope of the OCV of one cell [V per unit SOC]. With a smaller slope the filter diverges on a plateau."""
 HUBER = 2.0
-"""Maximum innovation in std of S (Huber). S is increased for a larger innovation."""
+"""Maximum innovation in multiples of the square root of S (Huber). S is increased for a larger innovation."""
 MINUTE_S = 60.0
 """Averaging time of the mean innovation that shows a persistent error within minutes [s]."""
 TEN_MINUTES_S = 600.0
 """Averaging time of the mean innovation that shows a persistent error within tens of minutes [s]."""
 INFLATION_AVERAGING = 5.0, 3.0
-"""Averaging times of two inflations: of the fast one in multiples of ``MINUTE_S``, of the slow one in multiples of
+"""Averaging time of ``fast_inflation`` in multiples of ``MINUTE_S``, and of ``slow_inflation`` in multiples of
 ``TEN_MINUTES_S``."""
 CONVERGED_SOC = 0.01
 """Change of the SOC below which the relinearization about the posterior has converged."""
@@ -61,8 +61,8 @@ HOLD_NOTHING, HOLD_CAPACITY, HOLD_CELL, HOLD_CELL_AND_CURVE = range(4)
 """Sets of states that an update does not change. ``HOLD_NOTHING`` is empty, and ``HOLD_CAPACITY`` contains LN_Q.
 ``HOLD_CELL`` contains LN_Q, OFFSET and the OCV nodes. ``HOLD_CELL_AND_CURVE`` also contains CURVE."""
 INDEPENDENT_R_STD = 0.5
-"""Maximum std of LN_R0 and LN_R that is independent between both. A larger std is common to both, as the unknown size of
-the cell. Only cell files of cells that were not measured have a larger std."""
+"""Maximum std of the independent parts of LN_R0 and LN_R. The rest of a larger std is common to both, because it is due to
+the unknown size of the cell. Only cell files of cells that were not measured have a larger std."""
 NEARLY_FULL_C = 0.02
 """Maximum current above ``NEARLY_FULL_SOC`` at which LN_Q is updated although the resistances are uncertain, as a
 C-rate. Larger overpotentials cannot be distinguished from a change of capacity."""
@@ -157,7 +157,7 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
     Args:
         s: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
-        q: Hypothesis.
+        q: Index of the hypothesis.
         variance_v2: R [V^2].
 
     Returns:
@@ -194,13 +194,13 @@ def compute_innovation(
     for j in range(STATES):
         ph[j] = 0.0
     for k in range(STATES):
-        if h[k] != 0.0:  # two nodes only
+        if h[k] != 0.0:  # it is 0 for all OCV nodes but two
             for j in range(STATES):
                 ph[j] += cov[k, j] * h[k]
     for j in range(STATES):
         linear_v2 += h[j] * ph[j]
-    least_v2 = (innovation_v / HUBER) ** 2
-    return innovation_v, max(linear_v2 + nonlinear_v * nonlinear_v, least_v2), max(linear_v2, least_v2)
+    min_v2 = (innovation_v / HUBER) ** 2
+    return innovation_v, max(linear_v2 + nonlinear_v * nonlinear_v, min_v2), max(linear_v2, min_v2)
 
 
 @njit(cache=True)
@@ -220,7 +220,7 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
 
         v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast
 
-    H excludes the
+    M h is the hysteresis, and c e the varying error of the OCV (CURVE). s0 is LN_R0, and s is LN_R. H excludes the
     derivatives of the resistances and of the learned OCV by SOC, because errors of these would change the SOC.
     """
     x, h, ohm, w = s.mean[q], s.h, s.ohm, s.window
@@ -235,12 +235,12 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
     for j in range(STATES):
         h[j] = 0.0
     h[SOC] = max(0.5 * (above - below) / reach, MIN_SLOPE_V * p.series)
-    first, others = math.exp(x[LN_R0]), math.exp(x[LN_R])
-    h[LN_R0] = -first * ohm[0] * (w.sum_a / w.samples - x[OFFSET])
+    r_0_factor, r_k_factor = math.exp(x[LN_R0]), math.exp(x[LN_R])
+    h[LN_R0] = -r_0_factor * ohm[0] * (w.sum_a / w.samples - x[OFFSET])
     for k in range(BRANCHES):
-        h[X + k] = -others * ohm[1 + k]
+        h[X + k] = -r_k_factor * ohm[1 + k]
         h[LN_R] += h[X + k] * (w.sum_x_a[k] / w.samples + x[X + k])
-    h[OFFSET] = first * ohm[0]
+    h[OFFSET] = r_0_factor * ohm[0]
     h[B_SLOW] = h[B_FAST] = 1.0
     h[HYST] = s.hysteresis * on_grid(soc, p.hysteresis_v)
     h[CURVE] = math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v)
@@ -318,7 +318,7 @@ def adapt_bias_inflation(s: Record, q: int, dt_s: float, u: float) -> None:
 
     Args:
         s: Record of EKF_STATE.
-        q: Hypothesis.
+        q: Index of the hypothesis.
         dt_s: Step [s].
         u: Innovation over its std.
     """

@@ -37,6 +37,10 @@ REFINEMENTS = 12
 """Number of golden section steps around the best point of the search."""
 ALTERNATIONS = 12
 """Number of iterations that fit amplitude and offset alternately within their bounds."""
+MIN_RATIO = 1e-3
+"""Minimum of a fitted amplitude or offset, as a fraction of the mean of the data, because both must be positive."""
+MIN_PRIOR_FRACTION = 0.05
+"""Minimum of the configured function as a fraction of its offset, because a capacitance may be negative near empty."""
 
 ELEMENT_MAP = np.dtype(
     [
@@ -96,7 +100,7 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
 
     Args:
         m: Record of ELEMENT_MAP.
-        e: Row of the map, 0..4.
+        e: Row of the map, an index of ``ELEMENT_NAMES``.
         prior: Configured a1..a15 at index 1..15, a weak prior for empty bins.
         fit: Record of ELEMENT_FIT, written.
     """
@@ -159,7 +163,7 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
         if m.weight[e, b] > 0.0:
             x[b] = m.soc_moment[e, b] / m.weight[e, b]
         configured = prior[base + 2] + sign * prior[base] * math.exp(-prior[base + 1] * x[b])
-        y[b] = max(configured, 0.05 * prior[base + 2])
+        y[b] = max(configured, MIN_PRIOR_FRACTION * prior[base + 2])
         w[b] = 0.0
         if m.weight[e, b] > 0.0:
             visited += 1
@@ -167,20 +171,23 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
             w[b] = 1.0 / (m.dwell_s[e, b] / m.weight[e, b] + MODEL_ERROR**2)
             ratios += w[b] * (m.moment[e, b] / m.weight[e, b] - math.log(y[b]))
             weights += w[b]
-    level = math.exp(ratios / weights) if visited > 0 else 1.0
+    scale = math.exp(ratios / weights) if visited > 0 else 1.0  # of the visited bins over the configured function
     for b in range(BINS):
         if m.weight[e, b] > 0.0:
             y[b] = math.exp(m.moment[e, b] / m.weight[e, b])
             w[b] /= y[b] * y[b]
         else:
-            y[b] *= level
+            y[b] *= scale
             w[b] = 1.0 / (PRIOR_ERROR * y[b]) ** 2
     return visited
 
 
 @njit(cache=True)
 def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -> float:
-    """Return the exponent of least cost by a logarithmic search, followed by a golden section around its best point."""
+    """Return the exponent with the least cost, by a logarithmic search and a golden section around its best point.
+
+    ``start`` is a first candidate.
+    """
     ratio = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
     lowest, highest = math.log(EXPONENT_MIN), math.log(EXPONENT_MAX)
     best = min(max(math.log(start), lowest), highest)
@@ -230,11 +237,11 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
     sw, sg, sgg, sy, sgy, syy = _sums(exponent, sign, x, y, w)
     det = sw * sgg - sg * sg
     offset = sy / sw
-    amplitude = 1e-3 * offset
-    if det > 1e-12 * sw * sgg:
-        free = (sw * sgy - sg * sy) / det
-        amplitude = max(amplitude, free)
-    offset = max((sy - sg * amplitude) / sw, 1e-3 * offset)
+    amplitude = MIN_RATIO * offset
+    if det > 1e-12 * sw * sgg:  # not singular: g differs between the bins
+        unconstrained = (sw * sgy - sg * sy) / det
+        amplitude = max(amplitude, unconstrained)
+    offset = max((sy - sg * amplitude) / sw, MIN_RATIO * offset)
     cross = offset * sw * offset + amplitude * (2.0 * offset * sg + amplitude * sgg)
     cost = syy + cross - 2.0 * (offset * sy + amplitude * sgy)
     return amplitude, offset, cost

@@ -57,14 +57,14 @@ def write_equivalent_circuit(f: Record, p: Record, e: Record) -> None:
     x, cov = f.mean[f.best], f.covariance[f.best]
     # each resistance is the sum of a part with weak and a part with strong temperature dependence
     resistances(x[SOC], p.weak_ohm, p.strong_ohm, f.weak, f.strong, e.ohm)
-    file_ohm, others = e.ohm[0], math.exp(x[LN_R])
+    file_r_0_ohm, r_k_factor = e.ohm[0], math.exp(x[LN_R])
     e.ohm[0] *= math.exp(x[LN_R0])
     for k in range(1, RESISTANCES):
-        e.ohm[k] *= others
-    ratio, variance = ln_r_s_ratio(f, p)
-    # Measurements do not determine the part of this rise that belongs to R_s: its half, with its half as std
+        e.ohm[k] *= r_k_factor
+    ln_ratio, variance = ln_r_s_ratio(f, p)
+    # measurements do not determine the part of the rise that belongs to R_s; half of the rise is used, with half as std
     half_ohm = 0.5 * branch_rise_within_sample(f, e)
-    e.value[R_S] = file_ohm * math.exp(ratio) + half_ohm
+    e.value[R_S] = file_r_0_ohm * math.exp(ln_ratio) + half_ohm
     e.ln_variance[R_S] = variance + (half_ohm / e.value[R_S]) ** 2
     write_rc_pair(e, 0, SHORT, R_TS, cov[LN_R, LN_R], p.r_std)
     write_rc_pair(e, SHORT, BRANCHES, R_TL, cov[LN_R, LN_R], p.r_std)
@@ -93,16 +93,18 @@ def write_rc_pair(e: Record, first: int, end: int, at: int, scale_variance: floa
         ohm += e.ohm[1 + k]
         ln_tau += e.ohm[1 + k] * LN_TAUS[k]
     ln_tau /= ohm
-    by_r = by_tau = by_c = 0.0
+    by_r = by_tau = by_c = (
+        0.0  # squared sensitivities of ln R, ln tau and ln C to the errors of the ladder's resistances
+    )
     for k in range(first, end):
         share, deviation = e.ohm[1 + k] / ohm, LN_TAUS[k] - ln_tau
         by_r += share**2
         by_tau += (share * deviation) ** 2
         by_c += (share * (deviation - 1.0)) ** 2
-    own = r_std * r_std
-    e.value[at], e.ln_variance[at] = ohm, scale_variance + own * by_r
-    e.value[at + 1], e.ln_variance[at + 1] = math.exp(ln_tau), own * by_tau
-    e.value[at + 2], e.ln_variance[at + 2] = math.exp(ln_tau) / ohm, scale_variance + own * by_c
+    variance = r_std * r_std
+    e.value[at], e.ln_variance[at] = ohm, scale_variance + variance * by_r
+    e.value[at + 1], e.ln_variance[at + 1] = math.exp(ln_tau), variance * by_tau
+    e.value[at + 2], e.ln_variance[at + 2] = math.exp(ln_tau) / ohm, scale_variance + variance * by_c
 
 
 @njit(cache=True)

@@ -41,8 +41,9 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
     The function must run before ``track_current_sign``, which updates the slow means.
     """
     counted_s = min(dt_s, FAST_S)
-    fast = dt_s <= FAST_S and c.slow_v != 0.0
-    moved = stuck = False
+    has_fast_changes = dt_s <= FAST_S and c.slow_v != 0.0  # 0: there are no slow means yet
+    ocv_moved = voltage_stuck = False
+    # with the default noise of half a resolution step, sqrt(3 sensor_v2) is one step
     resolved_v = MIN_RESOLUTION_STEPS * max(c.step_v, math.sqrt(3.0 * p.sensor_v2))
     change_v = abs(voltage_v - c.last_v)
     if c.last_v == 0.0 or change_v > 0.0:
@@ -53,22 +54,25 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
     else:
         c.held_as += 0.5 * (c.last_a + current_a) * min(dt_s, p.unmeasured_s)
         loaded = current_a >= LOAD_C * p.capacity_as / 3600.0
-        moved = loaded and ocv_has_moved(c, f, p, current_a, resolved_v)
+        ocv_moved = loaded and ocv_has_moved(c, f, p, current_a, resolved_v)
         change_a = abs(current_a - c.held_a) if loaded else min(abs(current_a - c.held_a), abs(current_a - c.slow_a))
-        dropped_v = reference_series_resistance(p) * change_a if fast else 0.0
-        stuck = moved or dropped_v > max(VISIBLE_V * p.series, resolved_v)
-        if stuck:
+        dropped_v = reference_series_resistance(p) * change_a if has_fast_changes else 0.0
+        voltage_stuck = ocv_moved or dropped_v > max(VISIBLE_V * p.series, resolved_v)
+        if voltage_stuck:
             c.frozen_v_s += counted_s
     c.same_s += dt_s
     if c.last_v == 0.0 or current_a != c.last_a:
         c.frozen_a_s = c.same_s = 0.0
         c.same_soc, c.same_soc_std = f.soc, f.soc_std
-    elif moved or (fast and abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > max(SWING_V * p.series, resolved_v)):
+    elif ocv_moved or (
+        has_fast_changes and abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > max(SWING_V * p.series, resolved_v)
+    ):
         c.frozen_a_s += counted_s
     elif c.frozen_a_s < FROZEN_S:  # discount single glitches at rest
         c.frozen_a_s -= c.frozen_a_s * min(1.0, counted_s / OUTLIERS_S)
     c.last_v, c.last_a = voltage_v, current_a
-    return not stuck or c.frozen_v_s <= SUSPECT_S or c.frozen_v_s > FROZEN_S
+    # after FROZEN_S the voltage passes again, because the next update of the filter reports the fault
+    return not voltage_stuck or c.frozen_v_s <= SUSPECT_S or c.frozen_v_s > FROZEN_S
 
 
 @njit(cache=True)
@@ -81,13 +85,13 @@ def reference_series_resistance(p: Record) -> float:
 @njit(cache=True)
 def ocv_has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: float) -> bool:
     """Return True if the charge since the last voltage change moved the OCV by more than the overpotential's change."""
-    if f.count > 1:
+    if f.count > 1:  # several hypotheses: the SOC is uncertain
         return False
     now_soc = c.held_soc - c.held_as / p.capacity_as
     moved_v = ocv(c.held_soc, p.ocv_v, p.ocv_slope_v) - ocv(now_soc, p.ocv_v, p.ocv_slope_v)
     dropped_v = p.middle_ohm * (current_a - c.held_a)
-    least_v = max(OCV_CHANGE_V * p.series, resolved_v, abs(dropped_v))
-    return min(abs(moved_v), abs(moved_v + dropped_v)) > least_v
+    limit_v = max(OCV_CHANGE_V * p.series, resolved_v, abs(dropped_v))
+    return min(abs(moved_v), abs(moved_v + dropped_v)) > limit_v
 
 
 @njit(cache=True)
@@ -96,5 +100,6 @@ def rewind_to_freeze(c: Record, f: Record, p: Record) -> None:
     if c.frozen_a_s > FROZEN_S:
         f.soc, f.soc_std = c.same_soc, c.same_soc_std + p.load_mean_c * c.same_s / 3600.0
     else:
-        moved = c.held_as / p.capacity_as
-        f.soc, f.soc_std = min(max(c.held_soc - moved, 0.0), 1.0), c.held_soc_std + UNOBSERVED_CHARGE_ERROR * abs(moved)
+        used_soc = c.held_as / p.capacity_as
+        f.soc = min(max(c.held_soc - used_soc, 0.0), 1.0)
+        f.soc_std = c.held_soc_std + UNOBSERVED_CHARGE_ERROR * abs(used_soc)

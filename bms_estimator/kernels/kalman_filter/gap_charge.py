@@ -66,11 +66,12 @@ def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
     The unknown current is assumed constant over the gap. It is drawn from the distribution of the present load or, the
     longer the gap, from that of the long-term load.
     """
-    same = math.exp(-dt_s / LOAD_S)
+    present_share = math.exp(-dt_s / LOAD_S)
     present_a2 = s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a
     usual_a2 = s.usual_a2 - 2.0 * held_a * s.usual_a + held_a * held_a
     idle_a = IDLE_C * p.capacity_as / 3600.0
-    return math.sqrt(max(same * present_a2 + (1.0 - same) * usual_a2, idle_a * idle_a)) * dt_s
+    mean_a2 = present_share * present_a2 + (1.0 - present_share) * usual_a2
+    return math.sqrt(max(mean_a2, idle_a * idle_a)) * dt_s
 
 
 @njit(cache=True)
@@ -94,7 +95,7 @@ def rounding_charge_variance(s: Record, p: Record, dt_s: float, current_a: float
     error_a2 = p.current_step_a * p.current_step_a / 12.0  # variance of rounding
     if current_a == 0.0 and s.current_a == 0.0:
         error_a2 = max(error_a2, p.dead_band_a * p.dead_band_a / 3.0)  # uniform within the dead band
-    same = abs(current_a - s.current_a) <= MAX_EQUAL_STEPS * p.current_step_a
-    before_s = s.same_s if same else 0.0
-    s.same_s = before_s + dt_s
-    return error_a2 * (s.same_s * s.same_s - before_s * before_s)
+    is_equal = abs(current_a - s.current_a) <= MAX_EQUAL_STEPS * p.current_step_a
+    previous_s = s.same_s if is_equal else 0.0
+    s.same_s = previous_s + dt_s
+    return error_a2 * (s.same_s * s.same_s - previous_s * previous_s)

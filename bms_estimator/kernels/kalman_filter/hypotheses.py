@@ -76,7 +76,7 @@ BEYOND_STD = 0.03
 """Std in SOC of the prior weight of a hypothesis beyond ``MIN_SOC`` or ``MAX_SOC``, whose SOC is limited."""
 MIN_STD = 0.005
 """Minimum std of the published SOC, because full and empty of a cell are not defined better."""
-UNKNOWN_FULL = 0.03
+MIN_STD_OF_R_STD = 0.03
 """Minimum std of the published SOC, as a fraction of the std of ln R. A cell that was not measured is full at another point of
 the curve."""
 HYST_STD = 0.7
@@ -129,14 +129,14 @@ def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
 
     SOC, polarization, hysteresis and errors of the model are unknown.
     """
-    start = s.mean[s.best], s.covariance[s.best]
+    mean, covariance = s.mean[s.best], s.covariance[s.best]
     for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
-        decorrelate_state(start[0], start[1], j)
+        decorrelate_state(mean, covariance, j)
     for k in range(BRANCHES):
-        decorrelate_state(start[0], start[1], X + k)
+        decorrelate_state(mean, covariance, X + k)
     s.x_a[:] = 0.0
-    initial_branch_currents(p, s.current_a, start[0], start[1])
-    start[1][HYST, HYST], start[1][CURVE, CURVE] = HYST_STD**2, 1.0
+    initial_branch_currents(p, s.current_a, mean, covariance)
+    covariance[HYST, HYST], covariance[CURVE, CURVE] = HYST_STD**2, 1.0
     s.count = HYPOTHESES if soc_std > MAX_SINGLE_STD else 1
     spacing = 2.0 * SPREAD_STDS * soc_std / (HYPOTHESES - 1)
     if s.best != 0:
@@ -250,4 +250,4 @@ def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
 def weakest_cell_soc_std(s: Record, p: Record) -> float:
     """Return the std of the SOC of the weakest cell in series, whose deviation from the mean cannot be observed."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
-    return math.hypot(max(s.soc_std, MIN_STD, UNKNOWN_FULL * p.r_std), spread)
+    return math.hypot(max(s.soc_std, MIN_STD, MIN_STD_OF_R_STD * p.r_std), spread)

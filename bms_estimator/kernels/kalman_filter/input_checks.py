@@ -30,9 +30,9 @@ from bms_estimator.numba_cache import njit
 GATE_STDS = 6.0
 """Limit of the innovation gate in std. A single sample beyond the gate is a glitch."""
 GATE_SAMPLES = 5
-"""Minimum number of successive samples beyond the gate that are accepted, because they show a change of the cell."""
+"""Number of successive samples beyond the gate from which on samples are accepted, because the cell has changed."""
 GATE_S = 5.0
-"""Minimum duration of successive samples beyond the gate that are accepted [s]."""
+"""Duration of successive samples beyond the gate from which on samples are accepted [s]."""
 SNAPSHOT_S = 60.0
 """Interval at which the last good state is stored [s]."""
 RESTORED_STD = 0.05
@@ -40,9 +40,12 @@ RESTORED_STD = 0.05
 MAX_SOC_STD = 0.4
 """Maximum std of the SOC."""
 SIGN_S = 300.0
-"""Averaging time of the relation between voltage and current changes, counted while the current changes [s]."""
+"""Averaging time of the check of the current's sign [s]. Only time in which the current changes counts."""
 MIN_EVIDENCE = 0.1
-"""Minimum filled fraction of the average over ``SIGN_S`` for a fault of the sign."""
+"""Minimum ``sign_evidence`` for a fault of the sign. It is 0 without data and 1 for a full average over ``SIGN_S``."""
+WRONG_SIGN_SLOPE = 0.25
+"""Minimum ratio of voltage to current changes for a fault of the sign, in multiples of R_s. A right sign gives -1, a wrong
+sign gives 1."""
 MAX_CHANGE_RATIO = 5.0
 """Limit of a voltage change, in multiples of the change that the resistances explain, so that a glitch to zero does not
 dominate the average."""
@@ -55,18 +58,18 @@ OFFSET_STDS = 4.0
 CAPACITY_STDS = 2.0
 """Limit of the capacity for the fault CAPACITY, in multiples of its initial std."""
 PRESENT_STDS = 3.0
-"""Minimum offset or LN_Q for the faults OFFSET and CAPACITY, in multiples of its present std."""
+"""Minimum offset or LN_Q for the faults OFFSET and CAPACITY, in multiples of the present std of each."""
 CLEAR_FRACTION = 0.7
 """Fraction of its limit below which a fault ends (hysteresis)."""
-WRONG_V = 0.12
+MAX_OCV_BIAS_V = 0.12
 """Mean bias of one cell above which the OCV counts as wrong [V]. An OCV of the cell's chemistry has smaller errors."""
-WRONG_S = 1800.0
-"""Averaging time of that bias [s]."""
-SEARCHES_S = 5.0 * 3600.0
+OCV_BIAS_S = 1800.0
+"""Averaging time of the mean bias that shows a wrong OCV [s]."""
+REINITIALIZATIONS_S = 5.0 * 3600.0
 """Time constant with which re-initializations of the SOC are discounted [s]."""
-MANY_SEARCHES = 4.0
-"""Number of recent re-initializations of the SOC at which the OCV counts as wrong."""
-UNKNOWN_K = 5.0
+MAX_REINITIALIZATIONS = 4.0
+"""Number of recent re-initializations of the SOC above which the OCV counts as wrong."""
+TEMPERATURE_MARGIN_K = 5.0
 """Distance from the temperature range of the cell file for the fault TEMPERATURE [K]."""
 
 SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT = (int(bit) for bit in InputFault)
@@ -75,9 +78,9 @@ UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT
 
 CHECKS = np.dtype(
     [
-        ("mean_a", "f8"),  # current at the last update of the filter [A]
+        ("mean_a", "f8"),  # mean current of the samples in the last update of the filter [A]
         ("gated_in_row", "i8"),  # number of successive samples beyond the innovation gate
-        ("gated_s", "f8"),  # duration of these samples [s]
+        ("gated_s", "f8"),  # duration of the successive samples beyond the gate [s]
         ("outliers", "f8"),  # number of rejected single samples, discounted with OUTLIERS_S
         ("slow_v", "f8"),  # running mean of the voltage [V]; 0: no sample yet
         ("slow_a", "f8"),  # running mean of the current [A]
@@ -99,11 +102,11 @@ CHECKS = np.dtype(
         ("same_soc", "f8"),  # SOC at the last change of the current
         ("same_soc_std", "f8"),  # std of the SOC at the last change of the current
         ("wrong_v", "f8"),  # running mean of the slow bias [V]
-        ("searches", "f8"),  # number of SOC re-initializations, discounted with SEARCHES_S
+        ("searches", "f8"),  # number of SOC re-initializations, discounted with REINITIALIZATIONS_S
         ("seen_reopened", "i8"),  # value of EKF_STATE.reopened at the last check
         ("suspects", "i8"),  # bits of model.input_faults.InputFault
         ("good_mean", "f8", STATES),  # mean of the likeliest hypothesis in the last good state
-        ("good_covariance", "f8", (STATES, STATES)),  # its covariance
+        ("good_covariance", "f8", (STATES, STATES)),  # covariance of that hypothesis
         ("good_soc", "f8"),  # SOC of the last good state
         ("good_soc_std", "f8"),  # std of the SOC of the last good state
         ("good_age_s", "f8"),  # time since the last good state was stored [s]
@@ -135,7 +138,9 @@ def passes_innovation_gate(
     current_a: float,
     voltage_v: float,
 ) -> bool:
-    """Return True if the filter may use a sample: its voltage is within the gate, or many successive samples are beyond.
+    """Return True if the filter may use a sample.
+
+    The voltage of a usable sample is within the gate, or many successive voltages are beyond the gate.
 
     Args:
         c: Record of CHECKS.
@@ -150,6 +155,7 @@ def passes_innovation_gate(
     """
     away_a = current_a - c.mean_a
     predicted_v = f.voltage_v - e.value[R_S] * away_a
+    # the voltage may have been measured before the current changed, and the RC pairs may already have followed the change
     jump_v = (e.value[R_S] + e.value[R_TS] + e.value[R_TL]) * max(abs(away_a), abs(change_a))
     limit_v = GATE_STDS * math.sqrt(f.innovation_variance) + jump_v
     if abs(voltage_v - predicted_v) <= limit_v or dt_s > p.unmeasured_s:
@@ -210,7 +216,7 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
     f.covariance[0, :, :] = c.good_covariance
     if not math.isfinite(f.temperature_c):
         f.temperature_c, f.sensed = REFERENCE_C, 0  # the next temperature is used without smoothing
-        f.weak = f.strong = f.hysteresis = 1.0
+        f.weak = f.strong = f.hysteresis = 1.0  # Arrhenius factors at REFERENCE_C
     initialize_load_statistics(f, p, f.current_a)
     spawn_hypotheses(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + RESTORED_STD**2))
     reset_window(f)
@@ -219,9 +225,10 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
 
 @njit(cache=True)
 def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
-    """Average fast changes of the voltage over fast changes of the current. Their ratio is -R_s if the sign is right.
+    """Average fast voltage change times fast current change, and the squared fast current change.
 
-    A ramp does not count as a change, because the voltage has ramps of its own at the ends of the OCV curve.
+    The ratio of both averages is -R_s if the sign is right. A ramp does not count as a change, because the voltage has
+    ramps of its own at the ends of the OCV curve.
     """
     if dt_s > FAST_S or c.slow_v == 0.0:  # the step is too long for a fast change, or this is the first sample
         c.slow_v = c.slower_v = voltage_v
@@ -254,8 +261,8 @@ def unusable_input_bits(c: Record, p: Record) -> int:
 @njit(cache=True)
 def sign_is_wrong(c: Record, p: Record) -> bool:
     """Return True if the voltage rises with a reported discharge. A present fault ends only when the voltage falls."""
-    steep = 0.25 * reference_series_resistance(p) * c.change_a2
-    return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > MIN_EVIDENCE
+    limit_v_a = WRONG_SIGN_SLOPE * reference_series_resistance(p) * c.change_a2
+    return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else limit_v_a) and c.sign_evidence > MIN_EVIDENCE
 
 
 @njit(cache=True)
@@ -265,13 +272,13 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     A wrong sign of the current causes an SOC error of twice the charge, always in one direction. A frozen current may be
     any typical load. Estimates learned with a wrong sign are useless, so that the filter is re-initialized afterwards.
     """
-    moved = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
-    error = UNOBSERVED_CHARGE_ERROR * moved
+    counted_soc = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
+    error_soc = UNOBSERVED_CHARGE_ERROR * counted_soc
     if c.suspects & CURRENT:
-        error = p.load_mean_c * min(dt_s, p.unmeasured_s) / 3600.0
+        error_soc = p.load_mean_c * min(dt_s, p.unmeasured_s) / 3600.0
     elif c.suspects & SIGN_OF_CURRENT:
-        error = 2.0 * moved
-    f.soc_std = min(math.hypot(f.soc_std + error, f.window.unknown_as / p.capacity_as), MAX_SOC_STD)
+        error_soc = 2.0 * counted_soc
+    f.soc_std = min(math.hypot(f.soc_std + error_soc, f.window.unknown_as / p.capacity_as), MAX_SOC_STD)
     f.window.unknown_as = 0.0
     f.step.phase = UNHELD
     bits = unusable_input_bits(c, p)
@@ -295,7 +302,7 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
     c.outliers -= c.outliers * min(1.0, dt_s / OUTLIERS_S)
     bits = unusable_input_bits(c, p)
     if bits:
-        if bits != SIGN_OF_CURRENT:
+        if bits != SIGN_OF_CURRENT:  # a frozen input has spoiled the SOC since it froze
             rewind_to_freeze(c, f, p)
         c.suspects = bits
         return
@@ -307,14 +314,14 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
         bits |= OFFSET_BIT
     if is_significant_bias(x[LN_Q], cov[LN_Q, LN_Q], CAPACITY_STDS * p.capacity_std, before & CAPACITY):
         bits |= CAPACITY
-    c.wrong_v += min(1.0, dt_s / WRONG_S) * (x[B_SLOW] - c.wrong_v)
-    c.searches += f.reopened - c.seen_reopened - min(1.0, dt_s / SEARCHES_S) * c.searches
+    c.wrong_v += min(1.0, dt_s / OCV_BIAS_S) * (x[B_SLOW] - c.wrong_v)
+    c.searches += f.reopened - c.seen_reopened - min(1.0, dt_s / REINITIALIZATIONS_S) * c.searches
     c.seen_reopened = f.reopened
     fraction = CLEAR_FRACTION if before & OCV else 1.0
-    if abs(c.wrong_v) > fraction * WRONG_V * p.series or c.searches > fraction * MANY_SEARCHES:
+    if abs(c.wrong_v) > fraction * MAX_OCV_BIAS_V * p.series or c.searches > fraction * MAX_REINITIALIZATIONS:
         bits = OCV | bits & OUTLIERS  # a wrong OCV also causes wrong estimates of offset and capacity
     outside_k = max(p.low_c - f.temperature_c, f.temperature_c - p.high_c)
-    if f.sensed and outside_k > UNKNOWN_K * (CLEAR_FRACTION if before & TEMPERATURE else 1.0):
+    if f.sensed and outside_k > TEMPERATURE_MARGIN_K * (CLEAR_FRACTION if before & TEMPERATURE else 1.0):
         bits |= TEMPERATURE
     c.suspects = bits
 

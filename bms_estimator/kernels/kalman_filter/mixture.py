@@ -67,7 +67,7 @@ def merge_pair(s: Record, a: int, b: int) -> None:
     max_ln_weight = max(s.ln_weight[a], s.ln_weight[b])
     weight_a, weight_b = math.exp(s.ln_weight[a] - max_ln_weight), math.exp(s.ln_weight[b] - max_ln_weight)
     share = weight_b / (weight_a + weight_b)
-    difference = s.ph
+    difference = s.ph  # scratch space
     for j in range(STATES):
         difference[j] = s.mean[b, j] - s.mean[a, j]
         s.mean[a, j] += share * difference[j]

@@ -134,28 +134,28 @@ def total_resistance(s: Record, p: Record, soc: float) -> float:
 
 
 @njit(cache=True)
-def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float) -> None:
+def add_process_noise(s: Record, p: Record, q: int, throughput: float, bias_v2: float) -> None:
     """Add Q of one step to the covariance of hypothesis ``q``; the diagonal of F is in ``s.f``.
 
     Args:
         s: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
-        q: Hypothesis.
-        moved: Charge throughput [SOC].
+        q: Index of the hypothesis.
+        throughput: Charge throughput [SOC].
         bias_v2: ``bias_variance`` [V^2].
     """
     cov, f, w = s.covariance[q], s.f, s.window
     dt_s = w.time_s
     if w.unknown_as > 0.0:
         add_gap_noise(p, cov, f, w.unknown_as / dt_s, dt_s / p.capacity_as)
-    cov[SOC, SOC] += p.charge_error**2 * moved
+    cov[SOC, SOC] += p.charge_error**2 * throughput
     if w.between_as2 + w.rounded_as2 > 0.0:
         cov[SOC, SOC] += (w.between_as2 + w.rounded_as2) / (p.capacity_as * p.capacity_as)
         for k in range(X, X + BRANCHES):
             cov[k, k] += w.between_as2 / (dt_s * dt_s) * (1.0 - f[k]) ** 2
-    a2 = (p.x_relative * w.charge_as / dt_s) ** 2
+    error_a2 = (p.x_relative * w.charge_as / dt_s) ** 2
     for k in range(X, X + BRANCHES):
-        cov[k, k] += a2 * (1.0 - f[k] * f[k])
+        cov[k, k] += error_a2 * (1.0 - f[k] * f[k])
     cov[B_SLOW, B_SLOW] += 0.5 * bias_v2 * s.slow_inflation[q] * (1.0 - f[B_SLOW] ** 2)
     cov[B_FAST, B_FAST] += 0.5 * bias_v2 * s.fast_inflation[q] * (1.0 - f[B_FAST] ** 2)
     cov[OFFSET, OFFSET] += offset_variance(p) * (1.0 - f[OFFSET] ** 2)
@@ -165,7 +165,7 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     cov[HYST, HYST] += HYST_STEADY_STD**2 * (1.0 - f[HYST] ** 2)
     cov[CURVE, CURVE] += 1.0 - f[CURVE] ** 2
     for j in range(NODE, NODE + NODES):
-        cov[j, j] += max(1.0 - cov[j, j], 0.0) * moved / AGED_SOC
+        cov[j, j] += max(1.0 - cov[j, j], 0.0) * throughput / AGED_SOC
 
 
 @njit(cache=True)

@@ -18,9 +18,9 @@ from bms_estimator.numba_cache import njit
 
 UNHELD, HELD, STEPPED = range(3)
 """Phases of ``detect_current_step``: the current changes; is constant; has stepped after it was constant."""
-MIN_C = 0.2
+MIN_STEP_C = 0.2
 """Minimum change of the current between two samples of a current step, as a C-rate."""
-HELD_SHARE = 0.1
+MAX_HELD_CHANGE = 0.1
 """Maximum change of a constant current, as a fraction of the step."""
 STEP_STD = 0.05
 """Std of ln R_s by one step, due to kinetics and to timing errors of samples."""
@@ -41,17 +41,17 @@ def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, volt
         change_a: Change of the current since the previous sample [A].
         voltage_v: Voltage of the sample [V].
     """
-    step, min_step_a = s.step, MIN_C * p.capacity_as / 3600.0
-    before, step.phase = step.phase, UNHELD
+    step, min_step_a = s.step, MIN_STEP_C * p.capacity_as / 3600.0
+    previous_phase, step.phase = step.phase, UNHELD
     step.variance += SHAPE_STD**2 * abs(s.current_a) * dt_s / p.capacity_as
     if dt_s > MAX_STEP_S:
         return
     stepped_a = abs(s.current_a - step.current_a)
-    if before == STEPPED and stepped_a >= min_step_a and abs(change_a) <= HELD_SHARE * stepped_a:
+    if previous_phase == STEPPED and stepped_a >= min_step_a and abs(change_a) <= MAX_HELD_CHANGE * stepped_a:
         update_r_s_from_step(s, p, voltage_v)
-    elif before == HELD and abs(change_a) >= min_step_a:
+    elif previous_phase == HELD and abs(change_a) >= min_step_a:
         step.phase = STEPPED
-    if abs(change_a) <= HELD_SHARE * min_step_a:
+    if abs(change_a) <= MAX_HELD_CHANGE * min_step_a:
         step.phase = HELD
         step.current_a, step.voltage_v = s.current_a, voltage_v
         for k in range(BRANCHES):
@@ -71,8 +71,9 @@ def update_r_s_from_step(s: Record, p: Record, voltage_v: float) -> None:
     if jump_v <= 0.0:
         return
     innovation = math.log(jump_v / abs(change_a) / s.ohm[0]) - step.ln_ratio
-    total = step.variance + STEP_STD**2 + ((FAST_STD * fast_v) ** 2 + 2.0 * p.sensor_v2) / jump_v**2
-    total = max(total, (innovation / HUBER) ** 2)
-    gain = step.variance / total
+    # 2: the jump is the difference of two voltage samples
+    variance = step.variance + STEP_STD**2 + ((FAST_STD * fast_v) ** 2 + 2.0 * p.sensor_v2) / jump_v**2
+    variance = max(variance, (innovation / HUBER) ** 2)
+    gain = step.variance / variance
     step.ln_ratio += gain * innovation
     step.variance -= gain * step.variance

@@ -14,7 +14,7 @@ from bms_estimator.numba_cache import njit
 
 NAMES = ("r_s", "r_ts", "tau_ts", "r_tl", "tau_tl")
 """Identified elements, in the order of theta."""
-E_O = 5
+E_O = len(NAMES)
 """Index of E_o [V] in ``given``, after the file's elements in the order of ``NAMES`` [ohm, s]."""
 
 

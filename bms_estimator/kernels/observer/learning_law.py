@@ -56,30 +56,31 @@ def initialize_states_at_rest(s: Record, p: Record, voltage_v: float) -> None:
     load_constants(q.model, m.given, p, o.soc, m.temperature_c)
     steady_state(q.model, m.x, m.dx, m.theta, m.given, o.current_a)
     injects = math.isfinite(q.offset_s)
-    m.offset_v = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) if injects else 0.0
+    estimate_v = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi)
+    m.offset_v = voltage_v - estimate_v if injects else 0.0
     for j in range(q.count):
-        m.d_offset[j] = -m.psi[j] if injects else 0.0
+        m.d_offset[j] = -m.psi[j] if injects else 0.0  # estimate plus offset does not depend on theta here
     m.settle_s = q.settle_s
     o.innovation_v = 0.0
     write_observer_state(s, p, voltage_v)
 
 
 @njit(cache=True)
-def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v: float) -> None:
+def learning_step(s: Record, p: Record, dt_s: float, previous_a: float, voltage_v: float) -> None:
     """Advance the learning law by one sample at the observer's present SOC.
 
     Args:
         s: Record of ESTIMATOR_STATE.
         p: Record of ESTIMATOR_SETTINGS.
         dt_s: Time since the previous sample [s].
-        before_a: Current at the previous sample [A].
+        previous_a: Current at the previous sample [A].
         voltage_v: Measured voltage [V].
     """
     m, q, o = s.learning, p.learning, s.observer
     load_constants(q.model, m.given, p, o.soc, m.temperature_c)
     unmeasured_s = p.observer.unmeasured_s
-    held_a = interpolated_current(dt_s, before_a, o.current_a, unmeasured_s)
-    advance(q.model, m.x, m.dx, m.theta, m.given, held_a, dt_s)
+    mean_a = interpolated_current(dt_s, previous_a, o.current_a, unmeasured_s)
+    advance(q.model, m.x, m.dx, m.theta, m.given, mean_a, dt_s)
     e = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) - m.offset_v
     o.innovation_v = e
     inject_output_error(m, q, dt_s, e)
@@ -132,9 +133,9 @@ def accumulate_information(m: Record, q: Record, dt_s: float, e: float) -> None:
 
 
 @njit(cache=True)
-def discount_information(m: Record, q: Record, times: float) -> None:
-    """Discount the accumulated information by e^-times."""
-    factor = math.exp(-times)
+def discount_information(m: Record, q: Record, exponent: float) -> None:
+    """Discount the accumulated information by e^-``exponent``."""
+    factor = math.exp(-exponent)
     for j in range(q.count):
         m.pull[j] *= factor
         for i in range(j + 1):

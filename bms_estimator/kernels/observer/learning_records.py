@@ -12,7 +12,7 @@ CONSTANTS = 16
 
 LEARNING_SETTINGS = np.dtype(
     [
-        ("enabled", "i8"),  # 0: a printed law
+        ("enabled", "i8"),  # 0: an adaptive law of the thesis is used instead
         ("model", "i8"),  # kernels.observer.learning_model.Model
         ("count", "i8"),  # number of identified parameters
         ("file", "f8", CONSTANTS),  # values at theta = 0
@@ -20,11 +20,11 @@ LEARNING_SETTINGS = np.dtype(
         ("upper", "f8", LEARNABLE),
         ("middle", "f8", LEARNABLE),  # theta to which the leakage leads
         ("leak_v2s", "f8", LEARNABLE),  # weight of the leakage, as information [V^2 s]
-        ("memory_s", "f8"),  # time constant of discounting, under load [s]
-        ("offset_s", "f8"),  # time constant of the injection [s]; infinite: no injection
+        ("memory_s", "f8"),  # time constant with which data are discounted under load [s]
+        ("offset_s", "f8"),  # time constant with which the output error is added to the offset [s]; infinite: never
         ("settle_s", "f8"),  # time after which effects of unknown initial states have decayed [s]
         ("rate", "f8"),  # gamma: rate at which theta follows the data, at k = 1 [1/s]
-        ("cells", "f8"),  # cells in series: k is that of one cell
+        ("cells", "f8"),  # cells in series; k grows with the error of one cell
         ("told_v", "f8"),  # size above which a sensitivity gives information on the parameters [V]
         ("reach", "f8"),  # trust region of theta: maximum step for which the sensitivities are valid
         ("soc_floor", "f8"),  # SOC below which learning is disabled (erratum 14)

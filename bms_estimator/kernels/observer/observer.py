@@ -1,6 +1,7 @@
 """High-gain adaptive observer, Algorithm 1 of the thesis.
 
-Numbers in parentheses are equations of the thesis, and errata are listed in docs/theory/thesis.md.
+Numbers in parentheses are equations of the thesis, and errata are listed in docs/theory/thesis.md. The states x2 and x3 of
+the thesis are ``v_ts`` and ``v_tl``.
 
 y, i, N and a_i are constant over a sample period. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix and
 is solved exactly. e is taken to decay with the eigenvalue that [1, 1] belongs to if both time constants are equal. (3.18)
@@ -10,7 +11,7 @@ every N >= 0 and every period. ``s`` is a record of OBSERVER_STATE, ``p`` of OBS
 
 import math
 
-from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, soc_from_ocv
+from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, soc_from_ocv
 from bms_estimator.kernels.cell_model.current_interpolation import MAX_FLOW_S, interpolated_current
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.arrays import Record
@@ -29,7 +30,7 @@ def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v:
     """Set the initial conditions of Algorithm 1 at the first sample."""
     s.time_s = time_s
     s.current_a = current_a
-    for i in range(1, 16):
+    for i in range(1, PARAMETERS):
         s.a[i] = p.a_initial[i]
         s.target[i] = p.target[i]
     s.k = p.k0
@@ -37,13 +38,13 @@ def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v:
     s.lock = 1
     s.adapting = 1
     s.started = 1
-    if p.capacity_as == 0.0:  # a fuel cell has neither SOC nor margins
+    if p.capacity_as == 0.0:  # a fuel cell has neither SOC nor stability margins
         s.soc = s.soc_coulomb = s.delta_1 = s.delta_2 = math.nan
         return
     s.soc = p.soc_initial
     if math.isnan(s.soc):
-        ohmic = current_a * r_s(1.0, s.a)  # R_s at full charge, because the SOC is not known yet
-        s.soc = soc_from_ocv(voltage_v + ohmic, p.ocv_v, p.ocv_slope_v)
+        ohmic_v = current_a * r_s(1.0, s.a)  # R_s at full charge, because the SOC is not known yet
+        s.soc = soc_from_ocv(voltage_v + ohmic_v, p.ocv_v, p.ocv_slope_v)
     s.soc_coulomb = s.soc
     s.voltage_estimate_v = ocv(s.soc, p.ocv_v, p.ocv_slope_v)  # (4.1), x2 = x3 = 0
     s.innovation_v = voltage_v - s.voltage_estimate_v
@@ -68,12 +69,12 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     s.adapting = 1 if s.soc > stability_floor(s, p) else 0
     soc = max(s.soc, stability_floor(s, p))
     ohm_s = p.output_r_s * r_s(soc, s.a) if p.output_r_s > 0.0 else 0.0
-    loop = max(1.0 + s.gain * ohm_s, MIN_LOOP_GAIN)
-    e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop  # (3.15) with (3.14) or (4.1)
+    loop_gain = max(1.0 + s.gain * ohm_s, MIN_LOOP_GAIN)  # y^ contains R_s u, and u = -N e
+    e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop_gain  # (3.15) with (3.14) or (4.1)
     s.innovation_v = e
 
     tau_ts, tau_tl = r_ts(soc, s.a) * c_ts(soc, s.a), r_tl(soc, s.a) * c_tl(soc, s.a)
-    rate_e = states_step(s, s.gain / loop, voltage_v - e_o, tau_ts, tau_tl, dt_s)
+    rate_e = states_step(s, s.gain / loop_gain, voltage_v - e_o, tau_ts, tau_tl, dt_s)
     mean_square = integral_of_exponential(2.0 * rate_e * dt_s, 1.0)  # mean of e^2 over the sample / e^2 at its start
 
     if s.adapting:
@@ -86,7 +87,7 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
         s.gain = nussbaum_gain(s.k, p)
     s.voltage_estimate_v = e_o - s.v_ts - s.v_tl  # (4.1)
     if p.output_r_s > 0.0:
-        s.voltage_estimate_v = voltage_v - (voltage_v - s.voltage_estimate_v) / loop  # (3.14), u = -N e
+        s.voltage_estimate_v = voltage_v - (voltage_v - s.voltage_estimate_v) / loop_gain  # (3.14), u = -N e
     track_lock(s, p, dt_s, voltage_v, e_o)
 
 
@@ -95,16 +96,16 @@ def adapt_parameters(s: Record, p: Record, dt_s: float, e_squared: float) -> Non
     """Apply the adaptive law (3.16), (3.17) or (3.18), a' = drive e^2 + rate (target - a), exactly for a constant e^2."""
     if dt_s != s.decay_dt_s:
         s.decay_dt_s = dt_s
-        for i in range(1, 16):
+        for i in range(1, PARAMETERS):
             s.decay[i] = math.exp(-p.rate[i] * dt_s)
             s.settle[i] = integral_of_exponential(-p.rate[i], dt_s)
-    for i in range(1, 16):
+    for i in range(1, PARAMETERS):
         s.a[i] = s.target[i] + (s.a[i] - s.target[i]) * s.decay[i] + p.drive[i] * e_squared * s.settle[i]
 
 
 @njit(cache=True)
 def update_margins(s: Record) -> None:
-    """Update delta1 (2.11) and delta2 (2.12) by the present parameters."""
+    """Compute delta1 (2.11) and delta2 (2.12), the SOCs below which C_ts and C_tl are negative, from the parameters."""
     s.delta_1 = delta(s.a[8], s.a[9], s.a[7])
     s.delta_2 = delta(s.a[11], s.a[12], s.a[10])
 
@@ -128,7 +129,7 @@ def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: fl
     """
     mean = -gain - 0.5 * (1.0 / tau_ts + 1.0 / tau_tl)
     half = 0.5 * (1.0 / tau_tl - 1.0 / tau_ts)
-    q = max(math.sqrt(half * half + gain * gain), 1e-300)
+    q = max(math.sqrt(half * half + gain * gain), 1e-300)  # not 0, because it is a divisor
     low, high = mean - q, mean + q
     phi_low = integral_of_exponential(low, dt_s)
     phi_high = integral_of_exponential(high, dt_s)
@@ -147,7 +148,7 @@ def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: fl
 def integral_of_exponential(rate: float, dt_s: float) -> float:
     """Return the integral of e^(rate t) over 0..dt_s [s]."""
     x = rate * dt_s
-    if abs(x) < 1e-8:
+    if abs(x) < 1e-8:  # expm1(x) / rate would be 0 / 0 at rate 0
         return dt_s * (1.0 + 0.5 * x)
     return math.expm1(x) / rate
 
@@ -214,7 +215,7 @@ def reinitialize_from_measurement(s: Record, p: Record, voltage_v: float, e_o: f
     s.gain = nussbaum_gain(s.k, p)
     s.v_ts = 0.5 * (e_o - voltage_v)
     s.v_tl = s.v_ts
-    for i in range(1, 16):
+    for i in range(1, PARAMETERS):
         s.a[i] = s.target[i]
     s.voltage_estimate_v = voltage_v
     update_margins(s)

@@ -15,16 +15,18 @@ OBSERVER_SETTINGS = np.dtype(
         ("ocv_v", "f8", OCV_POINTS),  # E_o over SOC 0..1 [V]
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
         ("a_initial", "f8", PARAMETERS),  # a_i(t0)
-        ("target", "f8", PARAMETERS),  # (lx au + ly al) / (lx + ly), limit of Lemma 4.1.3
-        ("rate", "f8", PARAMETERS),  # lx + ly of (3.18), lambda of (3.17) [1/s]
+        # target: limit to which (3.18) leads a_i, (lx au + ly al) / (lx + ly) with bounds al, au and weights lx, ly of
+        # the bounds (Lemma 4.1.3)
+        ("target", "f8", PARAMETERS),
+        ("rate", "f8", PARAMETERS),  # rate of that approach: lx + ly of (3.18), lambda of (3.17) [1/s]
         ("drive", "f8", PARAMETERS),  # 1: e^2 drives the parameter; 0: the parameter is constant
         ("output_r_s", "f8"),  # 1: the output contains u R_s (3.14); 0: the output is (4.1)
         ("nussbaum", "i8"),  # kernels.observer.nussbaum.Nussbaum
         ("alpha", "f8"),  # a of (3.10), in (2, 3]
         ("gain_scale", "f8"),  # lambda^(1/a) of (3.10) [1/(V^2 s)]
-        ("ml_series", "f8", SERIES_TERMS),  # coefficients and tables of kernels.observer.mittag_leffler
-        ("ml_decay", "f8", TABLE_POINTS),
-        ("ml_decay_slope", "f8", TABLE_POINTS),
+        ("ml_series", "f8", SERIES_TERMS),  # ``mittag_leffler.series_coefficients`` for alpha
+        ("ml_decay", "f8", TABLE_POINTS),  # first table of ``mittag_leffler.decay_table`` for alpha
+        ("ml_decay_slope", "f8", TABLE_POINTS),  # second table of ``decay_table``
         ("k0", "f8"),  # k(t0) [V^2 s]
         ("gain_limit", "f8"),  # clamp of |N|
         # In lock, k is reset to k0 when N(k) falls below ``rearm_gain``. There is no reset if it is -inf or at least N(k0).
@@ -63,8 +65,8 @@ OBSERVER_STATE = np.dtype(
         ("decay_dt_s", "f8"),
         ("innovation_v", "f8"),  # e = y - y^ before the sample corrected the states (3.15)
         ("voltage_estimate_v", "f8"),  # y^ after the sample corrected the states (4.1)
-        ("delta_1", "f8"),  # (2.11)
-        ("delta_2", "f8"),  # (2.12)
+        ("delta_1", "f8"),  # SOC below which C_ts of the model is negative (2.11)
+        ("delta_2", "f8"),  # SOC below which C_tl of the model is negative (2.12)
         ("unlocked_s", "f8"),  # time for which |e| has contradicted ``lock``, in or out of lock [s]
         ("started", "i8"),  # 1: initialized by a first sample
         ("lock", "i8"),  # 1 while the observer tracks

@@ -56,22 +56,24 @@ def current_suffices(current_a: float, p: Record) -> bool:
 
 
 @njit(cache=True)
-def series_resistance_step(s: Record, p: Record, dt_s: float, before_a: float, soc: float, voltage_v: float) -> None:
+def series_resistance_step(
+    s: Record, p: Record, dt_s: float, previous_a: float, previous_soc: float, voltage_v: float
+) -> None:
     """Advance x2 and x3, and add a sample to the sums of its bin.
 
     Args:
         s: Record of ESTIMATOR_STATE, after the observer's step.
         p: Record of ESTIMATOR_SETTINGS.
         dt_s: Time since the previous sample [s].
-        before_a: Current at the previous sample, constant until this sample [A].
-        soc: SOC at the previous sample.
+        previous_a: Current at the previous sample, constant until this sample [A].
+        previous_soc: SOC at the previous sample.
         voltage_v: Measured voltage [V].
     """
     r, o = s.series_resistance, s.observer
-    middle = max(0.5 * (soc + o.soc), stability_floor(o, p.observer))
-    ohm_ts, ohm_tl = r_ts(middle, o.a), r_tl(middle, o.a)
-    r.v_ts = rc_step(r.v_ts, before_a, ohm_ts, ohm_ts * c_ts(middle, o.a), dt_s)  # (2.2)
-    r.v_tl = rc_step(r.v_tl, before_a, ohm_tl, ohm_tl * c_tl(middle, o.a), dt_s)  # (2.3)
+    mid_soc = max(0.5 * (previous_soc + o.soc), stability_floor(o, p.observer))
+    ohm_ts, ohm_tl = r_ts(mid_soc, o.a), r_tl(mid_soc, o.a)
+    r.v_ts = rc_step(r.v_ts, previous_a, ohm_ts, ohm_ts * c_ts(mid_soc, o.a), dt_s)  # (2.2)
+    r.v_tl = rc_step(r.v_tl, previous_a, ohm_tl, ohm_tl * c_tl(mid_soc, o.a), dt_s)  # (2.3)
     r.settle_s = max(r.settle_s - dt_s, 0.0) if dt_s <= p.observer.unmeasured_s else p.learning.settle_s
     if r.settle_s > 0.0 or not o.adapting or not current_suffices(o.current_a, p):
         return
