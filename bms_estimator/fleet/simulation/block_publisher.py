@@ -16,7 +16,7 @@ import paho.mqtt.client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
 from pydantic import ValidationError
 
-from bms_estimator.edge.subjects import BlockRequest, awaits, raw
+from bms_estimator.edge.subjects import BlockRequest, block_request, raw
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.mqtt.broker_config import brokers, password, tls_context
@@ -36,7 +36,7 @@ MIN_RECONNECT_DELAY_S = 1
 """Minimum delay before a reconnect [s]."""
 MAX_RECONNECT_DELAY_S = 4
 """Maximum delay before a reconnect [s]."""
-_REPLIES = awaits("+").replace(".", "/")
+_REPLIES = block_request("+").replace(".", "/")
 
 
 class Report(NamedTuple):

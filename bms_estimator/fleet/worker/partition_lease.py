@@ -384,7 +384,7 @@ class PartitionLease:
         if not self._nc.is_connected:
             return
         if result.reply is not None:
-            await self._nc.publish(subjects.awaits(result.pack), result.reply.model_dump_json().encode())
+            await self._nc.publish(subjects.block_request(result.pack), result.reply.model_dump_json().encode())
         for topic, payload in (("state", result.state), ("parameters", result.parameters)):
             if payload is not None:
                 await self._nc.publish(subjects.published(result.pack, topic), payload)
