@@ -81,7 +81,7 @@ async def run_pack_service(
     source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, memory=memory)
     if database and settings.store.history_days:
         all_sinks.append(History(database, days=settings.store.history_days))
-    outbox = Outbox(database, most=settings.store.outbox_messages)
+    outbox = Outbox(database, max_messages=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     publish_raw: PublishRaw | None = None
     if settings.mqtt is not None:
