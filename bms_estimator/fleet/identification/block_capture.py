@@ -124,7 +124,7 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
     """Fetch the blocks of a pack that the stream still has.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         pack: Name of the pack.
         since_s: Beginning of the time span by the edge's clock [s since 1970].
         until_s: End of the time span [s since 1970].

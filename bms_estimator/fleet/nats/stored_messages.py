@@ -19,7 +19,7 @@ async def read_messages(
     The node that responds may lag behind the stream's leader. Therefore it is polled until it has the message ``last``.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         stream: Name of the stream; it must allow direct gets.
         subject: May have wildcards.
         first: First stream sequence number.

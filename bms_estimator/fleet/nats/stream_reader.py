@@ -41,7 +41,7 @@ async def read_stream(
     """Yield batches of messages in the order of the stream, up to its last message.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         stream: Name of the stream; it must allow direct gets.
         subject: Subject of the messages; may have wildcards.
         first: First stream sequence number.

@@ -69,7 +69,7 @@ async def make_streams(
     """Create missing streams and consumers, and set limits and replicas as configured. The function is idempotent.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         partitions: Number of partitions of ``RAW``, which cannot change.
         replicas: Number of replicas: 1, or 3 in a cluster of three.
         raw_bytes: Maximum size of ``RAW`` [bytes]; beyond it the oldest messages are dropped.

@@ -37,7 +37,7 @@ class PackBucket:
     """Copy of the table, updated by polling. An error in a row is not raised: it makes the row's pack unknown.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
 
     Attributes:
         packs: Registry of the packs.
@@ -117,7 +117,7 @@ async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, 
     """Write values to a bucket; unchanged ones are skipped.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         bucket: Name of the bucket.
         values: Values by key.
         remove: True to remove entries that are not in ``values``.

@@ -32,8 +32,8 @@ class PackType:
         settings: Settings of the packs; the name is not used.
         config_digest: Digest of the configuration of the estimator. A state of another digest is migrated.
         state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
-        estimator: Estimator bound to the work record of the partition.
-        meter: Charge and energy meter bound to the work record.
+        estimator: Estimator bound to the unpacked record of the partition.
+        meter: Charge and energy meter bound to the unpacked record.
         capacity_ah: Rated capacity of a pack; None for a fuel cell.
     """
 
@@ -68,7 +68,7 @@ class PackTypes:
     """Cache of the types of a partition's packs.
 
     Args:
-        record: Work record of the partition, shape (1,), dtype ``PACK_STATE``.
+        record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
     """
 
     def __init__(self, record: NDArray[np.void]) -> None:
@@ -96,7 +96,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
     Args:
         settings: Settings of the packs.
         cell: A pack as one object (``CellModel.pack``).
-        record: Work record of the partition, shape (1,), dtype ``PACK_STATE``.
+        record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
     """
     digest = config_digest(settings, cell)
     estimator = type_estimator(settings, cell).bound_to_record(record["estimator"])
