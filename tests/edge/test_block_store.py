@@ -38,10 +38,10 @@ def block_at(at_s: float, count: int = 5) -> ReadyBlock:
 
 @contextlib.asynccontextmanager
 async def open_store(
-    path: Path, most_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S
+    path: Path, max_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S
 ) -> AsyncIterator[BlockStore]:
     database = Database(path, tables=EDGE_TABLES, sync_s=0.0, retry_s=0.0)
-    store = BlockStore(database, "raw/pack", most_bytes, wall=lambda: wall_s, resend_s=0.0)
+    store = BlockStore(database, "raw/pack", max_bytes, wall=lambda: wall_s, resend_s=0.0)
     async with database, store:
         yield store
 
@@ -113,7 +113,7 @@ async def test_full_store_drops_the_oldest_blocks_and_updates_oldest(tmp_path: P
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minutes(1))
         size = store._on_disk.state.bytes
-    async with open_store(tmp_path / "s.sqlite", most_bytes=10 * size + size // 2) as store:
+    async with open_store(tmp_path / "s.sqlite", max_bytes=10 * size + size // 2) as store:
         with capture_logs() as lines:
             for block in minutes(60, 1):
                 await write_blocks(store, block)

@@ -1,6 +1,6 @@
-"""Type of packs, whose packs share one estimator.
+"""Type of packs. All packs of a type share one estimator.
 
-Creating an estimator takes longer than estimating the samples of a day.
+The estimator is shared because its creation takes longer than estimating the samples of a day.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ class PackType:
         state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
         estimator: Estimator bound to the unpacked record of the partition.
         meter: Charge and energy meter bound to the unpacked record.
-        capacity_ah: Rated capacity of a pack; None for a fuel cell.
+        capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
     """
 
     settings: PackSettings
@@ -46,7 +46,7 @@ class PackType:
 
 
 @dataclass(frozen=True)
-class _Recipe:
+class _EstimatorKey:
     """Cache key of an estimator; only the digest is compared."""
 
     config_digest: Digest
@@ -58,8 +58,14 @@ def config_digest(settings: Settings, cell: PackModel) -> Digest:
     """Return the digest of all values that a pack's estimator is created from."""
     sensor = settings.sensor
     parts = (
-        *(settings.observer, settings.identifier, settings.sampling, settings.pack.initial_soc, cell),
-        *(sensor.voltage_resolution_v, sensor.voltage_noise_v, sensor.current_sign),
+        settings.observer,
+        settings.identifier,
+        settings.sampling,
+        settings.pack.initial_soc,
+        cell,
+        sensor.voltage_resolution_v,
+        sensor.voltage_noise_v,
+        sensor.current_sign,
     )
     return _digest(hashlib.sha256(repr(parts).encode()).digest())
 
@@ -82,7 +88,7 @@ class PackTypes:
             settings: Settings of the packs.
             cell: A pack as one object (``CellModel.pack``).
         """
-        key = id(settings), id(cell)
+        key = id(settings), id(cell)  # not reused, because the cached tuple keeps both objects alive
         if key not in self._types:
             if len(self._types) >= MAX_TYPES:
                 self._types.clear()
@@ -117,12 +123,12 @@ def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
         settings: Settings of the packs.
         cell: A pack as one object (``CellModel.pack``).
     """
-    return _estimator(_Recipe(config_digest(settings, cell), settings, cell))
+    return _estimator(_EstimatorKey(config_digest(settings, cell), settings, cell))
 
 
 @lru_cache(maxsize=MAX_TYPES)
-def _estimator(recipe: _Recipe) -> Estimator:
-    return make_estimator(recipe.settings, recipe.cell)
+def _estimator(key: _EstimatorKey) -> Estimator:
+    return make_estimator(key.settings, key.cell)
 
 
 def _digest(sha256: bytes) -> Digest:

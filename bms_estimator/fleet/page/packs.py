@@ -20,6 +20,8 @@ MAX_LISTED = 20
 """Maximum number of packs in a list."""
 MAX_TYPES = 8
 """Maximum number of types that are shown. All further types are combined."""
+MAX_TYPE_INDEX = 65_535
+"""Largest value of column ``type``. All types beyond this number share this index."""
 OTHER = "other types"
 """Name of the combination of all further types."""
 UNLISTED = "not in the table"
@@ -73,19 +75,19 @@ class FleetPacks:
     def __init__(self) -> None:
         self._indexes: dict[str, int] = {}
         self._names: list[str] = []
-        self._sorted: list[str] = []
-        self._rows = np.repeat(_NEW, 1024)
+        self._sorted_names: list[str] = []
+        self._rows = np.repeat(_NEW, 1024)  # grows by doubling
         self._states: list[bytes] = []
         self._parameters: dict[str, bytes] = {}
-        self._types: dict[str, int] = {UNLISTED: 0}
+        self._types: dict[str, int] = {UNLISTED: 0}  # index of each type
         self.states, self.damaged = 0, 0
         """Number of received states; number of those that are not a JSON object."""
 
-    def list_pack(self, name: str, kind: str | None) -> None:
+    def list_pack(self, name: str, type_name: str | None) -> None:
         """Set the type of a pack in the fleet's table, such as ``lfp 16s2p``; None removes it."""
         row = self._row(name)
-        row["listed"] = kind is not None
-        row["type"] = self._types.setdefault(kind or UNLISTED, min(len(self._types), 65_535))
+        row["listed"] = type_name is not None
+        row["type"] = self._types.setdefault(type_name or UNLISTED, min(len(self._types), MAX_TYPE_INDEX))
 
     def receive_state(self, name: str, state: bytes, now_s: float) -> None:
         """Store a pack's newest state."""
@@ -114,10 +116,10 @@ class FleetPacks:
 
     def find(self, prefix: str) -> list[str]:
         """Return the first ``MAX_LISTED`` names with this prefix, sorted."""
-        if len(self._sorted) != len(self._names):
-            self._sorted = sorted(self._names)
-        first = bisect.bisect_left(self._sorted, prefix)
-        return [name for name in self._sorted[first : first + MAX_LISTED] if name.startswith(prefix)]
+        if len(self._sorted_names) != len(self._names):
+            self._sorted_names = sorted(self._names)
+        first = bisect.bisect_left(self._sorted_names, prefix)
+        return [name for name in self._sorted_names[first : first + MAX_LISTED] if name.startswith(prefix)]
 
     def one(self, name: str, now_s: float) -> dict[str, Any] | None:
         """Return the details of a pack; None if it is unknown."""
@@ -143,7 +145,7 @@ class FleetPacks:
 
         Returns:
             ``packs`` (counts), ``types`` (number and distribution of each), ``soc_std_edges`` (histogram edges; the last bin
-            is open), ``concerns`` (of each kind the number of packs and the worst ones), ``attention`` (number of packs with
+            is open), ``concerns`` (number of packs and worst packs of each concern), ``attention`` (number of packs with
             any concern).
         """
         rows = self._rows[: len(self._names)]
@@ -251,8 +253,8 @@ def _age_s(last_state_s: float, now_s: float) -> float | None:
 
 def _number(value: Any) -> float:
     """Return a number unchanged; NaN if it is not a number."""
-    real = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if real and math.isfinite(value) else math.nan
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_real and math.isfinite(value) else math.nan
 
 
 def _object(data: bytes) -> dict[str, Any] | None:
