@@ -21,7 +21,7 @@ async def read_messages(
     Args:
         nc: Connection to the tenant's NATS account.
         stream: Name of the stream; it must allow direct gets.
-        subject: May have wildcards.
+        subject: Subject of the messages; may have wildcards.
         first: First stream sequence number.
         last: Stream sequence number of the subject's last message.
 

@@ -62,7 +62,7 @@ class FleetView:
         if type_name is not None:
             self._unknown.pop(name, None)
 
-    def text(self, now_s: float, wall_s: float) -> str:
+    def overview_json(self, now_s: float, wall_s: float) -> str:
         """Return the overview as one line of JSON."""
         return json.dumps(self.overview(now_s, wall_s), allow_nan=False, separators=(",", ":"))
 
