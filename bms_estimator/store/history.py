@@ -32,7 +32,7 @@ _MEAN_COLUMNS = ("voltage_v", "current_a", "temperature_c")
 _LAST_VALUE_COLUMNS = ("soc", "soc_std")
 
 
-def _merged(column: str) -> str:
+def _merge_expression(column: str) -> str:
     """Return SQL that merges a column of two rows of one minute, which exist after a restart within the minute."""
     old, new = f"minute.{column}", f"excluded.{column}"
     if column in _LAST_VALUE_COLUMNS:
@@ -48,7 +48,7 @@ def _merged(column: str) -> str:
 
 _INSERT = (
     f"INSERT INTO minute ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) "  # noqa: S608 - only constant names
-    f"ON CONFLICT (time_s) DO UPDATE SET {', '.join(map(_merged, _COLUMNS[1:]))}"
+    f"ON CONFLICT (time_s) DO UPDATE SET {', '.join(map(_merge_expression, _COLUMNS[1:]))}"
 )
 
 

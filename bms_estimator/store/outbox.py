@@ -79,7 +79,7 @@ class Outbox:
         self._wake_taker()
 
     async def take(self, most: int) -> list[QueuedMessage]:
-        """Wait for a message, then return up to ``most`` of the oldest that were not returned since ``rewind``."""
+        """Wait for a message, then return up to ``most`` of the oldest messages not yet returned since ``rewind``."""
         while not (self._backlog_read and self._queue.can_take):
             self._message_ready.clear()
             await self._message_ready.wait()

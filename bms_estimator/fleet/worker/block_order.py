@@ -1,7 +1,7 @@
 """Order of a pack's blocks, and replies to its edge. Both depend only on the received blocks.
 
-An edge stores each block until a reply confirms that all earlier blocks are safe. On request it resends the awaited block
-and all later blocks. Therefore late, repeated and early blocks can be dropped.
+A reply names the awaited block and confirms all earlier ones, which the edge may then delete. On request, the edge resends
+the awaited block and all later blocks. Therefore late, repeated and early blocks can be dropped.
 """
 
 from enum import Enum

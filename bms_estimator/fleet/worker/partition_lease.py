@@ -34,8 +34,8 @@ from bms_estimator.process.tasks import until_first_ends
 RETRY_S = 0.5
 """Retry interval of server requests [s]."""
 SILENCE_S = 3.0
-"""Time without a delivery after which the stream is searched for further messages [s]. A worker that releases a partition
-has finished by then."""
+"""Time without a delivery after which the stream is searched for further messages [s]. It exceeds the time in
+which another worker releases the partition."""
 IDLE_SILENCE_S = 5.0 * SILENCE_S
 """Interval of further searches while the stream has no further message [s]."""
 MAX_PENDING_SUMMARIES = 128
