@@ -34,7 +34,7 @@ class SampleClock:
         last_s: Time of the last sample of an earlier run [s since 1970]; minus infinity without one.
 
     Attributes:
-        steps: Number of times that a clock was set or the source restarted.
+        steps: Number of times that a clock was set or the source started.
     """
 
     def __init__(self, last_s: float = -math.inf) -> None:

@@ -25,7 +25,7 @@ MIN_YIELDED_SAMPLES = 65_536
 class BlockCapture:
     """Blocks of one pack, to be added in the order of the stream.
 
-    Blocks of a store that the edge has replaced by a newer store are skipped, as by the workers.
+    Blocks of a store that the edge has replaced by a newer store are skipped, because workers skip them too.
 
     Args:
         since_s: Beginning of the time span [s since 1970].

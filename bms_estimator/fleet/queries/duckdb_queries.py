@@ -1,4 +1,4 @@
-"""Queries on the hourly rows of all packs: SQL on Parquet files by DuckDB. A collector may write meanwhile.
+"""Queries on the hourly rows of all packs: SQL on Parquet files by DuckDB. A collector may write at the same time.
 
 Meaning, method and limits of each query are in docs/fleet/questions.md.
 """

@@ -87,7 +87,7 @@ _LIMITS: dict[Role, dict[str, int]] = {
     Role.EDGE: {"subs": 8, "payload": MAX_BLOCK_BYTES}
 }
 _DENIED: dict[Role, tuple[str, ...]] = {
-    # A reader may create consumers, but must not use those of the partitions.
+    # A reader may create consumers, but must not use the consumers of the partitions.
     Role.READER: ("$JS.API.CONSUMER.DELETE.RAW.>", "$JS.API.CONSUMER.MSG.NEXT.RAW.>", "$JS.API.CONSUMER.UNPIN.>"),
     Role.WORKER: ("$JS.API.CONSUMER.DELETE.RAW.>",),
 }

@@ -169,7 +169,7 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
 
 
 async def _report_progress(demo: Demo, observer: DemoObserver, processes: "Processes", stop: asyncio.Event) -> None:
-    """Report the progress, kill a worker after ``KILL_AFTER``, and report when the other one has taken over."""
+    """Report the progress, kill a worker after ``KILL_AFTER``, and report when the other worker has taken over."""
     begin_s, line_count, processed = time.monotonic(), 1, 0
     killed_s: float | None = None
     is_taken_over = False

@@ -63,11 +63,11 @@ MAX_CAPACITY = 1.02
 WORN_OUT_CAPACITY = 0.6
 """True capacity of a worn-out pack as a fraction of the rated capacity."""
 MIN_RESISTANCE = 0.8
-"""Minimum true resistance as a multiple of that of the cell file."""
+"""Minimum true resistance as a multiple of the cell file's resistance."""
 MAX_RESISTANCE = 1.6
-"""Maximum true resistance as a multiple of that of the cell file."""
+"""Maximum true resistance as a multiple of the cell file's resistance."""
 FAILING_RESISTANCE = 3.0
-"""True resistance of a failing pack as a multiple of that of the cell file."""
+"""True resistance of a failing pack as a multiple of the cell file's resistance."""
 OUTLIER_FRACTION = 0.01
 """Fraction of packs that are worn out. An equal fraction is failing."""
 
@@ -151,7 +151,7 @@ class SimulatedFleet:
     Args:
         packs: Number of packs.
         seed: Seed of all random values.
-        begin_ns: Creation time of the first edge's store [ns since 1970]; those of the other edges follow within a minute.
+        begin_ns: Creation time of the first edge's store [ns since 1970]. The other stores follow within a minute.
         prefix: Prefix of the packs' names.
 
     Attributes:

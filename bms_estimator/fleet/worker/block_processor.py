@@ -46,7 +46,7 @@ class BlockProcessor:
 
     def __init__(self, record: NDArray[np.void], counters: Counter[str], wall: Callable[[], float]) -> None:
         self._record, self._counters, self._wall = record, counters, wall
-        self._delivery, self._flows, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
+        self._delivery, self._flow, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
         self._observer = record[0]["estimator"]["observer"]
         self._window = Window()
 
@@ -63,6 +63,7 @@ class BlockProcessor:
         self._restore_or_reset(pack_type, unmigrated_fields, block)
         rows, is_new_hour = self._roll_over_hour(pack, block, pack_type)
         self._resume_after_store_change(pack_type.estimator, block)
+        # another pack may have used the window meanwhile
         self._window.previous_end_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
         self._record_last_sample(block)
         arrival_s, now_s = self._arrival_s(block), self._wall()
@@ -83,7 +84,7 @@ class BlockProcessor:
         is_same_config = _digest(d["made_of"]) == pack_type.config_digest
         if is_same_config and unmigrated_fields is None:
             return
-        has_state = bool(self._hour["store"])
+        has_state = bool(self._hour["store"])  # 0 before the first block
         if _digest(d["meaning"]) == pack_type.state_digest and has_state:
             saved = unmigrated_fields
             if saved is None:
@@ -92,7 +93,7 @@ class BlockProcessor:
             valid = saved if is_same_config else without_observer(saved)
             error = restore_state(pack_type.estimator, valid, self._gap_s(block))
             # the restored estimator has no last sample, and its counters begin at 0
-            self._flows["sums"]["counted"] = self._hour["outliers_before"] = self._hour["searches_before"] = 0
+            self._flow["sums"]["counted"] = self._hour["outliers_before"] = self._hour["searches_before"] = 0
             self._counters["not_taken_over" if error else "taken_over"] += 1
         else:
             for name in ("flow", "hour", "estimator"):
@@ -108,7 +109,7 @@ class BlockProcessor:
         """
         if int(self._delivery["clock"]) == block.store:
             return
-        self._flows["sums"]["counted"] = 0  # no charge is counted over the gap
+        self._flow["sums"]["counted"] = 0  # no charge is counted over the gap
         has_time_base = math.isfinite(self._observer["time_s"])  # otherwise the estimator has already been resumed
         if self._observer["started"] and has_time_base:
             estimator.resume(self._gap_s(block))
@@ -117,7 +118,7 @@ class BlockProcessor:
         """Estimate the samples; add the estimates to the hour, the charge and energy meter and the publish window."""
         observer, counters = self._observer, self._counters
         accepted_before, steps_back_before = int(observer["samples"]), int(observer["time_steps_back"])
-        pack_type.meter.continue_from(ChargeEnergy(*(float(self._flows[name]) for name in ChargeEnergy._fields)))
+        pack_type.meter.continue_from(ChargeEnergy(*(float(self._flow[name]) for name in ChargeEnergy._fields)))
         for part in _parts(block):
             trace = pack_type.estimator.run(part.samples)
             hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
@@ -132,9 +133,10 @@ class BlockProcessor:
         """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
         flow, window, d = pack_type.meter.update_totals(), self._window.take(), self._delivery
         for name, value in zip(ChargeEnergy._fields, flow, strict=True):
-            self._flows[name] = value
+            self._flow[name] = value
         if window is None:
             return None
+        # ``blocks`` does not count the present block yet
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
         remaining = remaining_charge(pack_type.estimator, window.current_a)
         return _json(make_state_payload(window, remaining, counters, now_s, flow, pack_type.capacity_ah))

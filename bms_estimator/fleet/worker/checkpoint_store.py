@@ -238,7 +238,8 @@ class _ChunkReader(io.RawIOBase):
     """Readable file with the bytes of an iterator."""
 
     def __init__(self, chunks: Iterator[bytes]) -> None:
-        self._chunks, self._rest = chunks, memoryview(b"")  # the latter is the unread part of the last chunk
+        self._chunks = chunks
+        self._rest = memoryview(b"")  # unread part of the last chunk
 
     def readable(self) -> bool:
         return True

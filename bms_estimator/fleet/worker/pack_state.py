@@ -107,7 +107,7 @@ class UnpackedRecord:
             raise StateError(f"{len(packed)} bytes are not a packed record")
 
     def load_previous_layout(self, dtype: np.dtype[Any], packed: bytes) -> Fields:
-        """Unpack a pack's record of another layout. Copy the fields that exist here, except those of the estimator.
+        """Unpack a pack's record of another layout. Copy its fields that exist in this layout, except the estimator's.
 
         Args:
             dtype: Dtype of the record.
@@ -117,7 +117,7 @@ class UnpackedRecord:
             The fields of the estimator by name.
 
         Raises:
-            ValueError: The bytes do not have this dtype, or the dtype is not that of a pack.
+            ValueError: The bytes do not have this dtype, or no pack's record can have it.
         """
         previous = UnpackedRecord(dtype)
         previous.load(packed)

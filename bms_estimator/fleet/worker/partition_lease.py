@@ -37,7 +37,7 @@ SILENCE_S = 3.0
 """Time without a delivery after which the stream is searched for further messages [s]. It exceeds the time in
 which another worker releases the partition."""
 IDLE_SILENCE_S = 5.0 * SILENCE_S
-"""Interval of further searches while the stream has no further message [s]."""
+"""Interval between two searches while the stream has no new messages [s]."""
 MAX_PENDING_SUMMARIES = 128
 """Maximum number of published summaries that wait for the server's acknowledgment."""
 RETRYABLE_ERRORS = (NatsError, TimeoutError, StreamError)
@@ -69,7 +69,7 @@ class PartitionLease:
         blocks, samples: Number of blocks and samples processed by this lease.
         faults: Number of blocks skipped because of an internal error.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
-        trouble: Present error in words; empty without one.
+        trouble: Text of the present error; empty without one.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class PartitionLease:
         self._silent = False  # the stream must be searched, because no message has arrived
         self._next_search_s = time.monotonic() + SILENCE_S  # monotonic clock of the next search of the stream
         self._wake_up, self._wake_up_deferred = asyncio.Event(), asyncio.Event()
-        self._state_lock = asyncio.Lock()  # of ``partition`` and ``claim``
+        self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
         self._summaries_lock = asyncio.Lock()
 
     @property
