@@ -77,7 +77,7 @@ def _block_us(partition: Partition, blocks: list[bytes]) -> float:
 
 def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
     """Yield the time of each part, on the state before the last block [us]."""
-    work_record, pack_type = partition._work, partition._type_by_pack["pack0"]
+    work_record, pack_type = partition._unpacked, partition._type_by_pack["pack0"]
     estimator, wall_s = pack_type.estimator, STORE_ID / 1e9 + samples.size
     packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
     work_record.put(packed)

@@ -133,7 +133,7 @@ async def test_samples_keep_their_period_in_a_store_later_than_the_clock(
     async with simulated.edge:
         simulated.add(2)
         later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
-        await until(lambda: simulated.edge.store._on_disk.state.next == 2)  # the blocks are on disk
+        await until(lambda: simulated.edge.store._on_disk.state.next_number == 2)  # the blocks are on disk
         simulated.edge.store.on_request(later)
         await until(lambda: simulated.edge.store.last_s > WALL_S + 1e8)
         simulated.add(4)
@@ -219,7 +219,7 @@ async def test_invalid_requests_are_ignored(receiver: Receiver, engine: NatsClus
             await receiver.reply(payload)
         await receiver.reply(BlockRequest(store=1, number=1, resend=True))
         await receiver.reply(BlockRequest(store=store, number=1, resend=False))
-        await until(lambda: simulated.edge.unread == len(garbage))
+        await until(lambda: simulated.edge.invalid_messages == len(garbage))
         simulated.add(3)
         await simulated.assert_all_received()
 

@@ -37,11 +37,9 @@ def block_at(at_s: float, count: int = 5) -> ReadyBlock:
 
 
 @contextlib.asynccontextmanager
-async def open_store(
-    path: Path, most_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S
-) -> AsyncIterator[BlockStore]:
+async def open_store(path: Path, max_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S) -> AsyncIterator[BlockStore]:
     database = Database(path, tables=EDGE_TABLES, sync_s=0.0, retry_s=0.0)
-    store = BlockStore(database, "raw/pack", most_bytes, wall=lambda: wall_s, resend_s=0.0)
+    store = BlockStore(database, "raw/pack", max_bytes, wall=lambda: wall_s, resend_s=0.0)
     async with database, store:
         yield store
 
@@ -113,7 +111,7 @@ async def test_full_store_drops_the_oldest_blocks_and_updates_oldest(tmp_path: P
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minutes(1))
         size = store._on_disk.state.bytes
-    async with open_store(tmp_path / "s.sqlite", most_bytes=10 * size + size // 2) as store:
+    async with open_store(tmp_path / "s.sqlite", max_bytes=10 * size + size // 2) as store:
         with capture_logs() as lines:
             for block in minutes(60, 1):
                 await write_blocks(store, block)
@@ -172,7 +170,7 @@ async def test_restored_disk_begins_a_later_store(tmp_path: Path, block_request:
         await write_blocks(store, *minutes(3))
         await take(store, 3)
         store.on_request(block_request)
-        await until(lambda: store._on_disk.state.made_s * NS > block_request.store)
+        await until(lambda: store._on_disk.state.created_s * NS > block_request.store)
         await write_blocks(store, block_at(WALL_S + 1000.0))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest) == (1, 1)
@@ -195,7 +193,7 @@ async def test_damaged_database_is_replaced_by_a_later_store(tmp_path: Path, dam
     path = tmp_path / "s.sqlite"
     async with open_store(path) as store:
         await write_blocks(store, *minutes(3))
-        before = store._on_disk.state.made_s
+        before = store._on_disk.state.created_s
     if damage == "no database":
         path.write_bytes(b"nothing of the kind" * 1000)
     elif damage == "deleted":
@@ -275,7 +273,7 @@ async def main():
     async with open_store(Path(sys.argv[1])) as store:
         for block in minutes(10_000):
             await write_blocks(store, block)
-            print(store._on_disk.state.next, file=sys.stderr, flush=True)
+            print(store._on_disk.state.next_number, file=sys.stderr, flush=True)
 asyncio.run(main())
 """
 
@@ -299,6 +297,6 @@ async def test_block_numbers_are_unique_over_kills(tmp_path: Path) -> None:
         reported = await asyncio.to_thread(kill_while_writing, path)
         assert reported >= next_number + 20
         async with open_store(path) as store:
-            next_number = store._on_disk.state.next
+            next_number = store._on_disk.state.next_number
             assert next_number >= reported
             assert numbers(await take(store, store.unconfirmed)) == list(range(1, next_number))

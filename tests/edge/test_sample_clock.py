@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.edge.sample_clock import BAND_S, GRID, STEP_S, SampleClock
+from bms_estimator.edge.sample_clock import DEAD_BAND_S, GRID, STEP_S, SampleClock
 
 WALL_S = 1.7e9
 """Wall clock at the start [s since 1970]."""
@@ -35,7 +35,7 @@ def test_drifting_source_clock_is_corrected_without_a_gap(drift: float) -> None:
     clock = SampleClock()
     placed = run(clock, source_s, host_s=host_s)
     assert clock.steps == 1  # the start
-    assert np.abs(placed - WALL_S - host_s).max() < BAND_S + 0.02 * 600.0
+    assert np.abs(placed - WALL_S - host_s).max() < DEAD_BAND_S + 0.02 * 600.0
     assert np.abs(placed[-1] - WALL_S - host_s[-1]) < STEP_S
     assert np.diff(placed).max() <= 10.0 * 1.02
     assert np.diff(placed).min() >= 10.0 * 0.98

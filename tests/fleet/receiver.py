@@ -77,7 +77,7 @@ class Receiver:
 
     async def reply(self, request: BlockRequest | bytes) -> None:
         payload = request if isinstance(request, bytes) else request.model_dump_json().encode()
-        await self.nc.publish(subjects.awaits(self.pack), payload)
+        await self.nc.publish(subjects.block_request(self.pack), payload)
         await self.nc.flush()
 
     async def _read(self) -> None:

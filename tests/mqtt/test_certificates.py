@@ -55,7 +55,9 @@ def settings(broker: Broker, folder: Path, name: str | None) -> MqttSettings:
 
 def sink(settings: MqttSettings) -> MqttSink:
     delivery = DeliveryStats()
-    return MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, most=4), first_delay_s=0.1)
+    return MqttSink(
+        settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, max_messages=4), first_delay_s=0.1
+    )
 
 
 async def test_client_certificate_is_accepted(strict_broker: Broker, folder: Path) -> None:

@@ -35,7 +35,7 @@ class Sink:
             self.requests.register(name, self._handler(name))
         # short delays, so that tests do not wait
         options = {"first_delay_s": 0.1, "birth_delay_s": 0.1} | options
-        outbox = Outbox(None, most=max_queued)
+        outbox = Outbox(None, max_messages=max_queued)
         self.mqtt = MqttSink(MqttSettings(url=url), "pack", self.requests, self.delivery, outbox, **options)
 
     def _handler(self, name: str) -> Any:

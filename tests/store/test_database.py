@@ -190,7 +190,7 @@ async def test_shutdown_with_a_hung_disk_has_one_deadline_for_all_writes(path, m
     may_return = threading.Event()
     async with asyncio.timeout(LONG_S):
         async with Database(path, hang_s=10 * LONG_S) as database:
-            async with Outbox(database, most=10) as outbox, History(database, days=1) as history:
+            async with Outbox(database, max_messages=10) as outbox, History(database, days=1) as history:
                 hung = asyncio.create_task(database.call(lambda _: may_return.wait(2 * LONG_S)))
                 history.publish(ONE)
                 outbox.put(Message("t", b"", 1, retain=False))

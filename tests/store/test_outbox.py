@@ -25,7 +25,7 @@ def message(number: int) -> Message:
 
 
 def filled_outbox(count: int, *, max_messages: int = 100) -> Outbox:
-    outbox = Outbox(None, most=max_messages)
+    outbox = Outbox(None, max_messages=max_messages)
     for number in range(count):
         outbox.put(message(number))
     return outbox
@@ -106,7 +106,7 @@ def on_disk(path: Path) -> list[int]:
 
 
 async def test_nothing_is_written_while_the_broker_acknowledges(path):
-    async with CountingDatabase(path) as database, Outbox(database, most=100) as outbox:
+    async with CountingDatabase(path) as database, Outbox(database, max_messages=100) as outbox:
         outbox.connected = True
         for number in range(50):
             outbox.put(message(number))
@@ -118,7 +118,7 @@ async def test_nothing_is_written_while_the_broker_acknowledges(path):
 
 
 async def test_messages_that_a_connected_broker_does_not_acknowledge_are_written(path):
-    async with Database(path) as database, Outbox(database, most=100) as outbox:
+    async with Database(path) as database, Outbox(database, max_messages=100) as outbox:
         outbox.connected = True
         outbox.put(message(0))
         await outbox.take(1)
@@ -126,12 +126,12 @@ async def test_messages_that_a_connected_broker_does_not_acknowledge_are_written
 
 
 async def test_messages_of_an_earlier_run_precede_newer_ones(path):
-    async with Database(path) as database, Outbox(database, most=100) as outbox:
+    async with Database(path) as database, Outbox(database, max_messages=100) as outbox:
         for number in range(5):
             outbox.put(message(number))
         first, *_ = await outbox.take(2)
         outbox.acknowledge(first.number)
-    async with Database(path) as database, Outbox(database, most=100) as outbox:
+    async with Database(path) as database, Outbox(database, max_messages=100) as outbox:
         outbox.put(message(5))
         received: list[int] = []
         while len(received) < 5:
@@ -142,7 +142,7 @@ async def test_messages_of_an_earlier_run_precede_newer_ones(path):
 async def test_backlog_beyond_memory_is_read_from_disk_in_order(path):
     count = 3 * MAX_TAIL
     received: list[int] = []
-    async with Database(path) as database, Outbox(database, most=10 * count) as outbox:
+    async with Database(path) as database, Outbox(database, max_messages=10 * count) as outbox:
         for number in range(count):
             outbox.put(message(number))
             if number % 1000 == 0:
@@ -160,7 +160,7 @@ async def test_backlog_beyond_memory_is_read_from_disk_in_order(path):
 
 async def test_hung_disk_does_not_block_messages(path):
     gate = threading.Event()
-    async with Database(path, hang_s=0.05, retry_s=0.0) as database, Outbox(database, most=100) as outbox:
+    async with Database(path, hang_s=0.05, retry_s=0.0) as database, Outbox(database, max_messages=100) as outbox:
         await until(lambda: outbox._backlog_read)
         hung = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
         for number in range(5):
@@ -176,7 +176,7 @@ async def test_start_with_a_hung_disk_sends_new_messages(path):
     gate = threading.Event()
     async with Database(path, hang_s=0.05, retry_s=0.0) as database:
         hung = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
-        async with Outbox(database, most=100) as outbox:
+        async with Outbox(database, max_messages=100) as outbox:
             outbox.put(message(0))
             assert await take_numbers(outbox, 9) == [0]
             gate.set()
@@ -185,7 +185,7 @@ async def test_start_with_a_hung_disk_sends_new_messages(path):
 
 
 async def test_deleted_database_loses_and_counts_only_messages_on_disk_alone(path):
-    async with Database(path) as database, Outbox(database, most=10_000) as outbox:
+    async with Database(path) as database, Outbox(database, max_messages=10_000) as outbox:
         for number in range(1500):
             outbox.put(message(number))
         await until(lambda: len(outbox._queue.stored) == 500)
@@ -212,7 +212,7 @@ async def put_forever(outbox: Outbox) -> None:
 
 
 async def test_internal_error_of_the_writing_task_is_raised(path):
-    outbox = await Outbox(BrokenDatabase(path), most=100).__aenter__()
+    outbox = await Outbox(BrokenDatabase(path), max_messages=100).__aenter__()
     with pytest.raises(KeyError, match="internal"):
         await put_forever(outbox)
 
@@ -236,12 +236,12 @@ async def test_internal_error_of_the_writing_task_is_raised(path):
     ],
 )
 async def test_damaged_row_is_skipped_and_counted(path, column, value):
-    async with Database(path) as database, Outbox(database, most=100) as outbox:
+    async with Database(path) as database, Outbox(database, max_messages=100) as outbox:
         for number in range(3):
             outbox.put(message(number))
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute(f"UPDATE outbox SET {column} = {value} WHERE payload = CAST('1' AS BLOB)")
-    async with Database(path) as database, Outbox(database, most=100) as outbox:
+    async with Database(path) as database, Outbox(database, max_messages=100) as outbox:
         outbox.put(message(3))
         received: list[int] = []
         while len(received) < 3:
@@ -252,7 +252,7 @@ async def test_damaged_row_is_skipped_and_counted(path, column, value):
 
 async def test_memory_is_bounded_while_the_disk_fails(path):
     async with Database(path, retry_s=0.0) as database:
-        outbox = Outbox(database, most=100_000)
+        outbox = Outbox(database, max_messages=100_000)
         await outbox._sync(write=False)
         path.unlink()
         path.mkdir()
@@ -277,7 +277,7 @@ from bms_estimator.store.database import Database
 from bms_estimator.store.outbox import Outbox
 
 async def main():
-    async with Database(Path(sys.argv[1])) as database, Outbox(database, most=100_000) as outbox:
+    async with Database(Path(sys.argv[1])) as database, Outbox(database, max_messages=100_000) as outbox:
         for number in range(100_000):
             outbox.put(Message("t", str(number).encode(), 1, False))
             print(number, flush=True)

@@ -78,7 +78,7 @@ class OutboxMachine(RuleBasedStateMachine):
 
     def open(self) -> None:
         self.database = FaultyDatabase(Path(self.folder.name) / "pack.sqlite", retry_s=0.0)
-        self.outbox = Outbox(self.database, most=self.most)
+        self.outbox = Outbox(self.database, max_messages=self.most)
         self.dropped = 0
         self.sync(write=False)
 

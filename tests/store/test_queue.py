@@ -1,12 +1,12 @@
 """Order of queued messages, without a disk."""
 
 from bms_estimator.mqtt.message import Message
-from bms_estimator.store.outbox_queue import LOWEST, PAGE, OutboxQueue
+from bms_estimator.store.outbox_queue import MIN_NUMBER, PAGE, OutboxQueue
 
 
 def queue_with(count: int) -> OutboxQueue:
     """Return a queue with ``count`` written messages."""
-    queue = OutboxQueue(most=10 * PAGE)
+    queue = OutboxQueue(max_messages=10 * PAGE)
     for number in range(count):
         queue.put(Message("t", str(number).encode(), 1, retain=False))
     queue.mark_writing(queue.unwritten())
@@ -41,7 +41,7 @@ def test_acknowledged_messages_are_deleted_only_if_written():
     queue.put(Message("t", b"2", 1, retain=False))
     _, second, third = queue.take_next(3)
     queue.acknowledge(third.number)
-    assert not queue.stale, "it was never written"
+    assert not queue.has_stale_rows, "it was never written"
     queue.acknowledge(second.number)
-    assert queue.stale
-    assert queue.gaps() == [(LOWEST, 0), (1, 3)]
+    assert queue.has_stale_rows
+    assert queue.gaps() == [(MIN_NUMBER, 0), (1, 3)]

@@ -148,7 +148,7 @@ async def _publisher(
     if settings.mqtt is None:
         return None
     delivery = DeliveryStats()
-    outbox = Outbox(None, most=settings.store.outbox_messages)
+    outbox = Outbox(None, max_messages=settings.store.outbox_messages)
     home = settings.home_assistant
     mqtt = MqttSink(
         settings.mqtt, settings.pack.name, RequestDispatcher(delivery), delivery, outbox, home_assistant=home

@@ -105,7 +105,7 @@ def _outcomes(
 
     tasks, (server, creds, ca) = [], address
     for name in names:
-        kind = known.kind(name)
+        kind = known.parsed_row(name)
         if isinstance(kind, PackSpec) and not known.reason(name):
             tasks.append(Task(name, kind, known.cell_file(kind.cell), *span_s, server, creds, ca))
         else:
@@ -146,7 +146,7 @@ async def _put(results: Sequence["ReidentificationResult"], known: PackRegistry,
     async with connected(*address) as nc:
         stored_rows = await read_bucket(nc, PACKS_BUCKET)
         for one in results:
-            kind = known.kind(one.pack)
+            kind = known.parsed_row(one.pack)
             if not one.cell_file or not isinstance(kind, PackSpec):
                 continue
             if stored_rows.get(one.pack) != encode_row(kind):

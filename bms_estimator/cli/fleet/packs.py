@@ -11,7 +11,7 @@ import typer
 
 from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.packs.csv_table import CELL_FILE, PackTable, check_models, read_table, table_lines
+from bms_estimator.fleet.packs.csv_table import CELL_FILE_SUFFIX, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, model_key, settings_of
 from bms_estimator.model.config_file import write_text
@@ -53,7 +53,7 @@ def load(
 def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> None:
     """Print the server's table of packs as CSV, which `load` can read; errors in rows are printed to stderr."""
     known = asyncio.run(known_packs((server, creds, ca)))
-    kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackSpec)}
+    kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.parsed_row(pack), PackSpec)}
     # packs with equal models have equal errors, so that one pack of each model is checked
     representatives = {model_key(kind): pack for pack, kind in reversed(kinds.items())}
     for pack in (*(pack for pack in sorted(known) if pack not in kinds), *representatives.values()):
@@ -103,13 +103,13 @@ def pack_files(pack: str, known: PackRegistry) -> dict[str, str]:
     Raises:
         UserError: The row or its cell is invalid.
     """
-    kind = known.kind(pack)
+    kind = known.parsed_row(pack)
     if not isinstance(kind, PackSpec) or known.reason(pack):
         raise UserError(f"{pack}: {known.reason(pack)}")
     text, cell = known.cell_file(kind.cell), kind.cell
     settings = settings_of(kind).model_dump(mode="json", exclude_unset=True)
-    settings["pack"] |= {"name": pack, "cell": cell if text is None else f"{cell}{CELL_FILE}"}
-    return {"pack.toml": tomlkit.dumps(settings)} | ({} if text is None else {f"{cell}{CELL_FILE}": text})
+    settings["pack"] |= {"name": pack, "cell": cell if text is None else f"{cell}{CELL_FILE_SUFFIX}"}
+    return {"pack.toml": tomlkit.dumps(settings)} | ({} if text is None else {f"{cell}{CELL_FILE_SUFFIX}": text})
 
 
 def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:

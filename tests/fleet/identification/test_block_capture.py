@@ -48,7 +48,7 @@ def test_resent_and_late_blocks_appear_once_in_order():
         encoded_block(4),
     )
     assert (rows(capture) == samples(60.0, 300)).all()
-    assert (capture.blocks, capture.again, capture.damaged, capture.missing) == (5, 2, 0, [])
+    assert (capture.blocks, capture.repeated, capture.damaged, capture.missing) == (5, 2, 0, [])
 
 
 def test_missing_and_damaged_blocks_are_counted():
@@ -70,7 +70,7 @@ def test_time_continues_by_the_wall_clock_and_never_steps_back(later_s, first_s)
     capture = make_capture(encoded_block(1), encoded_block(2), encoded_block(1, new_store), encoded_block(3))
     time_s = rows(capture)["time_s"]
     assert (time_s.size, time_s[119], time_s[120]) == (180, 179.0, first_s)
-    assert capture.again == 1, "a block of the former store"
+    assert capture.repeated == 1, "a block of the former store"
     assert (np.diff(time_s) >= 0.0).all()
 
 

@@ -36,7 +36,7 @@ def error_of(path):
 def test_separators_line_ends_and_byte_order_mark(table, separator, encoding, end):
     text = "pack,cell,capacity_ah,series\nhouse,lfp,100,16\n\n boat , nmc ,1.5e2,\n"
     parsed = read_table(table(text.replace(",", separator).replace("\n", end), encoding))
-    assert {name: line.kind for name, line in parsed.packs.items()} == {
+    assert {name: line.spec for name, line in parsed.packs.items()} == {
         "house": PackSpec(cell="lfp", capacity_ah=100.0, series=16),
         "boat": PackSpec(cell="nmc", capacity_ah=150.0),
     }
@@ -97,7 +97,7 @@ def test_cell_file_beside_the_table(table, tmp_path):
     (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
     path = table("pack,cell\nhouse,own.toml\n")
     parsed = read_table(path)
-    assert parsed.packs["house"].kind == PackSpec(cell="own")
+    assert parsed.packs["house"].spec == PackSpec(cell="own")
     assert parsed.cell_files == {"own": tmp_path / "own.toml"}
     check_models(path, parsed, {"own": (tmp_path / "own.toml").read_text()})
     with pytest.raises(UserError, match=r"packs\.csv: line 2: own: no cell file of this name was loaded"):
@@ -131,7 +131,7 @@ def test_all_shipped_cells_are_valid():
 def test_table_round_trip(table):
     kinds = {"b": LFP, "a": PackSpec(cell="ncr18650", protocol="jbd")}
     parsed = read_table(table("".join(table_lines(kinds))))
-    assert {name: line.kind for name, line in parsed.packs.items()} == kinds
+    assert {name: line.spec for name, line in parsed.packs.items()} == kinds
 
 
 def test_packs_of_one_kind_share_settings_and_model():

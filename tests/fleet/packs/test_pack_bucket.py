@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.nats.stream_reader import BATCH_MESSAGES, StreamError
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.packs.pack_bucket import PackBucket, Written, read_bucket, remove_keys, write_bucket
+from bms_estimator.fleet.packs.pack_bucket import PackBucket, WriteCounts, read_bucket, remove_keys, write_bucket
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
@@ -35,13 +35,13 @@ async def nc(cluster):
 
 async def test_only_differences_are_written_and_rows_are_removed_on_request(nc):
     values = {f"p{i}": LFP for i in range(2 * BATCH_MESSAGES + 5)}
-    assert await write_bucket(nc, PACKS_BUCKET, values) == Written(len(values), 0, 0, 0, 0)
+    assert await write_bucket(nc, PACKS_BUCKET, values) == WriteCounts(len(values), 0, 0, 0, 0)
     assert await read_bucket(nc, PACKS_BUCKET) == values
     other = {"p0": LFP, "p1": b"{}", "more": LFP}
-    assert await write_bucket(nc, PACKS_BUCKET, other) == Written(
+    assert await write_bucket(nc, PACKS_BUCKET, other) == WriteCounts(
         new=1, changed=1, same=1, removed=0, left=len(values) - 2
     )
-    assert await write_bucket(nc, PACKS_BUCKET, other, remove=True) == Written(0, 0, 3, len(values) - 2, 0)
+    assert await write_bucket(nc, PACKS_BUCKET, other, remove=True) == WriteCounts(0, 0, 3, len(values) - 2, 0)
     assert await read_bucket(nc, PACKS_BUCKET) == other
     await remove_keys(nc, PACKS_BUCKET, ["more"])
     assert (await read_bucket(nc, PACKS_BUCKET)).keys() == {"p0", "p1"}

@@ -141,7 +141,7 @@ async def test_overview_has_counts_and_distributions(browser: Browser, fleet: Fl
         await browser_tab.until_text("lag", "0.4 s")
         page = browser_tab.page
         await page.locator('[data-q="silent"]', has_text="1 not heard yet").wait_for()
-        await page.get_by_role("img", name="8 partitions: 7 held by nobody").wait_for()
+        await page.get_by_role("img", name="8 partitions: 7 not held").wait_for()
         await page.get_by_role(
             "img", name="State of charge: 1 pack 0 to 5 %, 1 pack 65 to 70 %, 1 pack 90 to 95 %"
         ).wait_for()
@@ -201,7 +201,7 @@ async def test_search_by_prefix_with_the_keyboard(browser: Browser, fleet: Fleet
         await page.get_by_text("State of charge65.3 %").wait_for()
         assert page.url.endswith("#home-1")
         details = await page.inner_text("#packwhat")
-        assert details.startswith("lfp 16s1p 280 Ah · heard")
+        assert details.startswith("lfp 16s1p 280 Ah · last message")
         await browser_tab.until(
             "rows => document.querySelectorAll('#parameters tr').length === rows",
             len(ONE.parameters.elements) + len(ONE.parameters.state_of_health),
@@ -210,10 +210,10 @@ async def test_search_by_prefix_with_the_keyboard(browser: Browser, fleet: Fleet
         await page.get_by_role("dialog").wait_for(state="hidden")
         await browser_tab.until("() => location.hash === ''")
         await page.fill("#prefix", "nobody")
-        await page.get_by_text("No pack's name begins so.").wait_for()
+        await page.get_by_text("No pack has this prefix.").wait_for()
         await page.fill("#prefix", LISTED_ONLY.name)
         await page.locator("#found button").click()
-        await page.get_by_text("ncr18650 14s10p · not heard yet since this page is served").wait_for()
+        await page.get_by_text("ncr18650 14s10p · no message since the start of this page").wait_for()
         assert browser_tab.errors == []
 
 

@@ -130,13 +130,13 @@ def test_details_of_a_pack_have_state_parameters_and_suspicions():
     packs = receive_states({"a": healthy()}, 5.0)
     packs.receive_parameters("a", ONE.parameters.model_dump_json().encode())
     packs.receive_hour("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
-    details = packs.one("a", 7.0)
+    details = packs.details("a", 7.0)
     assert details
     assert (details["pack"], details["type"], details["heard_s"]) == ("a", "lfp 16s1p", 2.0)
     assert details["state"] == json.loads(healthy())
     assert details["parameters"] == json.loads(ONE.parameters.model_dump_json())
     assert "zero of the current sensor" in details["suspects"]
-    assert packs.one("b", 7.0) is None
+    assert packs.details("b", 7.0) is None
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b"1", b'{"soc": NaN}', b"\xff", b"[" * 60_000])
@@ -147,7 +147,7 @@ def test_invalid_messages_are_counted_and_skipped(data: bytes) -> None:
     packs.receive_parameters("b", data)
     assert packs.damaged == 1
     assert packs.overview(0.0, 0.0)["packs"]["known"] == 0
-    assert packs.one("b", 0.0)["parameters"] is None
+    assert packs.details("b", 0.0)["parameters"] is None
 
 
 @pytest.mark.parametrize("value", ["x", True, [], 1e400])

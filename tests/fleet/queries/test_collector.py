@@ -17,7 +17,7 @@ from bms_estimator.fleet.queries.parquet_files import (
     UNFINISHED_SUFFIX,
     compact,
     complete_files,
-    to_compact,
+    days_to_compact,
     write,
 )
 from bms_estimator.model.errors import UserError
@@ -138,18 +138,18 @@ def test_files_of_a_day_are_merged_after_its_end_or_if_many(tmp_path):
     for n in range(3):
         write(tmp_path, [make_hour("b", MIDNIGHT), make_hour("a", MIDNIGHT + n)])
     after_day_s = (MIDNIGHT + 27) * 3600.0
-    assert to_compact(tmp_path, after_day_s - 7200.0) == []
-    (day,) = to_compact(tmp_path, after_day_s)
+    assert days_to_compact(tmp_path, after_day_s - 7200.0) == []
+    (day,) = days_to_compact(tmp_path, after_day_s)
     (day / f".x.parquet{UNFINISHED_SUFFIX}").touch()
     (day / "half.parquet").write_bytes(b"PAR1 and no more")
     compact(day)
     assert [row[:2] for row in rows_of(tmp_path)] == [("a", MIDNIGHT + n) for n in range(3)] + [("b", MIDNIGHT)]
     assert len(complete_files(day)) == 1
-    assert to_compact(tmp_path, after_day_s) == []
+    assert days_to_compact(tmp_path, after_day_s) == []
     (file,) = write(tmp_path, [make_hour("c", MIDNIGHT)])
     for n in range(MAX_FILES_PER_DAY - 2):
         shutil.copy(file, day / f"batch-{n}.parquet")
-    assert to_compact(tmp_path, after_day_s) == [day]
+    assert days_to_compact(tmp_path, after_day_s) == [day]
 
 
 async def test_disk_error_loses_no_row(nc, tmp_path, monkeypatch):

@@ -190,7 +190,7 @@ async def test_edge_publishes_its_own_subject_and_receives_replies(fleet: Fleet)
             message = await all_messages.next_msg(LONG_S)
             received.append((message.subject, message.data))
         assert [pair for pair in received if b"evil" in pair[1]] == []
-        await admin.publish(subjects.awaits("p1"), b"yours")
+        await admin.publish(subjects.block_request("p1"), b"yours")
         async with asyncio.timeout(LONG_S):
             message = await anext(edge.messages)
         assert (message.topic.value, message.payload) == ("edge/p1/awaits", b"yours")

@@ -9,7 +9,7 @@ import nats
 import pytest
 
 from bms_estimator.edge.block import decode
-from bms_estimator.edge.subjects import RAW_STREAM, BlockRequest, awaits, raw
+from bms_estimator.edge.subjects import RAW_STREAM, BlockRequest, block_request, raw
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
 from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
@@ -50,12 +50,12 @@ async def send_blocks(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, i
         await receive_one(LONG_S)
     before, requests = received[fleet.names[0], RESENT_NUMBER], 0  # above 1 if an acknowledgment was late
     async with asyncio.timeout(LONG_S):
-        while received[fleet.names[0], RESENT_NUMBER] == before or not edges.again:
-            await nc.publish(awaits(fleet.names[0]), b"no answer")
-            await nc.publish(awaits(fleet.names[0]), request)
+        while received[fleet.names[0], RESENT_NUMBER] == before or not edges.repeated:
+            await nc.publish(block_request(fleet.names[0]), b"no answer")
+            await nc.publish(block_request(fleet.names[0]), request)
             requests += 1
             with contextlib.suppress(TimeoutError):  # an edge may miss a request, and ignores repetitions for RESEND_S
-                while received[fleet.names[0], RESENT_NUMBER] == before or not edges.again:
+                while received[fleet.names[0], RESENT_NUMBER] == before or not edges.repeated:
                     await receive_one(RESEND_S)
     stop.set()
     report = await publisher_task
@@ -73,7 +73,7 @@ def test_every_block_reaches_the_stream_and_a_requested_one_again(tmp_path: Path
     assert set(received) == {(f"sim-{i:06d}", n) for i in range(PACKS) for n in range(1, BLOCKS + 1)}
     assert received["sim-000000", RESENT_NUMBER] >= 2
     assert 1 <= report.resends <= requests  # several requests are sent only if a busy machine delays or loses one
-    assert report.again >= 1
+    assert report.repeated >= 1
 
 
 def test_command_writes_table_and_truth_and_rejects_invalid_options(

@@ -76,7 +76,7 @@ def test_edges_send_each_complete_block_once_oldest_first() -> None:
     remaining = edges.due(1003.0, 100)
     assert set(remaining.packs[remaining.numbers == 1]) | set(first_due.packs) == set(range(50))
     assert (remaining.arrival_s <= 1003.0).all()
-    assert edges.again == 0
+    assert edges.repeated == 0
 
 
 def test_edges_resend_from_the_requested_block() -> None:
@@ -93,7 +93,7 @@ def test_edges_resend_from_the_requested_block() -> None:
     assert not edges.done
     resent = [edges.due(100.0, 10) for _ in range(3)]
     assert [list(zip(due.packs, due.numbers, strict=True)) for due in resent] == [[(1, 3)], [(1, 4)], []]
-    assert (edges.again, edges.resends, edges.safe[1]) == (2, 1, 3)
+    assert (edges.repeated, edges.resends, edges.confirmed_below[1]) == (2, 1, 3)
     # A request is ignored if its block was resent recently, or is confirmed.
     edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S / 2.0)
     edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=2, resend=True), RESEND_S)

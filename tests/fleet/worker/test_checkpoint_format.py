@@ -21,7 +21,7 @@ from bms_estimator.fleet.worker.checkpoint_format import (
     read_checkpoint,
 )
 from bms_estimator.fleet.worker.deferred import Span
-from bms_estimator.fleet.worker.pack_state import PACK_STATE, WorkRecord
+from bms_estimator.fleet.worker.pack_state import PACK_STATE, UnpackedRecord
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.payloads import Estimate
 from tests.estimator.simulated_cell import pulses
@@ -142,14 +142,14 @@ class TestPreviousLayout:
         estimator[:] = [each for each in reversed(estimator) if each[0] != "fit_age_s"]
         layout[0][1].append(["once_known", "<i8", []])
         dtype = np.dtype(checkpoint_format._dtype_fields(layout))
-        work = WorkRecord(dtype)
+        work = UnpackedRecord(dtype)
         for part in dtype.names:
             for name in set(dtype[part].names) & set(PACK_STATE[part].names):
                 work.record[part][name] = state[part][name]
         work.record["delivery"]["once_known"] = 7
         previous_state = PreviousLayoutState(layout_of(dtype), work.packed_bytes())
         snapshot = stream.partition.snapshot()
-        return stream, to_bytes(replace(snapshot, packs={}, former={"a": previous_state}))
+        return stream, to_bytes(replace(snapshot, packs={}, unmigrated={"a": previous_state}))
 
     def test_next_block_migrates_the_record_by_field_names(self, previous_layout, samples) -> None:
         stream, data = previous_layout
@@ -165,7 +165,7 @@ class TestPreviousLayout:
         assert migrated.soc_std < 0.05
         assert migrated.charge_out_ah == pytest.approx(expected.charge_out_ah)
         assert other_version.counters["taken_over"] == 1
-        assert other_version.snapshot().former == {}
+        assert other_version.snapshot().unmigrated == {}
 
     def test_record_stays_unchanged_until_a_block_is_processed(self, previous_layout, samples) -> None:
         _, data = previous_layout
@@ -174,7 +174,7 @@ class TestPreviousLayout:
         assert partition.take("a", blocks[3], partition.sequence + 1).state is None
         assert partition.take("a", blocks[155], partition.sequence + 1).reply.number == 3000 // SAMPLES + 1
         assert partition.counters["packs"] == 1
-        assert partition.snapshot().former == read_checkpoint(data).former
+        assert partition.snapshot().unmigrated == read_checkpoint(data).unmigrated
         restored = Partition.restore(5, table, to_bytes(partition.snapshot()))
         assert restored.take("a", blocks[150], restored.sequence + 1).state
 
@@ -185,7 +185,7 @@ class TestPreviousLayout:
         states = [partition.take("a", early_block, partition.sequence + 1).state for _ in range(MAX_EARLY_REPEATS)]
         assert [state is None for state in states] == (MAX_EARLY_REPEATS - 1) * [True] + [False]
         assert partition.counters["lost_blocks"] == 1
-        assert partition.snapshot().former == {}
+        assert partition.snapshot().unmigrated == {}
 
     def test_continues_after_a_lost_and_a_rejected_block(self, previous_layout, samples, monkeypatch) -> None:
         _, data = previous_layout
@@ -200,6 +200,6 @@ class TestPreviousLayout:
 
     def test_invalid_record_is_reset(self, samples) -> None:
         previous_state = PreviousLayoutState(layout_of(np.dtype([("x", "<f8")])), b"1234567")
-        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, former={"a": previous_state})))
+        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, unmigrated={"a": previous_state})))
         assert partition.take("a", blocks_of(samples)[0], 1).state
         assert partition.counters["damaged_states"] == 1

@@ -446,7 +446,7 @@ class TestInvalidBlocks:
         blocks = blocks_of(samples[:400])
         deliver(stream, "a", blocks[:9])
         with monkeypatch.context() as patched, capture_logs() as logs:
-            patched.setattr(BlockProcessor, "_state", fail)  # after the estimator has processed the samples
+            patched.setattr(BlockProcessor, "_state_payload", fail)  # after the estimator has processed the samples
             result = stream.send("a", blocks[9])
             stream.send("new", blocks[0])
         assert (result.state, result.failed, result.reply.number, result.reply.resend) == (None, 1, 11, False)

@@ -11,7 +11,7 @@ from structlog.testing import capture_logs
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
-from bms_estimator.fleet.worker.partition import Table
+from bms_estimator.fleet.worker.partition import PackLookup
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.worker import Options, work
@@ -107,7 +107,7 @@ def _packs_of(partition: int) -> int:
     return sum(subjects.partition_of(pack, PARTITIONS) == partition for pack in PACKS)
 
 
-async def _lease_after_first_blocks(nc: Client, table: Table) -> tuple[PartitionLease, asyncio.Task[None]]:
+async def _lease_after_first_blocks(nc: Client, table: PackLookup) -> tuple[PartitionLease, asyncio.Task[None]]:
     """Return the running lease of the only partition after the first block of each pack."""
     inbox = nc.new_inbox()
     lease = PartitionLease(
@@ -129,7 +129,7 @@ async def _receive_and_die(nc: Client, partition: int, messages: int) -> None:
     await _subscribe(nc, f"{inbox}.*", consumer.receive)
     await consumer.renew()
     await until(lambda: len(consumer.waiting) == messages, lambda: len(consumer.waiting))
-    assert consumer.pinned
+    assert consumer.has_pin
 
 
 async def _subscribe(nc: Client, subject: str, receive) -> None:

@@ -95,7 +95,7 @@ async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path)
             workers[suspended].signal(signal.SIGCONT)
             await workers[suspended].logged("fenced out")
             await heartbeats.until_held(PARTITIONS, *workers)
-            edges.last = int(edges.next.max()) + BLOCKS_AFTER_KILLS
+            edges.last = int(edges.next_number.max()) + BLOCKS_AFTER_KILLS
             processed_blocks = 0
             while processed_blocks < edges.last * PACKS:  # a busy machine may take longer than the limit of one wait
                 await heartbeats.until(lambda last, before=processed_blocks: blocks(last) > before)

@@ -46,7 +46,7 @@ async def test_wrong_password_is_reported_and_not_shown(
     async with Proxy(locked_broker.port, supports_5=supports_5) as proxy:
         settings = MqttSettings(url=proxy.url, username="meter", password_file=tmp_path / "password")
         with structlog.testing.capture_logs() as logs:
-            async with MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, most=4)):
+            async with MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, max_messages=4)):
                 await until(lambda: delivery.trouble)
     assert [line["event"] for line in logs] == ["broker not reachable"]
     assert logs[0]["reason"].startswith(NOT_AUTHORIZED)

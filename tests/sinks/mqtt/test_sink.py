@@ -432,7 +432,7 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
     async with (
         Listener(secure_broker, "bms/#", username="meter", password="s3cret", tls_params=tls) as live,
         MqttSink(
-            settings, "pack", RequestDispatcher(DeliveryStats()), DeliveryStats(), Outbox(None, most=MAX_QUEUED)
+            settings, "pack", RequestDispatcher(DeliveryStats()), DeliveryStats(), Outbox(None, max_messages=MAX_QUEUED)
         ) as mqtt,
     ):
         mqtt.publish(ONE)
