@@ -108,7 +108,7 @@ def _load_verified(file: Any, name: str) -> Any:
 
 
 def _enable_disk_cache(folder: Path | None) -> None:
-    """Let numba store compiled kernels in ``folder``, or nowhere if it is None."""
+    """Let numba store compiled kernels in ``folder``. Without a folder each process compiles them."""
     if folder is None:
         warnings.warn("compiled kernels are not kept: no folder can be written", RuntimeWarning, stacklevel=1)
         _Dispatcher.enable_caching = lambda _: None

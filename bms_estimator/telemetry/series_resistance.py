@@ -18,7 +18,11 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
     Args:
         estimator: Estimator of a battery, after a sample, with R_s by (4.2).
     """
-    from bms_estimator.calibration.thesis.series_resistance import LOWEST_SOC, fit_series_resistance, series_resistance_from_sums  # noqa: PLC0415 - most packs do not need it
+    from bms_estimator.calibration.thesis.series_resistance import (  # noqa: PLC0415 - most packs do not need it
+        LOWEST_SOC,
+        fit_series_resistance,
+        series_resistance_from_sums,
+    )
 
     record = estimator.record[0]
     sums = record["series_resistance"]

@@ -231,44 +231,44 @@ def moments(
         UserError: No sample lies within ``MIN_SOC`` to ``MAX_SOC``.
     """
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
-    weight, last = _weights(load)
+    weight, is_rest_end = _weights(load)
     inside = (soc > MIN_SOC) & (soc < MAX_SOC)
-    selected = (_first_of_each_slot(load.time_s) | last) & inside
+    selected = (_first_of_each_slot(load.time_s) | is_rest_end) & inside
     if not selected.any():
         raise UserError(
             f"{load.name}: no sample between SOC {MIN_SOC:g} and {MAX_SOC:g} [--soc], so that resistances are undetermined"
         )
-    load_a = np.abs(currents[:, :4]).max(axis=1)
-    std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * load_a)
+    max_current_a = np.abs(currents[:, :4]).max(axis=1)
+    std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * max_current_a)
     std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)
     weight = np.where(selected, weight, 0.0)
-    root = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected, None]
-    first_root = root[:, 0]
+    root_weight = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected, None]
+    root_weight_of_samples = root_weight[:, 0]
     residual_v = load.voltage_v - given_v
-    rows = _rows(soc[selected], temperature_c[selected], currents[selected]) * root
-    target = residual_v[selected] * root[:, 0]
-    after = _clean_steps(load) & inside
-    before = np.r_[after[1:], False]
-    if after.any():
-        change_a = np.abs(load.current_a[after] - load.current_a[before])
+    rows = _rows(soc[selected], temperature_c[selected], currents[selected]) * root_weight
+    target = residual_v[selected] * root_weight[:, 0]
+    is_after_step = _clean_steps(load) & inside
+    is_before_step = np.r_[is_after_step[1:], False]
+    if is_after_step.any():
+        change_a = np.abs(load.current_a[is_after_step] - load.current_a[is_before_step])
         std_v = np.hypot(STEP_V * series, RELATIVE_STD * scale_ohm * change_a) * arrhenius(
-            ERROR_J, temperature_c[after]
+            ERROR_J, temperature_c[is_after_step]
         )
-        root = (np.sqrt(STEP_ROWS / after.sum()) / std_v)[:, None]
-        jump = _rows(soc[after], temperature_c[after], currents[after])
-        jump -= _rows(soc[before], temperature_c[before], currents[before])
-        rows = np.vstack([rows, jump * root])
-        target = np.r_[target, (residual_v[after] - residual_v[before]) * root[:, 0]]
+        root_weight = (np.sqrt(STEP_ROWS / is_after_step.sum()) / std_v)[:, None]
+        jump = _rows(soc[is_after_step], temperature_c[is_after_step], currents[is_after_step])
+        jump -= _rows(soc[is_before_step], temperature_c[is_before_step], currents[is_before_step])
+        rows = np.vstack([rows, jump * root_weight])
+        target = np.r_[target, (residual_v[is_after_step] - residual_v[is_before_step]) * root_weight[:, 0]]
     by_miscount = np.zeros(target.size)  # weighted voltage change by a relative miscount of 1
-    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * first_root
-    cross, own = rows.T @ by_miscount, float(by_miscount @ by_miscount + 1.0 / COUNT_STD**2)
-    vector = float(by_miscount @ target - miscount / COUNT_STD**2)
+    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * root_weight_of_samples
+    miscount_cross, miscount_information = rows.T @ by_miscount, float(by_miscount @ by_miscount + 1.0 / COUNT_STD**2)
+    miscount_vector = float(by_miscount @ target - miscount / COUNT_STD**2)
     return Moments(
-        information=rows.T @ rows - np.outer(cross, cross) / own,
-        information_vector=rows.T @ target - cross * vector / own,
-        miscount_cross=cross,
-        miscount_information=own,
-        miscount_vector=vector,
+        information=rows.T @ rows - np.outer(miscount_cross, miscount_cross) / miscount_information,
+        information_vector=rows.T @ target - miscount_cross * miscount_vector / miscount_information,
+        miscount_cross=miscount_cross,
+        miscount_information=miscount_information,
+        miscount_vector=miscount_vector,
     )
 
 
@@ -288,23 +288,23 @@ def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:
 
 def fit_ladder(captures: list[Moments], prior: Prior) -> LadderFit:
     """Fit the resistances to all ``captures`` by least squares."""
-    information = _prior_information(prior) + sum(one.information for one in captures)
-    information_vector = np.asarray(sum(one.information_vector for one in captures))
-    expand = np.eye(UNBOUNDED + 2 * PART_SIZE)
+    information = _prior_information(prior) + sum(capture.information for capture in captures)
+    information_vector = np.asarray(sum(capture.information_vector for capture in captures))
+    from_free = np.eye(UNBOUNDED + 2 * PART_SIZE)
     if prior.weak_share is not None:
-        share = prior.weak_share.ravel()
-        expand = np.zeros((UNBOUNDED + 2 * PART_SIZE, UNBOUNDED + PART_SIZE))
-        expand[:UNBOUNDED, :UNBOUNDED] = np.eye(UNBOUNDED)
-        expand[UNBOUNDED : UNBOUNDED + PART_SIZE, UNBOUNDED:], expand[UNBOUNDED + PART_SIZE :, UNBOUNDED:] = (
-            np.diag(share),
-            np.diag(1.0 - share),
+        weak_fraction = prior.weak_share.ravel()
+        from_free = np.zeros((UNBOUNDED + 2 * PART_SIZE, UNBOUNDED + PART_SIZE))
+        from_free[:UNBOUNDED, :UNBOUNDED] = np.eye(UNBOUNDED)
+        from_free[UNBOUNDED : UNBOUNDED + PART_SIZE, UNBOUNDED:], from_free[UNBOUNDED + PART_SIZE :, UNBOUNDED:] = (
+            np.diag(weak_fraction),
+            np.diag(1.0 - weak_fraction),
         )
-    information = expand.T @ information @ expand
-    root = np.linalg.cholesky(information)
-    lowest = np.r_[np.full(UNBOUNDED, -np.inf), np.zeros(root.shape[0] - UNBOUNDED)]
-    target = np.linalg.solve(root, expand.T @ information_vector)
-    unknowns = expand @ lsq_linear(root.T, target, bounds=(lowest, np.inf), tol=1e-12, max_iter=500).x
-    covariance = expand @ np.linalg.inv(information) @ expand.T
+    information = from_free.T @ information @ from_free
+    cholesky = np.linalg.cholesky(information)
+    lower_bounds = np.r_[np.full(UNBOUNDED, -np.inf), np.zeros(cholesky.shape[0] - UNBOUNDED)]
+    target = np.linalg.solve(cholesky, from_free.T @ information_vector)
+    unknowns = from_free @ lsq_linear(cholesky.T, target, bounds=(lower_bounds, np.inf), tol=1e-12, max_iter=500).x
+    covariance = from_free @ np.linalg.inv(information) @ from_free.T
     ohm = np.where(unknowns[UNBOUNDED:] > ZERO_FRACTION * prior.scale_ohm, unknowns[UNBOUNDED:], 0.0)
     weak, strong = ohm.reshape(2, RESISTANCES, SOC_NODES.size)
     return LadderFit(unknowns[:SPLINES], unknowns[SPLINES:UNBOUNDED], weak, strong, covariance[UNBOUNDED:, UNBOUNDED:])
@@ -314,10 +314,10 @@ def _prior_information(prior: Prior) -> Floats:
     """Return the information matrix of the prior of all unknowns."""
     table = np.zeros((UNBOUNDED + 2 * PART_SIZE, UNBOUNDED + 2 * PART_SIZE))
     spline = correction_at(EVEN_SOC)
-    near = spline / prior.ocv_error_v[:, None] * np.sqrt(OCV_INTERVALS / EVEN_SOC.size)
+    deviation = spline / prior.ocv_error_v[:, None] * np.sqrt(OCV_INTERVALS / EVEN_SOC.size)
     bend = np.diff(spline, 2, axis=0) * (EVEN_SOC.size - 1) ** 2 / (BEND_V * prior.series)
     bend[EVEN_SOC[1:-1] < LOW_BEND_SOC] /= LOW_BEND_FACTOR
-    table[:SPLINES, :SPLINES] = near.T @ near + bend.T @ bend / OCV_INTERVALS
+    table[:SPLINES, :SPLINES] = deviation.T @ deviation + bend.T @ bend / OCV_INTERVALS
     table[SPLINES:UNBOUNDED, SPLINES:UNBOUNDED] = np.eye(KELVIN_NODES.size) / prior.per_kelvin_v**2
     for first, shape in zip((UNBOUNDED, UNBOUNDED + PART_SIZE), prior.shapes, strict=True):
         rough = _rough_rows() / (ROUGHNESS_STD * prior.scale_ohm) / shape.ravel()
@@ -328,10 +328,10 @@ def _prior_information(prior: Prior) -> Floats:
 
 def _rough_rows() -> Floats:
     """Return the differences of one part's resistances along SOC and between neighbouring RC pairs, as rows."""
-    one = np.eye(PART_SIZE).reshape(RESISTANCES, SOC_NODES.size, PART_SIZE)
-    wide = np.where(SOC_NODES < LOW_SOC, LOW_SOC_ROUGHNESS, 1.0)
-    along = (one[:, 1:] - one[:, :-1]) / wide[None, :-1, None]
-    across = (one[2:] - one[1:-1]) / wide[None, :, None]
+    unknowns = np.eye(PART_SIZE).reshape(RESISTANCES, SOC_NODES.size, PART_SIZE)
+    std_factor = np.where(SOC_NODES < LOW_SOC, LOW_SOC_ROUGHNESS, 1.0)
+    along = (unknowns[:, 1:] - unknowns[:, :-1]) / std_factor[None, :-1, None]
+    across = (unknowns[2:] - unknowns[1:-1]) / std_factor[None, :, None]
     return np.vstack([along.reshape(-1, PART_SIZE), across.reshape(-1, PART_SIZE)])
 
 

@@ -73,7 +73,7 @@ class AdaptiveRun:
         average: Shape (16,), averages (3.19) of a1..a15 at index 1..15.
         crossings: Crossings of a8 and a11.
         epsilon_v: eps2 of Algorithm 1, the maximum error of a converged observer [V].
-        lock_losses: Number of times that the error exceeded ``lock_error_v`` for ``lock_time_s``.
+        lock_losses: Number of times that the observer lost the lock.
         outcome: "converged", or the reason for a failure.
     """
 

@@ -88,7 +88,7 @@ def predict(
     """Simulate the model with constant parameters over a capture that starts at rest.
 
     Args:
-        cell: Capacity and OCV, and the elements if ``a`` is None.
+        cell: Capacity, OCV and elements. ``a``, if given, replaces the elements.
         samples: Raw samples, dtype ``SAMPLE``.
         initial_soc: SOC 0..1 at the first sample.
         a: a1..a15 at index 1..15; None: those of ``cell``.
