@@ -10,7 +10,7 @@ absorb that voltage, and the predicted drop of a cold drive is twice too large.
 
 The weight of a capture does not depend on its number of rows. The weight of a row is the time since the previous row,
 divided by the time since the last change of current, so that each decade of time in a rest has equal weight. The ends of
-long rests together have as much weight again. Each capture counts as ``ROWS_PER_CAPTURE`` rows. Large voltage drops have
+long rests have additional weight: together as much as all other rows. Each capture counts as ``ROWS_PER_CAPTURE`` rows. Large voltage drops have
 an error relative to their size. All constants of this module were chosen by the score of replays on drive cycles that
 were not part of the fit.
 """
@@ -52,7 +52,7 @@ LOW_SOC_ROUGHNESS = 4.0
 BEND_V = 10.0
 """Prior std of d2d/dSOC2 per cell [V]."""
 LOW_BEND_SOC = 0.12
-"""SOC below which that prior std is larger."""
+"""SOC below which the prior std is ``LOW_BEND_FACTOR`` times ``BEND_V``."""
 LOW_BEND_FACTOR = 20.0
 """Factor on ``BEND_V`` below ``LOW_BEND_SOC``."""
 OCV_INTERVALS = 20
@@ -73,14 +73,15 @@ ERROR_V = 4e-3
 ERROR_J = 22e3
 """Activation energy of the growth of ``ERROR_V`` in the cold [J/mol]."""
 SOC_STD = 0.01
-"""Std of the SOC after a change of 1; the variance grows with the change. At a knee far from the start a cell
-deviates from its curve, and that voltage error must not become a resistance."""
+"""Std of the SOC after a change of 1. The variance grows with the change: at a knee far from the start a cell deviates from
+its curve, and this voltage error must not appear as a resistance."""
 RELATIVE_STD = 0.1
-"""Std of a row relative to its voltage drop, which is the largest current of x_0..x_3 times the scale of the resistances."""
+"""Std of a row relative to its voltage drop. The drop is the largest of the currents x_0 to x_3 times the scale of the
+resistances."""
 STEP_ROWS = 30.0
 """Weight of all voltage jumps of a capture at clean current steps, in rows. Jumps determine R_0 and do not drift."""
 STEP_V = 1e-3
-"""Std of these voltage jumps per cell [V]."""
+"""Std of a voltage jump at a clean current step, per cell [V]."""
 STEADY_FRACTION = 0.01
 """Maximum variation of the current before and after a clean step, as a fraction of the largest current. With a varying
 current, a delay between voltage and current samples would change R_0."""
@@ -142,7 +143,7 @@ class LadderFit:
         per_kelvin_v: u at ``KELVIN_NODES`` [V/K].
         weak_ohm: Shape (RESISTANCES, SOC_NODES.size), part with the weak temperature dependence [ohm].
         strong_ohm: Shape as of ``weak_ohm``, part with the strong temperature dependence [ohm].
-        covariance: Covariance of the weak and the strong resistances in this order, each by rows, without the bounds.
+        covariance: Covariance of the weak and then the strong resistances, each row by row. It neglects the bounds at 0.
     """
 
     correction: Floats
@@ -158,7 +159,7 @@ class LadderFit:
         return np.concatenate(parts)
 
     def branches(self, soc: float, first: int, end: int) -> tuple[float, float]:
-        """Return the sum of resistances ``first`` to ``end`` - 1 at ``soc`` and 25 C, and its standard error [ohm]."""
+        """Return the sum of the resistances ``first`` to ``end`` - 1 at ``soc`` and 25 C, and its standard error [ohm]."""
         node_weights = linear_interpolation_matrix(np.array([soc]), SOC_NODES)[0]
         row = np.zeros((2, RESISTANCES, SOC_NODES.size))
         row[:, first:end] = node_weights
@@ -230,7 +231,7 @@ def moments(
     Raises:
         UserError: No sample lies within ``MIN_SOC`` to ``MAX_SOC``.
     """
-    currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
+    currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])  # x_0, x_1, ...
     weight, is_rest_end = _weights(load)
     inside = (soc > MIN_SOC) & (soc < MAX_SOC)
     selected = (_first_of_each_slot(load.time_s) | is_rest_end) & inside
@@ -238,7 +239,7 @@ def moments(
         raise UserError(
             f"{load.name}: no sample between SOC {MIN_SOC:g} and {MAX_SOC:g} [--soc], so that resistances are undetermined"
         )
-    max_current_a = np.abs(currents[:, :4]).max(axis=1)
+    max_current_a = np.abs(currents[:, :4]).max(axis=1)  # of x_0 to x_3, see RELATIVE_STD
     std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * max_current_a)
     std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)
     weight = np.where(selected, weight, 0.0)
@@ -247,6 +248,7 @@ def moments(
     residual_v = load.voltage_v - given_v
     rows = _rows(soc[selected], temperature_c[selected], currents[selected]) * root_weight
     target = residual_v[selected] * root_weight[:, 0]
+    # the rows of voltage jumps: each is the difference between the samples after and before a clean step
     is_after_step = _clean_steps(load) & inside
     is_before_step = np.r_[is_after_step[1:], False]
     if is_after_step.any():

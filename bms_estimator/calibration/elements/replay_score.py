@@ -24,7 +24,7 @@ MIN_SCORED_S = 900.0
 MIN_SOC = 0.05
 """Minimum scored SOC."""
 MAX_STEP_S = 60.0
-"""Maximum weight of a sample in the mean score [s], so that a gap in the capture does not dominate."""
+"""Maximum weight of a sample in a mean over time [s], so that a gap in the capture does not dominate."""
 PENALTY = 40.0
 """Weight of the distance outside the interval, 2 / alpha, with alpha = 0.05 for an interval of 95 %."""
 
