@@ -29,7 +29,8 @@ _MODULES = {
     "load_cell": "model.cell",
     "validate": "calibration.validate",
 }
-"""Module of each public name, imported on first use: importing numba alone would make ``bms-estimator --help`` too slow."""
+"""Module of each public name, imported on first use: importing numba alone would make ``bms-estimator --help`` too
+slow."""
 
 
 def __getattr__(name: str) -> Any:

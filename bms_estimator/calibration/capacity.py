@@ -3,7 +3,7 @@
     z_k = z_c - Ah_k / Q + (offset / Q) t_k
 
 for anchor k of the continuous part c of a capture. The equation is linear in 1/Q, offset/Q and each part's z_c. All
-anchors are solved jointly by generalised least squares. Plett (2011) weighs the errors of both axes; here the offset of
+anchors are solved jointly by generalized least squares. Plett (2011) weighs the errors of both axes; here the offset of
 the current is an unknown with a prior. Errors of the OCV curve are correlated between anchors at similar SOCs, so that
 they cancel in a capacity between two anchors at the same SOC.
 """
@@ -39,8 +39,8 @@ MIN_SOC_SPAN = 0.15
 MAX_RELATIVE_CAPACITY_STD = 0.2
 """Maximum relative std of a capacity."""
 MAX_BEYOND_CURVE_STDS = 3.0
-"""Maximum distance of a rest's voltage beyond the curve's ends, in standard deviations. A larger distance indicates another
-cell."""
+"""Maximum distance of a rest's voltage beyond the curve's ends, in standard deviations. A larger distance indicates
+another cell."""
 MAX_REDUCED_CHI_SQUARED = 9.0
 """Maximum weighted squared residual of the anchors per degree of freedom."""
 OFFSET_ITERATIONS = 3
@@ -273,7 +273,7 @@ def _check_swing(anchors: Sequence[Anchor], rejected: Sequence[str], capacity_ah
 
 
 def _solve(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> Capacity:
-    """Solve for 1/Q, offset/Q and each part's first SOC by generalised least squares."""
+    """Solve for 1/Q, offset/Q and each part's first SOC by generalized least squares."""
     capacity_ah = float(p["capacity_as"]) / 3600.0
     parts = sorted({a.part for a in anchors})
     z, counted_ah = (np.array([getattr(a, name) for a in anchors]) for name in ("soc", "counted_ah"))

@@ -1,4 +1,4 @@
-"""Identification of a fuel cell from polarisation curves and records under changing current, section 7.3 of the thesis.
+"""Identification of a fuel cell from polarization curves and records under changing current, section 7.3 of the thesis.
 
 The voltage is fitted by least squares over the logarithms of all parameters, with the kernel that the observer runs. A
 parameter with a relative std above ``MAX_RELATIVE_STD`` is not changed, and the result states the reason.
@@ -46,11 +46,11 @@ REQUIRED_DATA = {
 
 @dataclass(frozen=True)
 class Source:
-    """Measured voltages of a polarisation curve or a record. Arrays have shape (n,).
+    """Measured voltages of a polarization curve or a record. Arrays have shape (n,).
 
     Attributes:
         name: Name for messages.
-        time_s: Increasing times [s]; None: a polarisation curve of steady-state points.
+        time_s: Increasing times [s]; None: a polarization curve of steady-state points.
         current_a: Current [A], positive when the stack delivers power.
         voltage_v: Voltage of the stack [V].
         temperature_c: Temperature [C]; NaN without a sensor.
@@ -88,7 +88,7 @@ def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFi
     """Identify the parameters of a stack.
 
     Args:
-        sources: Polarisation curves and records.
+        sources: Polarization curves and records.
         start: Initial values. A parameter that the data do not determine has its initial value in the result.
 
     Raises:

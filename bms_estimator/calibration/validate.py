@@ -1,7 +1,7 @@
 """Validation of a cell on a capture: open-loop simulation with constant parameters.
 
-Section 5.3 and chapter 6 of the thesis validate in this way. (2.2)-(2.9) of the thesis are the model of Chen and Mora: two
-RC pairs and a series resistance, whose elements are functions of SOC.
+Section 5.3 and chapter 6 of the thesis validate in this way. (2.2)-(2.9) of the thesis are the model of Chen and Mora:
+two RC pairs and a series resistance, whose elements are functions of SOC.
 """
 
 from dataclasses import dataclass
@@ -55,8 +55,8 @@ class Validation:
         above: Errors over the samples at SOC above ``LOW_SOC``.
         resting: Errors over the samples of ``above`` without current, caused by the OCV and the relaxation.
         loaded: Errors over the samples of ``above`` with current.
-        extra_ohm: Additional series resistance that minimizes the errors ``above`` [ohm]. Its cause may be a contact, the
-            temperature or age.
+        extra_ohm: Additional series resistance that minimizes the errors ``above`` [ohm]. Its cause may be a contact,
+            the temperature or age.
         without_extra_ohm: Errors over the samples of ``above`` that remain after ``extra_ohm`` was added to the model.
         warnings: Contradictions between capture and cell.
         time_s: Shape (n,), times of the good samples, from 0 [s].
@@ -85,8 +85,8 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     """Simulate a capture's voltage from its current alone and compare it with the measured voltage.
 
     The simulation uses the RC ladder of the cell file at the capture's temperature, or (2.2)-(2.9) without a ladder.
-    Near empty the model's C_ts and C_tl are negative. They are replaced with a small positive value, so that the simulation
-    continues.
+    Near empty the model's C_ts and C_tl are negative. They are replaced with a small positive value, so that the
+    simulation continues.
 
     Args:
         capture: Raw samples, rows of dtype ``SAMPLE``; it should start from rest.

@@ -67,7 +67,8 @@ _DRAIN_TIMEOUT_S = 1.0
 _HOST_POLL_S = 0.01
 """Interval of the check for a host that opens the line [s]."""
 _BOOT_S = 0.2
-"""Delay from the opening of the port to the first sample [s]. Opening resets a board, and the host discards old bytes."""
+"""Delay from the opening of the port to the first sample [s]. Opening resets a board, and the host discards old
+bytes."""
 _MAX_SAMPLES_AT_ONCE = 256
 """Maximum number of due samples that are sent before the event loop runs again."""
 _BOOT_READINGS = 256

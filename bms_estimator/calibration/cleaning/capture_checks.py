@@ -9,11 +9,13 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 
 MIN_PEAK_C_RATE = 0.1
-"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with a smaller one is useful only to `ocv`."""
+"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with a smaller one is useful only to
+`ocv`."""
 STEP_FRACTION = 0.1
 """Minimum change of current between two samples of a current step, as a fraction of the capture's largest current."""
 MAX_STEP_S = 3.0
-"""Maximum time between the two samples of a current step [s]. Later samples include relaxation beside the ohmic step."""
+"""Maximum time between the two samples of a current step [s]. Later samples include relaxation beside the ohmic
+step."""
 MIN_STEPS = 5
 """Minimum number of current steps whose median determines the sign of the current."""
 LONG_REST_S = 300.0
@@ -62,7 +64,7 @@ def without_excitation(load: CleanCapture, cell: CellModel) -> bool:
 
 
 def step_resistance(load: CleanCapture) -> float | None:
-    """Return the median of -dV/dI over the current steps [ohm]. It is negative for a wrong sign; None: too few steps."""
+    """Return the median of -dV/dI over the current steps [ohm]; negative for a wrong sign, None for too few steps."""
     change_a = np.diff(load.current_a)
     largest_a = float(np.abs(load.current_a).max(initial=0.0))
     steps = (np.abs(change_a) > STEP_FRACTION * largest_a) & (np.diff(load.time_s) <= MAX_STEP_S)

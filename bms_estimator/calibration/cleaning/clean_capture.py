@@ -10,20 +10,22 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-NEIGHBOURS = 2
-"""Number of neighbours on each side of a sample. A sample is compared with the median of itself and its neighbours."""
-MIN_SAMPLES = 2 * NEIGHBOURS + 1
+NEIGHBORS = 2
+"""Number of neighbors on each side of a sample. A sample is compared with the median of itself and its neighbors."""
+MIN_SAMPLES = 2 * NEIGHBORS + 1
 """Minimum number of good samples of a capture."""
 SPIKE_V = 0.03
-"""Maximum deviation of a voltage from its neighbours' median that the current does not explain, per cell [V]."""
+"""Maximum deviation of a voltage from its neighbors' median that the current does not explain, per cell [V]."""
 SPIKE_C = 0.1
-"""Maximum deviation of a current from its neighbours' median while the voltage stays constant, as C-rate [1/h]."""
+"""Maximum deviation of a current from its neighbors' median while the voltage stays constant, as C-rate [1/h]."""
 RESISTANCE_FACTOR = 3.0
 """Largest plausible voltage change per ampere, in multiples of the series resistance at SOC 0.5."""
 UNCHANGED_FRACTION = 0.01
-"""Maximum change of the voltage at a current spike, as a fraction of the change that the largest resistance explains."""
+"""Maximum change of the voltage at a current spike, as a fraction of the change that the largest resistance
+explains."""
 MIN_GOOD_FRACTION = 0.5
-"""Minimum fraction of samples within the limits of the cell. A smaller fraction means that the cell file is of another cell."""
+"""Minimum fraction of samples within the limits of the cell. A smaller fraction means that the cell file is of another
+cell."""
 
 
 @dataclass(frozen=True)
@@ -120,8 +122,8 @@ def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
 
 
 def _deviation_from_median(values: Floats) -> Floats:
-    """Return each value less the median of the value and its neighbours; 0 at the ends."""
-    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
+    """Return each value less the median of the value and its neighbors; 0 at the ends."""
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBORS + 1)
     deviation = np.zeros(values.size)
-    deviation[NEIGHBOURS:-NEIGHBOURS] = values[NEIGHBOURS:-NEIGHBOURS] - np.median(windows, axis=1)
+    deviation[NEIGHBORS:-NEIGHBORS] = values[NEIGHBORS:-NEIGHBORS] - np.median(windows, axis=1)
     return deviation

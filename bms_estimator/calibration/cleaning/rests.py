@@ -11,9 +11,11 @@ GLITCH_FRACTION = 0.5
 """Maximum deviation of a voltage from the median, as a fraction of the median. A larger one is a fault of the
 instrument, because no Li-ion cell has such a range."""
 MAX_BACKWARD_FRACTION = 0.1
-"""Maximum fraction of samples with a time before that of an earlier sample. A small correction of a clock causes few of them."""
+"""Maximum fraction of samples with a time before that of an earlier sample. A small correction of a clock causes few of
+them."""
 MIN_GOOD_FRACTION = 0.5
-"""Minimum fraction of good voltages. With fewer, the median is not that of good voltages, so that glitches are not recognized."""
+"""Minimum fraction of good voltages. With fewer, the median is not that of good voltages, so that glitches are not
+recognized."""
 REST_C_RATE = 0.01
 """Maximum C-rate of a rest [1/h]. A hundredth of 1 C changes SOC by 0.25 % in a quarter of an hour."""
 NOISE_STDS = 6.0

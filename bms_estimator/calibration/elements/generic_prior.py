@@ -8,9 +8,11 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells, load_cell
 
 COMPARED_SOC = 0.1, 0.95
-"""Lower and upper end of the SOC range in which OCV curves are compared. Outside, the steep ends would dominate the difference."""
+"""Lower and upper end of the SOC range in which OCV curves are compared. Outside, the steep ends would dominate the
+difference."""
 RESTS_STD = 0.35
-"""Relative standard deviation of a ladder with the total resistance from rests and the distribution of a typical cell."""
+"""Relative standard deviation of a ladder with the total resistance from rests and the distribution of a typical
+cell."""
 
 
 def nearest_generic_cell(soc: Floats, ocv_v: Floats, capacity_ah: float, series_count: int) -> CellModel:
@@ -45,8 +47,8 @@ def scaled_generic_ladder(
 ) -> Ladder:
     """Return the generic resistances over SOC, scaled to the resistances from rests.
 
-    Rests do not show the growth of resistances in the cold and near empty. Therefore the growth remains that of the generic
-    cell.
+    Rests do not show the growth of resistances in the cold and near empty. Therefore the growth remains that of the
+    generic cell.
 
     Args:
         generic: Result of ``nearest_generic_cell``.

@@ -76,8 +76,8 @@ PERCENTILES = (2.0, 98.0)
 LADDER_STD = 0.1
 """Relative std of resistances between cells of one make: two NCR18650 differ by 5 to 8 %, and cells age."""
 GENERIC_STD = 0.3
-"""Minimum relative std of a generic ladder. A ladder with a smaller std was identified, so that its temperature range is that
-of captures."""
+"""Minimum relative std of a generic ladder. A ladder with a smaller std was identified, so that its temperature range
+is that of captures."""
 SHAPE_MIN_SOC = 0.4
 """SOC above which a resistance is averaged to normalize its shape."""
 SHAPE_LIMITS = (0.2, 20.0)
@@ -85,7 +85,8 @@ SHAPE_LIMITS = (0.2, 20.0)
 MIN_RMS_SOC = 0.1
 """Lower SOC limit of the reported RMS errors."""
 COUNT_PASSES = 3
-"""Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a knee."""
+"""Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a
+knee."""
 EQUAL_SCORE_RATIO = 1.05
 """Ratio up to which two scores count as equal. Four replays do not resolve a smaller difference."""
 
@@ -129,7 +130,8 @@ class Identification:
         captures: Fit of each capture, in the order given.
         left_out: Names of captures without excitation.
         ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0 if the given OCV is used.
-        score_before: Geometric mean of the captures' interval scores with the given cell [%]; NaN when none has a score.
+        score_before: Geometric mean of the captures' interval scores with the given cell [%]; NaN when none has a
+            score.
         score_after: Geometric mean of the interval scores with the identified cell [%].
     """
 
@@ -220,7 +222,7 @@ def identify(
 
 
 def initial_soc(load: CleanCapture, cell: CellModel) -> float:
-    """Return SOC at the first sample by the voltage of the first rest; without a rest by the loaded voltage plus i R_s."""
+    """Return SOC at the first sample by the voltage of the first rest, without a rest by the first voltage plus i R_s."""
     current_a = 0.0 if load.resting_samples else float(load.current_a[0])
     return soc_from_ocv(load.start_v + current_a * r_s(0.5, cell.a), *ocv_grid(cell))
 
@@ -338,9 +340,9 @@ class _Candidate:
     def _shapes(self) -> Floats:
         """Return the prior shape of the weak and strong part of each resistance over SOC, at ``SOC_NODES``.
 
-        The shape of an identified ladder is used unchanged. Of a generic ladder the square root of the shape is used, because
-        cells differ. The shape is constant for a cell with a voltage plateau, because the generic shape did not fit the
-        captures of an LFP cell.
+        The shape of an identified ladder is used unchanged. Of a generic ladder the square root of the shape is used,
+        because cells differ. The shape is constant for a cell with a voltage plateau, because the generic shape did not
+        fit the captures of an LFP cell.
         """
         given, grid_v = self._cell.ladder, ocv_grid(self._cell)[0]
         if given is None or has_plateau(np.linspace(0.0, 1.0, grid_v.size), grid_v, self._cell.cell.series_count):
@@ -392,7 +394,7 @@ def _moments(runs: list[Run], cell: CellModel) -> list[Moments]:
 
 
 def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
-    """Return the captures with their counted charge rescaled so that the knees of the OCV lie at the measured voltages."""
+    """Return the captures with their counted charge rescaled so that knees of voltage and OCV coincide."""
     for _ in range(COUNT_PASSES):
         miscounts = _Candidate(runs, _moments(runs, cell), cell, refine_ocv=refine_ocv).miscounts()
         runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
@@ -436,8 +438,8 @@ def _ocv_error(cell: CellModel) -> Floats:
 def _curve_error(cell: CellModel) -> Floats:
     """Return the std of the OCV curve at ``EVEN_SOC`` [V], without the error of the hysteresis.
 
-    Captures of drives are discharges. With the error of the hysteresis in the prior, the fit would correct the curve by that
-    error, and the correction would have the wrong sign in charges.
+    Captures of drives are discharges. With the error of the hysteresis in the prior, the fit would correct the curve by
+    that error, and the correction would have the wrong sign in charges.
     """
     error_v = _ocv_error(cell)
     if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:
@@ -483,7 +485,7 @@ def _rms(cell: CellModel, run: Run) -> float:
 
 
 def _geometric_mean(scores: Floats) -> float:
-    """Return the geometric mean of the finite scores. In it, a capture with a high score for every cell does not dominate."""
+    """Return the geometric mean, in which a capture with a high score for every cell does not dominate; NaN without scores."""
     finite = scores[np.isfinite(scores)]
     return float(np.exp(np.log(finite).mean())) if finite.size else float("nan")
 

@@ -122,7 +122,7 @@ def _elements_from_rest(
 
 
 def _rc_resistance(voltage_v: float, current_a: float, load_s: float, tau_s: float) -> float:
-    """Return the resistance of an RC pair that a load of ``load_s`` charged to ``voltage_v`` [ohm]: (2.2) solved for R."""
+    """Return the resistance [ohm] of an RC pair that a load of ``load_s`` charged to ``voltage_v``, by (2.2)."""
     charged_fraction = -float(np.expm1(-load_s / tau_s))
     return max(voltage_v / (current_a * charged_fraction), MIN_OHM)
 

@@ -1,4 +1,4 @@
-"""Fit of an RC ladder's resistances to captures by regularised linear least squares with all resistances positive.
+"""Fit of an RC ladder's resistances to captures by regularized linear least squares with all resistances positive.
 
     v = E_o(SOC) + d(SOC) + (T - 25 C) u(SOC) - sum_k [w_k(SOC) g_w(T) + s_k(SOC) g_s(T)] x_k
 
@@ -9,10 +9,10 @@ unknowns. u also absorbs the voltage that a cold cell has not relaxed after half
 absorb that voltage, and the predicted drop of a cold drive is twice too large.
 
 The weight of a capture does not depend on its number of rows. The weight of a row is the time since the previous row,
-divided by the time since the last change of current, so that each decade of time in a rest has equal weight. The ends of
-long rests have additional weight: together as much as all other rows. Each capture counts as ``ROWS_PER_CAPTURE`` rows. Large voltage drops have
-an error relative to their size. All constants of this module were chosen by the score of replays on drive cycles that
-were not part of the fit.
+divided by the time since the last change of current, so that each decade of time in a rest has equal weight. The ends
+of long rests have additional weight: together as much as all other rows. Each capture counts as ``ROWS_PER_CAPTURE``
+rows. Large voltage drops have an error relative to their size. All constants of this module were chosen by the score of
+replays on drive cycles that were not part of the fit.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ capture has no current steps."""
 ZERO_FRACTION = 1e-6
 """Fraction of the scale below which a fitted resistance counts as 0."""
 ROUGHNESS_STD = 0.1
-"""Prior std of the difference of a resistance between two SOC nodes, and between two neighbouring RC pairs, relative to
+"""Prior std of the difference of a resistance between two SOC nodes, and between two neighboring RC pairs, relative to
 the scale. The resistance per decade of time is about constant from a second to an hour."""
 LOW_SOC = 0.15
 """SOC below which ``ROUGHNESS_STD`` is larger."""
@@ -73,8 +73,8 @@ ERROR_V = 4e-3
 ERROR_J = 22e3
 """Activation energy of the growth of ``ERROR_V`` in the cold [J/mol]."""
 SOC_STD = 0.01
-"""Std of the SOC after a change of 1. The variance grows with the change: at a knee far from the start a cell deviates from
-its curve, and this voltage error must not appear as a resistance."""
+"""Std of the SOC after a change of 1. The variance grows with the change: at a knee far from the start a cell deviates
+from its curve, and this voltage error must not appear as a resistance."""
 RELATIVE_STD = 0.1
 """Std of a row relative to its voltage drop. The drop is the largest of the currents x_0 to x_3 times the scale of the
 resistances."""
@@ -116,8 +116,8 @@ class Moments:
     X are the rows of the model, W their weights. The miscount is the relative error of the counted charge.
 
     Attributes:
-        information: X'WX with the miscount of the charge marginalised.
-        information_vector: X'Wy with the miscount marginalised.
+        information: X'WX with the miscount of the charge marginalized.
+        information_vector: X'Wy with the miscount marginalized.
         miscount_cross: X'Wc, where c is the voltage change by a miscount of 1.
         miscount_information: c'Wc plus the inverse prior variance of the miscount.
         miscount_vector: c'Wy plus the part of the miscount's prior.
@@ -143,7 +143,8 @@ class LadderFit:
         per_kelvin_v: u at ``KELVIN_NODES`` [V/K].
         weak_ohm: Shape (RESISTANCES, SOC_NODES.size), part with the weak temperature dependence [ohm].
         strong_ohm: Shape as of ``weak_ohm``, part with the strong temperature dependence [ohm].
-        covariance: Covariance of the weak and then the strong resistances, each row by row. It neglects the bounds at 0.
+        covariance: Covariance of the weak and then the strong resistances, each row by row. It neglects the bounds at
+            0.
     """
 
     correction: Floats
@@ -159,7 +160,7 @@ class LadderFit:
         return np.concatenate(parts)
 
     def branches(self, soc: float, first: int, end: int) -> tuple[float, float]:
-        """Return the sum of the resistances ``first`` to ``end`` - 1 at ``soc`` and 25 C, and its standard error [ohm]."""
+        """Return the sum of resistances ``first`` to ``end`` - 1 at ``soc`` and 25 C, and its standard error [ohm]."""
         node_weights = linear_interpolation_matrix(np.array([soc]), SOC_NODES)[0]
         row = np.zeros((2, RESISTANCES, SOC_NODES.size))
         row[:, first:end] = node_weights
@@ -176,8 +177,8 @@ class Prior:
         per_kelvin_v: Std of u [V/K]; ``FIXED_PER_KELVIN_STD_V`` if u is not fitted.
         scale_ohm: Scale of the resistances [ohm].
         series: Cells in series.
-        shapes: Shape (2, RESISTANCES, SOC_NODES.size), typical course of the weak and strong part of each resistance over
-            SOC, relative to a mean.
+        shapes: Shape (2, RESISTANCES, SOC_NODES.size), typical course of the weak and strong part of each resistance
+            over SOC, relative to a mean.
         weak_share: Shape (RESISTANCES, SOC_NODES.size), given fraction of each resistance that is the weak part; None:
             the captures determine it.
     """
@@ -329,7 +330,7 @@ def _prior_information(prior: Prior) -> Floats:
 
 
 def _rough_rows() -> Floats:
-    """Return the differences of one part's resistances along SOC and between neighbouring RC pairs, as rows."""
+    """Return the differences of one part's resistances along SOC and between neighboring RC pairs, as rows."""
     unknowns = np.eye(PART_SIZE).reshape(RESISTANCES, SOC_NODES.size, PART_SIZE)
     std_factor = np.where(SOC_NODES < LOW_SOC, LOW_SOC_ROUGHNESS, 1.0)
     along = (unknowns[:, 1:] - unknowns[:, :-1]) / std_factor[None, :-1, None]

@@ -1,8 +1,8 @@
 """Score of an estimator with a cell. Replays start in mid-load with an initial SOC that is too low or too high.
 
-The measure is the interval score of SOC +- 2 std (Gneiting and Raftery, JASA 102 (2007) 359). It is the width of the interval
-plus 40 times the distance of the true SOC outside the interval. The score is proper: its expected value is smallest for the
-true interval.
+The measure is the interval score of SOC +- 2 std (Gneiting and Raftery, JASA 102 (2007) 359). It is the width of the
+interval plus 40 times the distance of the true SOC outside the interval. The score is proper: its expected value is
+smallest for the true interval.
 """
 
 import numpy as np

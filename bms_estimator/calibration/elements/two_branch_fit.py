@@ -1,7 +1,7 @@
 """Coefficients a1..a15 of two RC pairs and a series resistance that are equivalent to an RC ladder at 25 C.
 
-Each element is an exponential of SOC plus an offset, (2.5)-(2.9) of the thesis. delta1 (2.11) and delta2 (2.12) are the SOCs
-below which the capacitances are negative.
+Each element is an exponential of SOC plus an offset, (2.5)-(2.9) of the thesis. delta1 (2.11) and delta2 (2.12) are the
+SOCs below which the capacitances are negative.
 """
 
 import numpy as np
@@ -24,7 +24,8 @@ MIN_FRACTION = 1e-4
 MAX_DELTA = 0.01
 """Maximum delta1 and delta2. The capacitances are positive down to this SOC."""
 SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT), "r_tl": (1 + SHORT, RESISTANCES)}
-"""First index, and index after the last, of the ladder's resistances whose sum each section of the cell file contains."""
+"""First index, and index after the last, of the ladder's resistances whose sum each section of the cell file
+contains."""
 
 
 def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:

@@ -1,8 +1,8 @@
 """Fit of Chen and Mora's formula of the open-circuit voltage, (2.10) of the thesis, to points of relaxation tests.
 
-The formula has the coefficients a16 to a21. ``Points`` of one or more tests are fitted jointly. For comparison, ``average``
-averages the parameters of single fits as the thesis does in (5.1)-(5.2). The mean of strongly correlated parameters is a poor
-fit.
+The formula has the coefficients a16 to a21. ``Points`` of one or more tests are fitted jointly. For comparison,
+``average`` averages the parameters of single fits as the thesis does in (5.1)-(5.2). The mean of strongly correlated
+parameters is a poor fit.
 """
 
 from dataclasses import dataclass
@@ -17,14 +17,15 @@ from bms_estimator.model.cell import ChenMoraOcv
 NAMES = ("a16", "a17", "a18", "a19", "a20", "a21")
 """Names of the parameters of (2.10)."""
 LOWER = np.array([1e-6, 5.0, 1e-6, -np.inf, -np.inf, -np.inf])
-"""Lower bounds of a16..a21. In the thesis all are positive. a19..a21 are unbounded here, because the cubic of a real cell
-may have negative coefficients: the NCR18650 points fit to 9.6 mV RMS, and to 10.6 mV with positive coefficients. Below an
-exponent of 5 the exponential covers all SOC and cannot be distinguished from the cubic."""
+"""Lower bounds of a16..a21. In the thesis all are positive. a19..a21 are unbounded here, because the cubic of a real
+cell may have negative coefficients: the NCR18650 points fit to 9.6 mV RMS, and to 10.6 mV with positive coefficients.
+Below an exponent of 5 the exponential covers all SOC and cannot be distinguished from the cubic."""
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
-"""Upper bounds of a16..a21. At an exponent of 300 the exponential has decayed by SOC 0.01. ``fit_chen_mora`` bounds a16 by
-the highest point, so that E_o(0) is not far below 0 V even if the last points are steep."""
+"""Upper bounds of a16..a21. At an exponent of 300 the exponential has decayed by SOC 0.01. ``fit_chen_mora`` bounds a16
+by the highest point, so that E_o(0) is not far below 0 V even if the last points are steep."""
 AT_BOUND_V = 1e-5
-"""Distance from its bound below which an amplitude counts as at the bound: less than the resolution of converters [V]."""
+"""Distance from its bound below which an amplitude counts as at the bound: less than the resolution of converters
+[V]."""
 EXPONENTS = np.geomspace(5.0, 300.0, 60)
 """Candidate exponents a17 from which the search starts."""
 

@@ -50,7 +50,7 @@ def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
 
 
 def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
-    """Return the change of E_o(SOC) by temperature and hysteresis [V]. Initially the hysteresis is that after a charge."""
+    """Return the change of E_o(SOC) by temperature and hysteresis [V]. The hysteresis starts as that after a charge."""
     ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(load)
     if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
         added_v += np.interp(soc, ocv.soc, ocv.per_kelvin_v) * (temperature_c - REFERENCE_C)

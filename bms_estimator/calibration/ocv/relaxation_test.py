@@ -1,8 +1,8 @@
-"""Voltage relaxation test, section 5.2.1 of the thesis: points of the open-circuit voltage from a capture of loads and rests.
+"""Voltage relaxation test: points of the open-circuit voltage from a capture of loads and rests.
 
-A cell is discharged in steps with a rest after each. At the end of a rest its voltage is near the open-circuit voltage.
-The remaining relaxation is extrapolated with an exponential, and the standard deviation of the point contains the error
-of the extrapolation.
+The test is described in section 5.2.1 of the thesis. A cell is discharged in steps with a rest after each. At the end
+of a rest its voltage is near the open-circuit voltage. The remaining relaxation is extrapolated with an exponential,
+and the standard deviation of the point contains the error of the extrapolation.
 """
 
 from dataclasses import dataclass
@@ -38,8 +38,9 @@ from a drift, so that its extrapolation diverges."""
 TAU_COUNT = 40
 """Number of candidate time constants."""
 EXTRAPOLATION_ERROR = 0.6
-"""Std of the extrapolated change, as a fraction of the change, because relaxation is no pure exponential. Half-hour rests
-of a NCR18650, cut to a quarter of an hour, miss their end voltage by 2.4 mV RMS with extrapolation and by 4.7 mV without."""
+"""Std of the extrapolated change, as a fraction of the change, because relaxation is no pure exponential. Half-hour
+rests of a NCR18650, cut to a quarter of an hour, miss their end voltage by 2.4 mV RMS with extrapolation and by 4.7 mV
+without."""
 MIN_NOISE_V = 1e-4
 """Minimum noise of a voltage [V]."""
 SLOW_TAU_S = 600.0
@@ -99,10 +100,10 @@ class RelaxationTest:
         glitches: Number of samples dropped as faults of the instrument.
         start_soc: SOC at the first sample.
         end_soc: SOC at the last sample.
-        empty_v: Open-circuit voltage at SOC 0 [V], which is the last loaded voltage plus the overpotential at the end of the
-            previous load. NaN when the capture ends above SOC 0.02 or at rest.
-        full_v: Voltage of the first sample if it is at rest and full, which is the open-circuit voltage at SOC 1 [V]; otherwise
-            NaN.
+        empty_v: Open-circuit voltage at SOC 0 [V], which is the last loaded voltage plus the overpotential at the end
+            of the previous load. NaN when the capture ends above SOC 0.02 or at rest.
+        full_v: Voltage of the first sample if it is at rest and full, which is the open-circuit voltage at SOC 1 [V];
+            otherwise NaN.
     """
 
     name: str
@@ -278,8 +279,8 @@ def _extrapolated_rest(rest: SampleBlock, soc: float, *, after_charge: bool) -> 
 def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[float, float]:
     """Fit v = v_inf + b e^(-t/tau); return v_inf and its standard deviation [V].
 
-    For each tau of a grid, v_inf and b are fitted by linear least squares. The result is the mean over the grid, weighted
-    by likelihood, so that the standard deviation contains the uncertainty of tau.
+    For each tau of a grid, v_inf and b are fitted by linear least squares. The result is the mean over the grid,
+    weighted by likelihood, so that the standard deviation contains the uncertainty of tau.
     """
     elapsed = time_s - time_s[0]
     taus = np.geomspace(MIN_TAU * duration_s, MAX_TAU * duration_s, TAU_COUNT)

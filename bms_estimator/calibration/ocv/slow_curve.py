@@ -1,7 +1,8 @@
 """Low-rate curves: open-circuit voltage from discharges and charges at a small constant current (pseudo-OCV).
 
 The open-circuit voltage is the mean of a discharge and a charge of one cell. The hysteresis is half of their difference
-less the ohmic drop. An unpaired discharge or charge gives the open-circuit voltage with an error of half the difference.
+less the ohmic drop. An unpaired discharge or charge gives the open-circuit voltage with an error of half the
+difference.
 """
 
 from collections.abc import Sequence
@@ -18,10 +19,11 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 MIN_DURATION_S = 7.0 * 3600.0
-"""Minimum duration of a low-rate curve, that of a full curve at C/7 [s]. At C/10 half of the difference between discharge
-and charge is some 20 mV."""
+"""Minimum duration of a low-rate curve, that of a full curve at C/7 [s]. At C/10 half of the difference between
+discharge and charge is some 20 mV."""
 MAX_CURRENT_DEVIATION = 0.05
-"""Maximum relative deviation of a constant current from its median, in addition to a standard deviation of its noise."""
+"""Maximum relative deviation of a constant current from its median, in addition to a standard deviation of its
+noise."""
 SMOOTH_SAMPLES = 31
 """Length of the median filter [samples]. It removes faults and divides the noise by about five."""
 STD_PER_MEDIAN_STEP = 1.05
@@ -35,7 +37,8 @@ PAIR_K = 5.0
 PAIR_CURRENT = 0.3
 """Maximum relative difference of the current between discharge and charge of a pair."""
 MAX_MISSING_SOC = 0.1
-"""Maximum SOC by which a charge may end below full. A larger difference means an incomplete charge or a wrong current."""
+"""Maximum SOC by which a charge may end below full. A larger difference means an incomplete charge or a wrong
+current."""
 GRID = np.unique(
     np.round(np.r_[np.arange(0, 0.1, 0.005), np.arange(0.1, 0.95, 0.01), np.arange(0.95, 1.0, 0.005), 1], 4)
 )
@@ -59,8 +62,8 @@ PAIR_FRACTION = 0.1
 UNPAIRED_FRACTION = 0.5
 """Systematic error as a fraction of the half difference, at SOCs where only one curve of a pair has data."""
 END_TRANSIENT_SOC = 0.03
-"""SOC range before the end of a charge that stops early. The voltage rises there before the end, so that the range is not
-averaged with the discharge."""
+"""SOC range before the end of a charge that stops early. The voltage rises there before the end, so that the range is
+not averaged with the discharge."""
 UNPAIRED_V = 0.01
 """Systematic error of an unpaired curve without its ohmic part, per cell in series [V]."""
 PAIR_COLD_FRACTION = 0.25

@@ -33,12 +33,12 @@ GIVEN_COMMON_V = 2e-3
 """Std of the systematic error of a given curve, per cell [V]."""
 REST_SHARE = 0.7
 """Fraction of the half difference of low-rate curves that is hysteresis and remains in a rest after a discharge. The
-remainder is polarisation. Measured fractions are 0.4 and 0.5 for an NCA cell, 1.0 for an LFP cell."""
+remainder is polarization. Measured fractions are 0.4 and 0.5 for an NCA cell, 1.0 for an LFP cell."""
 REST_SHARE_STD = 0.3
 """Std of ``REST_SHARE``."""
 PLATEAU_SHARE = 0.9
-"""Fraction of the hysteresis that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the hysteresis (Dreyer et
-al., Nature Materials 9, 2010, 448). Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
+"""Fraction of the hysteresis that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the
+hysteresis (Dreyer et al., Nature Materials 9, 2010, 448). Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
 PLATEAU_V = 0.15
 """Maximum slope dOCV/dSOC of a plateau, per cell [V]."""
 PLATEAU_SOC = 0.05
@@ -332,7 +332,7 @@ def _soc_at(curve: TableFit, voltage_v: float) -> float:
 
 
 def _centered(points: Points, hysteresis_at_rest_v: Floats, relative_std: float) -> Points:
-    """Move points to the mean of discharge and charge by the hysteresis ``hysteresis_at_rest_v``, with an error of ``relative_std``."""
+    """Move points to the mean of discharge and charge by a hysteresis with the error ``relative_std``."""
     hysteresis_v = np.interp(points.soc, GRID, hysteresis_at_rest_v)
     return replace(
         points,

@@ -5,11 +5,11 @@ One linear Gaussian model over all points (a smoothing spline with random effect
 
     v = f(SOC) + (T - 25 C) u(SOC) + c(T) w(SOC) + f'(SOC) (s + q (1 - SOC)) + d(SOC) + noise
 
-f is the curve, a cubic spline with a prior of the curvature of real cells. u is dE/dT. c(T) w(SOC) is the error of rests that
-were too short at low temperature: c is its std, ``Points.cold_v``. w is common to all sources and can hardly be distinguished
-from u, so that the priors divide the observed difference between both. s and q are the errors of a source's first SOC and of
-its capacity. d is the systematic error of a source. The priors of u, w, s, q and d have mean 0. The curve's standard deviation
-follows from the posterior covariance and is large in gaps between points.
+f is the curve, a cubic spline with a prior of the curvature of real cells. u is dE/dT. c(T) w(SOC) is the error of
+rests that were too short at low temperature: c is its std, ``Points.cold_v``. w is common to all sources and can hardly
+be distinguished from u, so that the priors divide the observed difference between both. s and q are the errors of a
+source's first SOC and of its capacity. d is the systematic error of a source. The priors of u, w, s, q and d have mean
+0. The curve's standard deviation follows from the posterior covariance and is large in gaps between points.
 """
 
 import itertools
@@ -70,10 +70,11 @@ EMPTY_STD_V = 0.05
 FULL_STD_V = 0.005
 """Std of the voltage at SOC 1 without a rest there, per ``CELL_V`` [V]."""
 MAX_SLOPE_V = 2.0
-"""Upper limit of the slope f' that converts an error of SOC to one of voltage, per ``CELL_V`` [V]. At the ends of the curve
-the slope is too uncertain."""
+"""Upper limit of the slope f' that converts an error of SOC to one of voltage, per ``CELL_V`` [V]. At the ends of the
+curve the slope is too uncertain."""
 STD_OF_MEDIAN = 1.48
-"""Standard deviation of a normal distribution over the median of its magnitude. The median is robust against outliers."""
+"""Standard deviation of a normal distribution over the median of its magnitude. The median is robust against
+outliers."""
 ITERATIONS = 4
 """Number of iterations. Each uses the slope f' and the errors of the sources of the previous iteration."""
 
@@ -305,6 +306,6 @@ def _middles() -> Floats:
 
 
 def _bend_rows(std_v: Floats) -> Floats:
-    """Return the rows of the curvature prior with std ``std_v``, weighted by the interval length relative to ``BEND_LENGTH``."""
+    """Return the rows of the curvature prior with std ``std_v``, weighted by interval length over ``BEND_LENGTH``."""
     weight = np.sqrt(np.diff(_edges()) / BEND_LENGTH) / std_v
     return np.asarray(_spline(_middles(), 2) * weight[:, None])

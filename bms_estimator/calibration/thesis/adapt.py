@@ -1,8 +1,8 @@
 """Calibration of a1..a15 by the procedure of the thesis "Adaptive Estimation of Li-ion Battery Model Parameters".
 
-a1..a15 are the coefficients of the elements of Chen and Mora's model: three for each of R_ts, R_tl, C_ts, C_tl and R_s as
-functions of SOC, (2.5)-(2.9) of the thesis. Step 1, the OCV, is part of the given cell. Step 2 is the adaptive observer for
-a1..a12, step 3 the fit of R_s, a13..a15. The result is scored by the replays of `identify`.
+a1..a15 are the coefficients of the elements of Chen and Mora's model: three for each of R_ts, R_tl, C_ts, C_tl and R_s
+as functions of SOC, (2.5)-(2.9) of the thesis. Step 1, the OCV, is part of the given cell. Step 2 is the adaptive
+observer for a1..a12, step 3 the fit of R_s, a13..a15. The result is scored by the replays of `identify`.
 """
 
 from collections.abc import Sequence
@@ -73,8 +73,8 @@ class Adaptation:
 def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = None) -> Adaptation:
     """Estimate a1..a15 by the thesis's procedure.
 
-    If the cell file has no bounds for the adaptive law (3.18), those printed in Table 10 of the thesis are used, scaled to
-    the cell's capacity.
+    If the cell file has no bounds for the adaptive law (3.18), those printed in Table 10 of the thesis are used, scaled
+    to the cell's capacity.
 
     Args:
         captures: Raw samples, rows of dtype ``SAMPLE``; each starts from rest.

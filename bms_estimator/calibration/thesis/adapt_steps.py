@@ -1,8 +1,8 @@
 """Steps 2 and 3 of the thesis on captures.
 
-Step 2 runs the adaptive observer (Algorithm 1) and averages its parameters by (3.19), which gives a1..a12, the coefficients
-of R_ts, R_tl, C_ts and C_tl. Step 3 computes R_s by (4.2) and fits its coefficients a13..a15. Step 1, the fit of the
-open-circuit voltage to rests, is the command `ocv`. Its result is part of the given cell.
+Step 2 runs the adaptive observer (Algorithm 1) and averages its parameters by (3.19), which gives a1..a12, the
+coefficients of R_ts, R_tl, C_ts and C_tl. Step 3 computes R_s by (4.2) and fits its coefficients a13..a15. Step 1, the
+fit of the open-circuit voltage to rests, is the command `ocv`. Its result is part of the given cell.
 """
 
 from collections.abc import Sequence

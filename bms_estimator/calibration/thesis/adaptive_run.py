@@ -1,10 +1,10 @@
-"""Step 2 of the thesis: run of the adaptive observer over a capture (Algorithm 1, schemes 1 to 3), which estimates a1..a15.
+"""Step 2 of the thesis: run of the adaptive observer over a capture, Algorithm 1 and schemes 1 to 3.
 
 Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
 
-a1..a15 are the coefficients of the elements of Chen and Mora's model as functions of SOC. The observer runs over the whole
-capture. It stops adapting at the SOC below which a capacitance of the model is negative (Fig. 19). The result contains
-"converged" or the reason for a failure.
+a1..a15 are the coefficients of the elements of Chen and Mora's model as functions of SOC. The observer runs over the
+whole capture. It stops adapting at the SOC below which a capacitance of the model is negative (Fig. 19). The result
+contains "converged" or the reason for a failure.
 """
 
 import itertools

@@ -1,8 +1,8 @@
 """Average of the parameters over the settled part of a run, (3.19) of the thesis.
 
 The average begins at the time t_int, when the error has settled, and ends at the time t_unst, when the battery becomes
-unstable. Both times are determined from the run. delta1 (2.11) and delta2 (2.12) are the SOCs below which C_ts and C_tl of the model are
-negative.
+unstable. Both times are determined from the run. delta1 (2.11) and delta2 (2.12) are the SOCs below which C_ts and C_tl
+of the model are negative.
 """
 
 from dataclasses import dataclass
@@ -52,9 +52,9 @@ def averaging_window(
 ) -> AveragingWindow:
     """Find t_int and t_unst of (3.19).
 
-    t_unst is the time at which ``margin`` reaches zero or the voltage reaches its knee, whichever is first. From t_int to
-    t_unst, 99 % of the errors are within ``epsilon_v`` and each parameter a_i is within 0.1 % of its median. An average from
-    the first sample on would contain the transient from the initial value of a_i.
+    t_unst is the time at which ``margin`` reaches zero or the voltage reaches its knee, whichever is first. From t_int
+    to t_unst, 99 % of the errors are within ``epsilon_v`` and each parameter a_i is within 0.1 % of its median. An
+    average from the first sample on would contain the transient from the initial value of a_i.
 
     Args:
         time_s: Shape (n,) [s].

@@ -1,8 +1,8 @@
 """Terminal voltage of Chen and Mora's model with constant parameters a1..a15 under a measured current.
 
 Section 5.3 and chapter 6 of the thesis validate the parameters in this way. Numbers in parentheses are equations of the
-thesis. The dynamic model has elements that depend on SOC. The static model has constant elements, those at one SOC. In both,
-E_o depends on SOC.
+thesis. The dynamic model has elements that depend on SOC. The static model has constant elements, those at one SOC. In
+both, E_o depends on SOC.
 """
 
 from dataclasses import dataclass, fields
@@ -67,7 +67,7 @@ class Prediction:
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """Mask without the first samples after current jumps, where many loggers report a voltage from before the jump."""
+        """Mask without the first samples after current jumps. Many loggers report a voltage from before the jump there."""
         jump_a = np.abs(np.diff(self.current_a, prepend=self.current_a[0]))
         return np.asarray(jump_a <= JUMP_FRACTION * np.abs(self.current_a).max())
 
@@ -92,8 +92,8 @@ def predict(
         samples: Raw samples, dtype ``SAMPLE``.
         initial_soc: SOC 0..1 at the first sample.
         a: a1..a15 at index 1..15; None: those of ``cell``.
-        lowest_soc: SOC below which the prediction ends. It also ends just above delta1 and delta2, the SOCs below which a
-            capacitance of the model is negative.
+        lowest_soc: SOC below which the prediction ends. It also ends just above delta1 and delta2, the SOCs below which
+            a capacitance of the model is negative.
 
     Raises:
         UserError: No sample is good, or SOC is too low at the first one.
@@ -143,7 +143,7 @@ def static_elements(a: Floats, soc: float) -> Floats:
 
 
 def _unstable_below(a: Floats) -> float:
-    """Return the SOC below which a capacitance is negative, (2.11), (2.12), with a margin; 0 if no capacitance is negative."""
+    """Return the SOC below which a capacitance is negative, (2.11), (2.12), with a margin; 0 if none is negative."""
     unstable_soc = max(delta(a[i + 1], a[i + 2], a[i]) for i in (7, 10))
     return DELTA_FACTOR * unstable_soc + DELTA_MARGIN if unstable_soc > 0.0 else 0.0
 

@@ -3,14 +3,14 @@
 Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
 
 The thesis prints (4.2) with the opposite sign. Solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive:
-E_o is the open-circuit voltage, y the terminal voltage, i the current. x2 and x3, the voltages of both RC pairs, are simulated
-with constant a1..a12. The observer's x2 and x3 cannot be used: they would contain i R_s, because the observer's output (4.1)
-follows y.
+E_o is the open-circuit voltage, y the terminal voltage, i the current. x2 and x3, the voltages of both RC pairs, are
+simulated with constant a1..a12. The observer's x2 and x3 cannot be used: they would contain i R_s, because the
+observer's output (4.1) follows y.
 
-(4.2) as printed divides by the current. An error of the open-circuit voltage of 10 mV therefore becomes 65 mohm at C/20 and
-2 mohm at 1.5C. The thesis averages over the currents with equal weights, so that the value at C/20 has the weight of the value at 1.5C
-(erratum 19). Here the voltage i R_s is fitted by least squares, so that each value of (4.2) has its squared current as
-weight.
+(4.2) as printed divides by the current. An error of the open-circuit voltage of 10 mV therefore becomes 65 mohm at C/20
+and 2 mohm at 1.5C. The thesis averages over the currents with equal weights, so that the value at C/20 has the weight
+of the value at 1.5C (erratum 19). Here the voltage i R_s is fitted by least squares, so that each value of (4.2) has
+its squared current as weight.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,8 @@ class SeriesResistance:
     Attributes:
         soc: Mean SOC of the bin's samples, 0..1.
         r_s_ohm: R_s (4.2) of the bin, by least squares on the voltage [ohm].
-        weight: Mean of the squared current in the bin [A^2]; after ``mean_of`` the sum of these means over the captures.
+        weight: Mean of the squared current in the bin [A^2]; after ``mean_of`` the sum of these means over the
+            captures.
     """
 
     soc: Floats
