@@ -1,11 +1,14 @@
 """Simulations of the thesis with the cell of Chen and Mora.
 
-The thesis simulates schemes 1 to 3 (section 3.2.5) and the improved method (section 4.1.1). They differ in the law that
-adapts the coefficients a1..a15 of the elements: (3.16) in scheme 1, (3.17) in scheme 2 and (3.18) in scheme 3 and in
-the improved method. The observer's gain is N(k), (3.10). Values that the thesis does not print are chosen as N(k) =
-E_2.5(-k^2.5), k0 = 0, x2(0) = x3(0) = 0, without sensor noise. If the printed weights contradict the printed estimates,
-the inferred weights are used (E4, E24, E32). Numbers in parentheses are equations and sections of the thesis, and E1 to
-E36 are its errata (``errata``).
+Numbers in parentheses are equations and sections of the thesis, and E1 to E36 are its errata (``errata``).
+
+The thesis simulates schemes 1 to 3 (3.2.5) and the improved method (4.1.1). They differ in the law that adapts the
+coefficients a1..a15 of the elements: (3.16) in scheme 1, (3.17) in scheme 2, and (3.18) in scheme 3 and in the improved
+method. The observer's gain is N(k), (3.10).
+
+The thesis does not print all values. Those chosen here are N(k) = E_2.5(-k^2.5), the initial values k0 = 0 and
+x2(0) = x3(0) = 0, and no sensor noise. If the printed weights contradict the printed estimates, the inferred weights
+are used (E4, E24, E32).
 """
 
 from dataclasses import dataclass
@@ -204,7 +207,7 @@ class Simulation:
         )
 
     def _fit_start(self, alpha: float, near_v: float, near_lambda: float) -> FittedStart:
-        """Fit start voltage and lambda to the changes of a2 in Tables 2 and 3, beginning at ``near_v`` and ``near_lambda``."""
+        """Fit start voltage and lambda to the changes of a2 in Tables 2 and 3, near ``near_v`` and ``near_lambda``."""
         shifts = {"scheme-1": printed_values.TABLE_2_SHIFT, "scheme-2": printed_values.TABLE_3_SHIFT}
 
         def residuals(start_v_and_lambda: Floats) -> list[float]:

@@ -222,7 +222,7 @@ def identify(
 
 
 def initial_soc(load: CleanCapture, cell: CellModel) -> float:
-    """Return SOC at the first sample by the voltage of the first rest, without a rest by the first voltage plus i R_s."""
+    """Return SOC at the first sample by the voltage of the first rest; without a rest, by the voltage plus i R_s."""
     current_a = 0.0 if load.resting_samples else float(load.current_a[0])
     return soc_from_ocv(load.start_v + current_a * r_s(0.5, cell.a), *ocv_grid(cell))
 
@@ -485,7 +485,7 @@ def _rms(cell: CellModel, run: Run) -> float:
 
 
 def _geometric_mean(scores: Floats) -> float:
-    """Return the geometric mean, in which a capture with a high score for every cell does not dominate; NaN without scores."""
+    """Return the geometric mean, in which a capture with a high score for every cell does not dominate."""
     finite = scores[np.isfinite(scores)]
     return float(np.exp(np.log(finite).mean())) if finite.size else float("nan")
 

@@ -67,7 +67,7 @@ class Prediction:
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """Mask without the first samples after current jumps. Many loggers report a voltage from before the jump there."""
+        """Mask without the first samples after current jumps. Their voltage is often from before the jump."""
         jump_a = np.abs(np.diff(self.current_a, prepend=self.current_a[0]))
         return np.asarray(jump_a <= JUMP_FRACTION * np.abs(self.current_a).max())
 
