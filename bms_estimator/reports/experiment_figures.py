@@ -62,7 +62,7 @@ def figure_26(experiment: Experiment) -> Figure:
 
 def figure_27(experiment: Experiment) -> Figure:
     """Draw the currents of the relaxation tests."""
-    tests = experiment.procedure.of(Kind.RELAXATION)
+    tests = experiment.procedure.captures_of(Kind.RELAXATION)
     return _figure("27", "Currents of the voltage relaxation tests", _currents(tests, "27"), experiment, "")
 
 
@@ -157,7 +157,7 @@ def figure_31(experiment: Experiment) -> Figure:
 
 def _constant(p: Procedure) -> list[str]:
     """Return the names of the constant loads, at most ``MAX_LOADS``."""
-    return [c.name for c in p.of(Kind.CONSTANT)][:MAX_LOADS]
+    return [c.name for c in p.captures_of(Kind.CONSTANT)][:MAX_LOADS]
 
 
 def _steps(p: Procedure) -> list[str]:
@@ -228,7 +228,7 @@ def figure_33(experiment: Experiment) -> Figure:
 
 def figure_34(experiment: Experiment) -> Figure:
     """Draw the currents of the constant loads."""
-    captures = experiment.procedure.of(Kind.CONSTANT)[:MAX_LOADS]
+    captures = experiment.procedure.captures_of(Kind.CONSTANT)[:MAX_LOADS]
     return _figure("34", "Constant loads: currents", _currents(captures, "34"), experiment, "")
 
 

@@ -113,19 +113,19 @@ class Procedure:
         self.voltage_step_v = voltage_step_v
         self.captures = list(captures)
         for kinds in ((Kind.RELAXATION,), (Kind.CONSTANT, Kind.STEPS)):
-            if not self.of(*kinds):
+            if not self.captures_of(*kinds):
                 needed = " or ".join(kind.value for kind in kinds)
                 listed = ", ".join(f"{c.name} ({c.kind.value})" for c in self.captures)
                 raise UserError(f"the protocol needs a {needed}; given: {listed or 'nothing'}")
 
-    def of(self, *kinds: Kind) -> list[Capture]:
-        """Return the captures of given kinds."""
+    def captures_of(self, *kinds: Kind) -> list[Capture]:
+        """Return the captures of these kinds."""
         return [capture for capture in self.captures if capture.kind in kinds]
 
     @property
     def loads(self) -> list[Capture]:
         """Captures with which the model is compared: constant loads and steps. All but ``smallest`` validate."""
-        return self.of(Kind.CONSTANT, Kind.STEPS)
+        return self.captures_of(Kind.CONSTANT, Kind.STEPS)
 
     @property
     def validating(self) -> list[Capture]:
@@ -141,12 +141,12 @@ class Procedure:
             relaxation_test(
                 c.samples, self.cell.cell.capacity_ah, series_count=self.cell.cell.series_count, name=c.name
             )
-            for c in self.of(Kind.RELAXATION)
+            for c in self.captures_of(Kind.RELAXATION)
         ]
 
     @cached_property
     def single_fits(self) -> list[ChenMoraFit]:
-        """Fits of (2.10) to each test, for (5.1)-(5.2)."""
+        """Fits of (2.10) to each test, whose parameters the thesis averages by (5.1)-(5.2)."""
         return [fit_chen_mora(pooled([test])) for test in self.tests]
 
     @cached_property
@@ -168,8 +168,8 @@ class Procedure:
         return max(LOWEST_SOC, min(float(test.soc.min()) for test in self.tests))
 
     @cached_property
-    def with_ocv(self) -> CellModel:
-        """Cell with the fitted (2.10)."""
+    def cell_with_ocv(self) -> CellModel:
+        """Cell with the open-circuit voltage of ``joint_fit``."""
         return self.cell.model_copy(update={"ocv": self.joint_fit.ocv})
 
     def initial_soc(self, capture: Capture) -> float:
@@ -191,14 +191,14 @@ class Procedure:
 
         It is a relaxation test if there is no constant load, or if that load is the only one for validation.
         """
-        constant = self.of(Kind.CONSTANT) if len(self.loads) > 1 else []
-        return min(constant or self.of(Kind.RELAXATION), key=lambda c: float(np.mean(c.samples["current_a"])))
+        constant = self.captures_of(Kind.CONSTANT) if len(self.loads) > 1 else []
+        return min(constant or self.captures_of(Kind.RELAXATION), key=lambda c: float(np.mean(c.samples["current_a"])))
 
     @cached_property
     def adaptive(self) -> AdaptiveRun:
-        """Run of Algorithm 1 on ``smallest``."""
+        """Run of the adaptive observer (Algorithm 1) on ``smallest``."""
         estimator = Estimator(
-            self.with_ocv,
+            self.cell_with_ocv,
             ObserverSettings(),
             identifier=None,
             voltage_resolution_v=self.voltage_step_v,
@@ -212,14 +212,14 @@ class Procedure:
     def step_3(self) -> list[Capture]:
         """Captures of step 3: relaxation tests, and constant loads up to ``MAX_STEP_3_C``."""
         max_a = MAX_STEP_3_C * self.cell.cell.capacity_ah
-        constant = [c for c in self.of(Kind.CONSTANT) if np.median(c.samples["current_a"]) <= max_a]
-        return [*constant, *self.of(Kind.RELAXATION)]
+        constant = [c for c in self.captures_of(Kind.CONSTANT) if np.median(c.samples["current_a"]) <= max_a]
+        return [*constant, *self.captures_of(Kind.RELAXATION)]
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
         """R_s by (4.2) from each capture of ``step_3``."""
         a = self.adaptive.average
-        return {c.name: series_resistance(self.with_ocv, self._predict(c, a)) for c in self.step_3}
+        return {c.name: series_resistance(self.cell_with_ocv, self._predict(c, a)) for c in self.step_3}
 
     @cached_property
     def r_s_mean(self) -> SeriesResistance:
@@ -247,7 +247,7 @@ class Procedure:
     # Validation -------------------------------------------------------------------------------------------------
 
     def _predict(self, capture: Capture, a: Floats) -> Prediction:
-        return predict(self.with_ocv, capture.samples, self.initial_soc(capture), a=a, lowest_soc=self.lowest_soc)
+        return predict(self.cell_with_ocv, capture.samples, self.initial_soc(capture), a=a, lowest_soc=self.lowest_soc)
 
     @cached_property
     def dynamic(self) -> dict[str, Prediction]:
@@ -262,10 +262,10 @@ class Procedure:
     @cached_property
     def largest(self) -> str:
         """Name of the constant load with the largest current (the bulb in Fig. 41); without one, of the first load."""
-        constant = self.of(Kind.CONSTANT) or self.loads[:1]
+        constant = self.captures_of(Kind.CONSTANT) or self.loads[:1]
         return max(constant, key=lambda c: float(np.median(c.samples["current_a"]))).name
 
     def interpolated(self, name: str) -> tuple[Floats, Floats]:
         """Return SOC and E_o by the interpolation of section 7.1 over the load ``name``."""
-        cell = self.with_ocv.model_copy(update={"r_s": self.r_s_without(name).element})
+        cell = self.cell_with_ocv.model_copy(update={"r_s": self.r_s_without(name).element})
         return soc_by_interpolation(cell, self.dynamic[name])

@@ -13,7 +13,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, cell_step, r_s, r_tl, r_ts, terminal_voltage
 from bms_estimator.model.cell import Bounds, CellModel
-from bms_estimator.reports.simulation import observer_settings, to_samples, with_bounds
+from bms_estimator.reports.simulation import IDEAL_RESOLUTION_V, observer_settings, to_samples, with_bounds
 
 STEP_S = 0.1
 """Simulation step [s]."""
@@ -62,7 +62,7 @@ def quasi_steady(cell: CellModel, current_a: float) -> QuasiSteady:
         with_bounds(cell, bounds_around_truth),
         observer_settings("improved"),
         identifier=None,
-        voltage_resolution_v=1e-6,
+        voltage_resolution_v=IDEAL_RESOLUTION_V,
         initial_soc=1.0,
     )
     estimator.run(to_samples(time_s, np.full(time_s.size, current_a), voltage_v))

@@ -53,6 +53,8 @@ STATIC_SOC = 0.5
 FINAL_SOC = 0.02
 """SOC at which the comparison of model and cell ends. Below delta2 = 0.0179 the C_tl of Table 5's estimates is
 negative."""
+IDEAL_RESOLUTION_V = 1e-6
+"""Voltage resolution of simulations without a sensor [V], which is negligible."""
 EPSILON_V = 1e-3
 """eps2 of Algorithm 1 in simulation, the maximum error of a converged observer [V]."""
 LARGE_START_T_INT_S = 60.0
@@ -152,7 +154,9 @@ class Simulation:
     def _observer(self, law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> Estimator:
         """Return an observer whose parameters start and converge as in Tables 2 to 4."""
         settings = observer_settings(law, lambda_, alpha)
-        estimator = Estimator(self.cell, settings, identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0)
+        estimator = Estimator(
+            self.cell, settings, identifier=None, voltage_resolution_v=IDEAL_RESOLUTION_V, initial_soc=1.0
+        )
         record = estimator.settings[0]
         record["a_initial"][1:] = printed_values.CHEN_MORA_ROUNDED
         record["target"][1:] = printed_values.CHEN_MORA_ROUNDED
@@ -234,7 +238,11 @@ class Simulation:
         """Run of the improved method with the settings of Table 5 (a7, a8: E4, E24) at C/10."""
         samples = discharge(self.cell, SMALL_CURRENT_A, 10.0 * STEP_S)
         estimator = Estimator(
-            self.cell, observer_settings("improved"), identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0
+            self.cell,
+            observer_settings("improved"),
+            identifier=None,
+            voltage_resolution_v=IDEAL_RESOLUTION_V,
+            initial_soc=1.0,
         )
         return adaptive_run(estimator, samples)
 

@@ -15,6 +15,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Bounds, CellModel
 from bms_estimator.reports.simulation import (
+    IDEAL_RESOLUTION_V,
     discharge,
     mean_error_percent,
     observer_settings,
@@ -86,19 +87,19 @@ def measure() -> tuple[RunResult, ...]:
     cell, results = table_5_cell(), []
     for name, bounds in bounds_sets(cell).items():
         bounded = with_bounds(cell, bounds)
-        limit = np.zeros(16)
-        for i, b in bounds.items():
-            limit[i] = b.limit
-        results += [_measure(bounded, name, c_rate, limit) for c_rate in C_RATES]
+        limits = np.zeros(16)
+        for i, bounds_of_parameter in bounds.items():
+            limits[i] = bounds_of_parameter.limit
+        results += [_measure(bounded, name, c_rate, limits) for c_rate in C_RATES]
     return tuple(results)
 
 
-def _measure(cell: CellModel, name: str, c_rate: float, limit: Floats) -> RunResult:
-    """Run the observer from full to empty at ``c_rate``; ``limit`` are the limits of a1..a12 at index 1..12."""
+def _measure(cell: CellModel, name: str, c_rate: float, limits: Floats) -> RunResult:
+    """Run the observer from full to empty at ``c_rate``; ``limits`` are those of a1..a12 at index 1..12."""
     current_a = c_rate * cell.cell.capacity_ah
     samples = discharge(cell, current_a, 3600.0 / c_rate / SAMPLES)
     estimator = Estimator(
-        cell, observer_settings("improved"), identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0
+        cell, observer_settings("improved"), identifier=None, voltage_resolution_v=IDEAL_RESOLUTION_V, initial_soc=1.0
     )
     run = adaptive_run(estimator, samples)
     evaluated = (run.time_s >= SETTLED_FROM_S) & (run.time_s <= run.window.t_unst_s)
@@ -107,9 +108,9 @@ def _measure(cell: CellModel, name: str, c_rate: float, limit: Floats) -> RunRes
         c_rate=c_rate,
         tracking_v=float(np.abs(run.error_v[evaluated]).max()),
         error_percent=_product_errors(run.average, cell.a),
-        limit_percent=_product_errors(limit, cell.a),
+        limit_percent=_product_errors(limits, cell.a),
     )
 
 
-def _product_errors(a: Floats, true: Floats) -> tuple[float, float]:
-    return mean_error_percent(PRODUCTS[0], a, true), mean_error_percent(PRODUCTS[1], a, true)
+def _product_errors(a: Floats, true_a: Floats) -> tuple[float, float]:
+    return mean_error_percent(PRODUCTS[0], a, true_a), mean_error_percent(PRODUCTS[1], a, true_a)

@@ -125,7 +125,7 @@ def _soc_difference(p: Procedure) -> list[Result]:
 
 def products(p: Procedure) -> Iterator[tuple[str, float, float]]:
     """Yield names of relaxation test and RC product, and the product as estimated and as measured in the rests [s]."""
-    for test, capture in zip(p.tests, p.of(Kind.RELAXATION), strict=True):
+    for test, capture in zip(p.tests, p.captures_of(Kind.RELAXATION), strict=True):
         try:
             measured = initial_elements(capture.samples, test, p.cell.cell.capacity_ah)
         except UserError:  # without a rest after a discharge, there is nothing to compare with

@@ -36,7 +36,7 @@ Answers = Mapping[bytes, Callable[[Measured], bytes]]
 
 
 def _to_steps(value: float, per_unit: float, minimum: int, maximum: int) -> int:
-    """Convert a value to integer steps, limited to a range."""
+    """Convert a value to integer steps, of which ``per_unit`` are a unit of the value, limited to a range."""
     return min(max(round(value * per_unit), minimum), maximum)
 
 
@@ -78,29 +78,30 @@ def _daly_status(measured: Measured) -> bytes:
 
 
 def _daly_cells(measured: Measured) -> bytes:
-    steps = [_to_u16(v, 1000) for v in measured.cells_v] + [0, 0]
-    frames = range(math.ceil(len(measured.cells_v) / daly.CELLS_PER_FRAME))
-    return b"".join(_daly_frame(daly.CELLS, struct.pack(">B3H", i + 1, *steps[3 * i : 3 * i + 3])) for i in frames)
+    count = daly.CELLS_PER_FRAME
+    steps = [_to_u16(v, 1000) for v in measured.cells_v] + [0] * (count - 1)  # fills up the last frame
+    frames = range(math.ceil(len(measured.cells_v) / count))
+    return b"".join(
+        _daly_frame(daly.CELLS, struct.pack(">B3H", i + 1, *steps[count * i : count * (i + 1)])) for i in frames
+    )
 
 
 def _daly_probes(measured: Measured) -> bytes:
     has_probe = not math.isnan(measured.temperature_c)
-    return _daly_frame(
-        daly.PROBES, bytes((1, _to_steps(measured.temperature_c + daly.ZERO_C, 1, 1, 255) if has_probe else 0))
-    )
+    probe_byte = _to_steps(measured.temperature_c + daly.ZERO_C, 1, 1, 255) if has_probe else 0
+    return _daly_frame(daly.PROBES, bytes((1, probe_byte)))  # frame number 1
 
 
 def _daly_pack(measured: Measured) -> bytes:
-    current = _to_u16(measured.current_a + daly.ZERO_CURRENT / 10, 10)
-    return _daly_frame(
-        daly.PACK, struct.pack(">4H", _to_u16(measured.voltage_v, 10), 0, current, _to_u16(measured.soc, 1000))
-    )
+    voltage_word = _to_u16(measured.voltage_v, 10)
+    current_word = _to_u16(measured.current_a + daly.ZERO_CURRENT / 10, 10)
+    return _daly_frame(daly.PACK, struct.pack(">4H", voltage_word, 0, current_word, _to_u16(measured.soc, 1000)))
 
 
 def _jk_old(measured: Measured) -> bytes:
-    current_word = _to_steps(abs(measured.current_a), 100, 0, jk.CHARGING - 1) | (
-        jk.CHARGING if measured.current_a < 0.0 else 0
-    )
+    current_word = _to_steps(abs(measured.current_a), 100, 0, jk.CHARGING - 1)
+    if measured.current_a < 0.0:
+        current_word |= jk.CHARGING
     if math.isnan(measured.temperature_c):
         probe_word = jk.ABSENT_C
     else:
@@ -118,6 +119,7 @@ def _jk_old(measured: Measured) -> bytes:
         + NAME.ljust(15, b"_")
         + bytes((jk.VERSION, 1))
     )
+    # terminal number, command, source and type before the registers; record number and end mark after them
     head = bytes((0, 0, 0, 0, jk.READ_ALL, jk.FROM_BMS, jk.ANSWER))
     body = head + registers + bytes((0, 0, 0, 0, jk.OLD_END))
     length = 2 + len(body) + 4  # the length field, the body and the checksum
@@ -157,6 +159,6 @@ BMS_ANSWERS: Mapping[str, Answers] = {
     "jk": {jk.OLD_REQUEST: _jk_old},
     "jk-pb": {jk.request(ADDRESS): _jk_newer},
 }
-"""Responses by protocol; ``jk`` and ``jk-pb`` are the two families of JK."""
+"""Responses by protocol. ``jk`` is the older, ``jk-pb`` the newer family of JK."""
 MAX_CELLS = 32
 """Maximum number of cells that the frames of all protocols can hold."""

@@ -256,17 +256,17 @@ class VirtualBoard:
         self._aux_count = compute_aux_count(rate_hz)
 
     async def _sample_until(self, end_s: float, loop: asyncio.AbstractEventLoop) -> None:
-        offset_s = loop.time() - self.time_s / self._speed
+        start_s = loop.time() - self.time_s / self._speed  # loop time at which the pack's time is 0
         while self.time_s < end_s:
             for _ in range(_MAX_SAMPLES_AT_ONCE):
-                due_s = offset_s + (self.time_s + self._period_ns * 1e-9) / self._speed
+                due_s = start_s + (self.time_s + self._period_ns * 1e-9) / self._speed
                 if due_s > loop.time() or self.time_s >= end_s:
                     break
                 if not self._take_sample():
                     return
             self._flush()
             if math.isinf(self._speed) and self._unsent:
-                await self._drain()
+                await self._drain()  # the host's reads set the pace
             else:
                 await asyncio.sleep(max(due_s - loop.time(), 0.0 if math.isinf(self._speed) else _MIN_SLEEP_S))
 
@@ -297,7 +297,7 @@ class VirtualBoard:
         status |= BoardStatus.OVERRUN * self._overrun
         n = self._aux_count
         aux = self._converter.ntc(reading.temperature_c, n) if self._aux_is_ntc else self._converter.bandgap(n)
-        self._aux_is_ntc = not self._aux_is_ntc
+        self._aux_is_ntc = not self._aux_is_ntc  # NTC and bandgap alternate
         board_us = self._clock_ns // 1000 % MODULUS
         return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, n, int(status))
 

@@ -242,7 +242,7 @@ class FastInStep3(Procedure):
     @property
     def step_3(self) -> list[Capture]:
         """Return all loads."""
-        return self.of(Kind.CONSTANT, Kind.RELAXATION)
+        return self.captures_of(Kind.CONSTANT, Kind.RELAXATION)
 
 
 class OwnInStep3(FastInStep3):

@@ -29,11 +29,11 @@ from bms_estimator.calibration.elements.ladder_fit import (
     TYPICAL_DROP_V,
     ZERO_FRACTION,
     LadderFit,
-    Moments,
+    NormalEquations,
     Prior,
     correction_at,
     fit_ladder,
-    moments,
+    normal_equations,
 )
 from bms_estimator.calibration.elements.replay_score import MAX_STEP_S, interval_score
 from bms_estimator.calibration.ocv.overpotential import (
@@ -83,7 +83,9 @@ SHAPE_MIN_SOC = 0.4
 SHAPE_LIMITS = (0.2, 20.0)
 """Limits of a resistance relative to its mean above ``SHAPE_MIN_SOC``."""
 MIN_RMS_SOC = 0.1
-"""Lower SOC limit of the reported RMS errors."""
+"""Lower SOC limit of the reported RMS errors and of the RMS change of the OCV."""
+MIN_ERROR_V = 1e-5
+"""Minimum model error written to a cell file [V]. A cell file requires a value above 0."""
 COUNT_PASSES = 3
 """Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a
 knee."""
@@ -195,6 +197,7 @@ def identify(
     """
     cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
     loads = [load for load in cleaned if not without_excitation(load, cell)]
+    # without any load, the checks below report the missing excitation
     runs = [_run(load, cell, initial_soc, temperature_c) for load in loads or cleaned]
     contradictions = [line for run in runs for line in capture_contradictions(run.load, cell, float(run.soc[0]))]
     contradictions += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
@@ -202,19 +205,19 @@ def identify(
         raise UserError("\n".join(contradictions))
     runs = _recounted(runs, cell, refine_ocv=refine_ocv)
     left_out = tuple(load.name for load in cleaned if without_excitation(load, cell))
-    moments_of_runs = _moments(runs, cell)
+    equations = _equations_of(runs, cell)
     variants = (False, True) if refine_ocv else (False,)  # with the given OCV, with a corrected OCV
-    candidates = [_Candidate(runs, moments_of_runs, cell, refine_ocv=refine) for refine in variants]
+    candidates = [_Candidate(runs, equations, cell, refine_ocv=refine) for refine in variants]
     before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
     after = [candidate.scores() for candidate in candidates]
     best = len(after) - 1  # the last candidate, if no capture has a score
     if np.isfinite(before).any():
         # scores of captures that are not held back favor the variant with more unknowns
-        held_back = [j for j in range(len(runs)) if candidates[0].held_back(j)]
+        held_back = [j for j in range(len(runs)) if candidates[0].is_held_back(j)]
         given, refined = (
             _geometric_mean(scores[held_back] if held_back else scores) for scores in (after[0], after[-1])
         )
-        best = int((EQUAL_SCORE_RATIO if held_back else 1.0) * refined < given)
+        best = int((EQUAL_SCORE_RATIO if held_back else 1.0) * refined < given)  # index in ``candidates``
     outcome = candidates[best].outcome(before, after[best], left_out)
     if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before:
         raise UserError(_worse_replays(outcome))
@@ -230,8 +233,8 @@ def initial_soc(load: CleanCapture, cell: CellModel) -> float:
 class _Candidate:
     """Variant of the fit, with a corrected or with the given OCV."""
 
-    def __init__(self, runs: list[Run], moments_of_runs: list[Moments], cell: CellModel, *, refine_ocv: bool) -> None:
-        self._runs, self._moments, self._cell, self._refine = runs, moments_of_runs, cell, refine_ocv
+    def __init__(self, runs: list[Run], equations: list[NormalEquations], cell: CellModel, *, refine_ocv: bool) -> None:
+        self._runs, self._equations, self._cell, self._refine = runs, equations, cell, refine_ocv
         self._scale_ohm = _resistance_scale(runs, cell)
         self.fit = self._fit(range(len(runs)))
 
@@ -242,13 +245,13 @@ class _Candidate:
 
     def miscounts(self) -> list[float]:
         """Return the additional relative error of each capture's charge count at which its voltage matches the fit."""
-        return [moments_of_run.miscount(self.fit) for moments_of_run in self._moments]
+        return [equations_of_run.miscount(self.fit) for equations_of_run in self._equations]
 
     def scores(self) -> Floats:
         """Return the score of each capture's replays [%], by a fit without the capture if it is held back."""
         return np.array([interval_score(self._cell_for(j), run.load, run.soc) for j, run in enumerate(self._runs)])
 
-    def held_back(self, j: int) -> bool:
+    def is_held_back(self, j: int) -> bool:
         """Return True if another capture within ``MIN_SPAN_K`` of the temperature of capture ``j`` was given."""
         mean_c = [run.mean_c for run in self._runs]
         return any(k != j and abs(mean_c[k] - mean_c[j]) < MIN_SPAN_K for k in range(len(mean_c)))
@@ -272,15 +275,15 @@ class _Candidate:
                 voltage_rms_v=_rms(self.cell, run),
                 score_before=float(before[j]),
                 score_after=float(after[j]),
-                held_back=self.held_back(j),
+                held_back=self.is_held_back(j),
             )
             for j, run in enumerate(self._runs)
         )
-        change_v = correction_at(np.linspace(0.1, 1.0, 181)) @ self.fit.correction
+        change_v = correction_at(np.linspace(MIN_RMS_SOC, 1.0, 181)) @ self.fit.correction
         return Identification(
             cell=self.cell,
             elements={
-                soc: {name: self.fit.branches(soc, *which) for name, which in two_branch_fit.SECTIONS.items()}
+                soc: {name: self.fit.branches(soc, *indices) for name, indices in two_branch_fit.SECTIONS.items()}
                 for soc in REPORTED_SOC
             },
             captures=fits,
@@ -291,7 +294,7 @@ class _Candidate:
         )
 
     def _cell_for(self, j: int) -> CellModel:
-        if not self.held_back(j):
+        if not self.is_held_back(j):
             return self.cell
         others = [k for k in range(len(self._runs)) if k != j]
         return self._cell_from(self._fit(others), others)
@@ -311,7 +314,7 @@ class _Candidate:
             shapes=self._shapes(),
             weak_share=None if spans_temperature else weak_share(SOC_NODES) if given is None else _weak_share_of(given),
         )
-        return fit_ladder([self._moments[k] for k in which], prior)
+        return fit_ladder([self._equations[k] for k in which], prior)
 
     def _cell_from(self, fit: LadderFit, which: Sequence[int]) -> CellModel:
         """Return the cell with the fit to the captures ``which``."""
@@ -327,14 +330,14 @@ class _Candidate:
             weak_ohm=tuple(map(_tuple, fit.weak_ohm)),
             strong_ohm=tuple(map(_tuple, fit.strong_ohm)),
             std=round(float(np.hypot(LADDER_STD, ohm_std / max(ohm, 1e-9 * self._scale_ohm))), 3),
-            error_v=1.0,
+            error_v=1.0,  # replaced below
             temperature_c=(low_c, high_c),
         )
         update: dict[str, object] = {"ladder": ladder, "adaptation": {}, **two_branch_fit.cell_file_sections(ladder)}
         if self._refine:
             update["ocv"] = _corrected_ocv(self._cell, fit, entropy=spans_temperature)
         new = self._cell.model_copy(update=update)
-        error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), 1e-5)
+        error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), MIN_ERROR_V)
         return new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
 
     def _shapes(self) -> Floats:
@@ -349,8 +352,8 @@ class _Candidate:
             return np.ones((2, RESISTANCES, SOC_NODES.size))
         rows = _at_nodes(given)
         mean_ohm = rows[:, :, SOC_NODES > SHAPE_MIN_SOC].mean(axis=2, keepdims=True)
-        zero = mean_ohm < ZERO_FRACTION * self._scale_ohm
-        shapes = np.clip(np.where(zero, 1.0, rows / np.where(zero, 1.0, mean_ohm)), *SHAPE_LIMITS)
+        is_zero = mean_ohm < ZERO_FRACTION * self._scale_ohm  # has no shape
+        shapes = np.clip(np.where(is_zero, 1.0, rows / np.where(is_zero, 1.0, mean_ohm)), *SHAPE_LIMITS)
         return np.asarray(np.sqrt(shapes) if given.std >= GENERIC_STD else shapes)
 
 
@@ -373,13 +376,13 @@ def _resistance_scale(runs: list[Run], cell: CellModel) -> float:
     return float(np.median(steps)) if steps else TYPICAL_DROP_V * cell.cell.series_count / cell.cell.capacity_ah
 
 
-def _moments(runs: list[Run], cell: CellModel) -> list[Moments]:
+def _equations_of(runs: list[Run], cell: CellModel) -> list[NormalEquations]:
     """Return the normal equations of the regression over each capture."""
     scale_ohm = _resistance_scale(runs, cell)
     grid_v, grid_slope_v = ocv_grid(cell)
     grid = np.linspace(0.0, 1.0, grid_v.size)
     return [
-        moments(
+        normal_equations(
             run.load,
             run.soc,
             np.interp(run.soc, grid, grid_v) + ocv_offset(cell, run.load_with_temperature, run.soc),
@@ -396,7 +399,7 @@ def _moments(runs: list[Run], cell: CellModel) -> list[Moments]:
 def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
     """Return the captures with their counted charge rescaled so that knees of voltage and OCV coincide."""
     for _ in range(COUNT_PASSES):
-        miscounts = _Candidate(runs, _moments(runs, cell), cell, refine_ocv=refine_ocv).miscounts()
+        miscounts = _Candidate(runs, _equations_of(runs, cell), cell, refine_ocv=refine_ocv).miscounts()
         runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
     return runs
 

@@ -49,6 +49,8 @@ LOW_SOC = 0.15
 """SOC below which ``ROUGHNESS_STD`` is larger."""
 LOW_SOC_ROUGHNESS = 4.0
 """Factor on ``ROUGHNESS_STD`` below ``LOW_SOC``."""
+LEVEL_PRECISION = 1e-6
+"""Inverse prior variance of a resistance relative to the scale. It only makes the information matrix regular."""
 BEND_V = 10.0
 """Prior std of d2d/dSOC2 per cell [V]."""
 LOW_BEND_SOC = 0.12
@@ -110,7 +112,7 @@ MAX_SOC = 1.01
 
 
 @dataclass(frozen=True)
-class Moments:
+class NormalEquations:
     """Normal equations of one capture, with y the measured voltage less the given OCV.
 
     X are the rows of the model, W their weights. The miscount is the relative error of the counted charge.
@@ -207,7 +209,7 @@ def correction_at(soc: Floats) -> Floats:
     return np.asarray(BSpline.design_matrix(np.clip(soc, 0.0, 1.0), knots, 3).toarray())
 
 
-def moments(
+def normal_equations(
     load: CleanCapture,
     soc: Floats,
     given_v: Floats,
@@ -216,7 +218,7 @@ def moments(
     scale_ohm: float,
     series: int,
     miscount: float,
-) -> Moments:
+) -> NormalEquations:
     """Return the normal equations of the regression over ``load``.
 
     Args:
@@ -244,29 +246,28 @@ def moments(
     std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * max_current_a)
     std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)
     weight = np.where(selected, weight, 0.0)
-    root_weight = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected, None]
-    root_weight_of_samples = root_weight[:, 0]
+    root_weight = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected]
     residual_v = load.voltage_v - given_v
-    rows = _rows(soc[selected], temperature_c[selected], currents[selected]) * root_weight
-    target = residual_v[selected] * root_weight[:, 0]
+    rows = _rows(soc[selected], temperature_c[selected], currents[selected]) * root_weight[:, None]
+    target = residual_v[selected] * root_weight
     # the rows of voltage jumps: each is the difference between the samples after and before a clean step
     is_after_step = _clean_steps(load) & inside
     is_before_step = np.r_[is_after_step[1:], False]
     if is_after_step.any():
         change_a = np.abs(load.current_a[is_after_step] - load.current_a[is_before_step])
-        std_v = np.hypot(STEP_V * series, RELATIVE_STD * scale_ohm * change_a) * arrhenius(
+        step_std_v = np.hypot(STEP_V * series, RELATIVE_STD * scale_ohm * change_a) * arrhenius(
             ERROR_J, temperature_c[is_after_step]
         )
-        root_weight = (np.sqrt(STEP_ROWS / is_after_step.sum()) / std_v)[:, None]
+        step_root_weight = np.sqrt(STEP_ROWS / is_after_step.sum()) / step_std_v
         jump = _rows(soc[is_after_step], temperature_c[is_after_step], currents[is_after_step])
         jump -= _rows(soc[is_before_step], temperature_c[is_before_step], currents[is_before_step])
-        rows = np.vstack([rows, jump * root_weight])
-        target = np.r_[target, (residual_v[is_after_step] - residual_v[is_before_step]) * root_weight[:, 0]]
-    by_miscount = np.zeros(target.size)  # weighted voltage change by a relative miscount of 1
-    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * root_weight_of_samples
+        rows = np.vstack([rows, jump * step_root_weight[:, None]])
+        target = np.r_[target, (residual_v[is_after_step] - residual_v[is_before_step]) * step_root_weight]
+    by_miscount = np.zeros(target.size)  # weighted voltage change by a relative miscount of 1; 0 for jumps
+    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * root_weight
     miscount_cross, miscount_information = rows.T @ by_miscount, float(by_miscount @ by_miscount + 1.0 / COUNT_STD**2)
     miscount_vector = float(by_miscount @ target - miscount / COUNT_STD**2)
-    return Moments(
+    return NormalEquations(
         information=rows.T @ rows - np.outer(miscount_cross, miscount_cross) / miscount_information,
         information_vector=rows.T @ target - miscount_cross * miscount_vector / miscount_information,
         miscount_cross=miscount_cross,
@@ -289,20 +290,20 @@ def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:
     )
 
 
-def fit_ladder(captures: list[Moments], prior: Prior) -> LadderFit:
+def fit_ladder(captures: list[NormalEquations], prior: Prior) -> LadderFit:
     """Fit the resistances to all ``captures`` by least squares."""
     information = _prior_information(prior) + sum(capture.information for capture in captures)
     information_vector = np.asarray(sum(capture.information_vector for capture in captures))
+    # matrix that gives all unknowns from the free ones; with a given weak fraction, only the sums of both parts are free
     from_free = np.eye(UNBOUNDED + 2 * PART_SIZE)
     if prior.weak_share is not None:
         weak_fraction = prior.weak_share.ravel()
         from_free = np.zeros((UNBOUNDED + 2 * PART_SIZE, UNBOUNDED + PART_SIZE))
         from_free[:UNBOUNDED, :UNBOUNDED] = np.eye(UNBOUNDED)
-        from_free[UNBOUNDED : UNBOUNDED + PART_SIZE, UNBOUNDED:], from_free[UNBOUNDED + PART_SIZE :, UNBOUNDED:] = (
-            np.diag(weak_fraction),
-            np.diag(1.0 - weak_fraction),
-        )
+        from_free[UNBOUNDED : UNBOUNDED + PART_SIZE, UNBOUNDED:] = np.diag(weak_fraction)
+        from_free[UNBOUNDED + PART_SIZE :, UNBOUNDED:] = np.diag(1.0 - weak_fraction)
     information = from_free.T @ information @ from_free
+    # least squares with the Cholesky factor as rows has these normal equations
     cholesky = np.linalg.cholesky(information)
     lower_bounds = np.r_[np.full(UNBOUNDED, -np.inf), np.zeros(cholesky.shape[0] - UNBOUNDED)]
     target = np.linalg.solve(cholesky, from_free.T @ information_vector)
@@ -324,14 +325,14 @@ def _prior_information(prior: Prior) -> Floats:
     table[SPLINES:UNBOUNDED, SPLINES:UNBOUNDED] = np.eye(KELVIN_NODES.size) / prior.per_kelvin_v**2
     for first, shape in zip((UNBOUNDED, UNBOUNDED + PART_SIZE), prior.shapes, strict=True):
         rough = _rough_rows() / (ROUGHNESS_STD * prior.scale_ohm) / shape.ravel()
-        part = rough.T @ rough + 1e-6 * np.eye(PART_SIZE) / prior.scale_ohm**2
+        part = rough.T @ rough + LEVEL_PRECISION * np.eye(PART_SIZE) / prior.scale_ohm**2
         table[first : first + PART_SIZE, first : first + PART_SIZE] = part
     return table
 
 
 def _rough_rows() -> Floats:
     """Return the differences of one part's resistances along SOC and between neighboring RC pairs, as rows."""
-    unknowns = np.eye(PART_SIZE).reshape(RESISTANCES, SOC_NODES.size, PART_SIZE)
+    unknowns = np.eye(PART_SIZE).reshape(RESISTANCES, SOC_NODES.size, PART_SIZE)  # index 0 is R_0, which is no RC pair
     std_factor = np.where(SOC_NODES < LOW_SOC, LOW_SOC_ROUGHNESS, 1.0)
     along = (unknowns[:, 1:] - unknowns[:, :-1]) / std_factor[None, :-1, None]
     across = (unknowns[2:] - unknowns[1:-1]) / std_factor[None, :, None]

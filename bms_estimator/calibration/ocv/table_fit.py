@@ -134,7 +134,7 @@ class _Model:
         points: Rows of the points, not yet divided by their standard deviations.
         prior: Rows of the priors, divided by their standard deviations.
         splines: Number of spline coefficients.
-        temperature_columns: Number of nodes of u and w.
+        temperature_columns: Number of nodes of u and w; 0 if the temperatures of the points do not determine them.
     """
 
     points: Floats
@@ -171,9 +171,8 @@ def fit_table(points: Points) -> TableFit:
     rows = np.vstack([model.points / std_v[:, None], model.prior])
     covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)[: model.splines, : model.splines]
     per_kelvin_at_nodes_v = coefficients[model.splines : model.splines + ENTROPY_NODES.size]
-    ocv_v = np.maximum.accumulate(
-        basis @ coefficients[: model.splines] + 1e-9 * NODES
-    )  # PCHIP and the inverse need strictly increasing values
+    # PCHIP and the inverse need strictly increasing values
+    ocv_v = np.maximum.accumulate(basis @ coefficients[: model.splines] + 1e-9 * NODES)
     interpolate = PchipInterpolator(NODES, ocv_v)
     return TableFit(
         soc=NODES,
@@ -236,7 +235,7 @@ def _solve(model: _Model, points: Points, std_v: Floats, voltage_scale: float) -
     from_increments = np.tril(np.ones((model.splines, model.splines)))
     rows[:, : model.splines] = rows[:, : model.splines] @ from_increments
     lower_bounds = np.full(rows.shape[1], -np.inf)
-    lower_bounds[1 : model.splines] = MIN_SLOPE_V * voltage_scale * np.diff(_centres())
+    lower_bounds[1 : model.splines] = MIN_SLOPE_V * voltage_scale * np.diff(_coefficient_socs())
     orthogonal, triangle = np.linalg.qr(rows)
     increments = lsq_linear(triangle, orthogonal.T @ target, bounds=(lower_bounds, np.inf), method="bvls").x
     coefficients = np.zeros(model.points.shape[1])
@@ -281,7 +280,7 @@ def _knots() -> Floats:
     return np.concatenate([np.zeros(3), KNOTS, np.ones(3)])
 
 
-def _centres() -> Floats:
+def _coefficient_socs() -> Floats:
     """Return the SOC at which each coefficient of the spline acts (Greville abscissae)."""
     knots = _knots()
     return np.asarray((knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3.0)

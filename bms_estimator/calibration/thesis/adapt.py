@@ -13,7 +13,7 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.cleaning.rests import remove_glitches
-from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO, initial_soc
+from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO, MIN_ERROR_V, initial_soc
 from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.thesis.adapt_steps import AdaptedElements, CaptureWithSoc, steps_2_and_3
 from bms_estimator.calibration.thesis.prediction import predict
@@ -25,9 +25,6 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, Resistance
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-
-MIN_ERROR_V = 1e-5
-"""Minimum model error written to a cell file [V]. A cell file requires a value above 0."""
 
 
 @dataclass(frozen=True)
