@@ -23,6 +23,8 @@ Below an exponent of 5 the exponential covers all SOC and cannot be distinguishe
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
 """Upper bounds of a16..a21. At an exponent of 300 the exponential has decayed by SOC 0.01. ``fit_chen_mora`` bounds a16
 by the highest point, so that E_o(0) is not far below 0 V even if the last points are steep."""
+TYPICAL = np.array([0.1, 10.0, 1.0, 1.0, 1.0, 1.0])
+"""Typical sizes of a16..a21, which scale the steps of the fit."""
 AT_BOUND_V = 1e-5
 """Distance from its bound below which an amplitude counts as at the bound: less than the resolution of converters
 [V]."""
@@ -75,10 +77,13 @@ def fit_chen_mora(points: Points) -> ChenMoraFit:
     upper = np.r_[points.ocv_v.max(), UPPER[1:]]
     linear_fits = [_with_exponent(points, exponent, upper) for exponent in EXPONENTS]
     start_residual2, start_a = min(linear_fits, key=lambda linear_fit: linear_fit[0])
-    inside = np.clip(start_a, LOWER + 1e-9, upper * 0.999)
-    scale = np.array([0.1, 10.0, 1.0, 1.0, 1.0, 1.0])
+    strictly_inside = np.clip(start_a, LOWER + 1e-9, upper * 0.999)  # as least_squares requires
     fit = least_squares(
-        lambda a: chen_mora(a, points.soc) - points.ocv_v, inside, bounds=(LOWER, upper), x_scale=scale, xtol=1e-12
+        lambda a: chen_mora(a, points.soc) - points.ocv_v,
+        strictly_inside,
+        bounds=(LOWER, upper),
+        x_scale=TYPICAL,
+        xtol=1e-12,
     )
     a = fit.x if 2.0 * fit.cost < start_residual2 else start_a  # the cost is half of the squared residual
     residual_v = points.ocv_v - chen_mora(a, points.soc)

@@ -133,7 +133,7 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
     smooth = good.copy()
     smooth["current_a"] = median_filter(good["current_a"], SMOOTH_SAMPLES, mode="nearest")
     noise_a = STD_PER_MEDIAN_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
-    resting = resting_samples(smooth, float(np.ptp(moved_ah)))
+    resting = resting_samples(smooth, capacity_ah=float(np.ptp(moved_ah)))  # the capacity itself is unknown here
     branches = []
     for first, last in true_runs(~resting):
         current_a = smooth["current_a"][first:last]
@@ -164,7 +164,7 @@ def _branch(
             f"while the voltage went from {voltage_v[0]:.3f} to {voltage_v[-1]:.3f} V; discharge must be positive "
             "(--current-sign)"
         )
-    jump_v = float("nan")
+    jump_v = float("nan")  # at the full end: the end of a charge, the start of a discharge
     if charge and last < good.size and resting[last]:
         jump_v = voltage_v[-1] - float(good["voltage_v"][last])
     elif not charge and first > 0 and resting[first - 1]:

@@ -180,7 +180,8 @@ def find_sources(
         hysteresis_at_rest_v = half_difference_v * (
             _typical_share(hysteresis_source, series_count) if share is None else share
         )
-        is_unchanged = hysteresis_source in sources[len(slow) :] and share is None  # given curves are used as they are
+        # the hysteresis of a given curve is used unchanged, unless rests measure its fraction
+        is_unchanged = hysteresis_source in sources[len(slow) :] and share is None
         hysteresis_v = np.interp(NODES, GRID, half_difference_v if is_unchanged else hysteresis_at_rest_v)
         hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_difference_v)
         tests_with_points = [
