@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from bms_estimator.calibration.cleaning.rests import REST_C_RATE
 from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora
 from bms_estimator.calibration.ocv.points import max_v, pooled, rms_v
 from bms_estimator.reports import printed_values
@@ -58,8 +59,8 @@ def table_9(experiment: Experiment) -> Table:
     for j in range(3):
         row = [f"a{13 + j}", number(printed_values.TABLE_9[j])]
         row += [] if truth is None else [number(float(truth[13 + j]))]
-        meaningless = j == 1 and fit.a[0] == 0.0
-        rows.append((*row, "-" if meaningless else number(float(fit.a[j])), number(float(fit.std[j]), 2)))
+        is_undefined = j == 1 and fit.a[0] == 0.0  # the exponent a14 of an amplitude a13 of 0
+        rows.append((*row, "-" if is_undefined else number(float(fit.a[j])), number(float(fit.std[j]), 2)))
     return Table(
         "9",
         "Step 3: a13 to a15",
@@ -75,41 +76,44 @@ def table_9(experiment: Experiment) -> Table:
 def table_10(experiment: Experiment) -> Table:
     """Return the table of a1 to a12."""
     procedure, truth, run = experiment.procedure, experiment.truth, experiment.procedure.adaptive
-    printed_bounds = experiment.recorded is None
+    has_printed_bounds = experiment.recorded is None
     excess = {
         i: (printed_values.TABLE_10[i][1] - printed_values.bounds("10", i).limit, _excess_over_limit(i))
         for i in (8, 10, 12)
     }
     columns: tuple[str, ...] = ("parameter", "bounds", "λx, λy", "initial")
     columns += ("printed", "recomputed", "limit of Lemma 4.1.3")
-    columns += ("mean from t0 over 10 h",) if printed_bounds else ()
+    columns += ("mean from t0 over 10 h",) if has_printed_bounds else ()
     columns += () if truth is None else ("true",)
     rows = []
     for i, (_, estimate) in printed_values.TABLE_10.items():
-        b = procedure.cell.bounds(i)
+        bounds = procedure.cell.bounds(i)
         row: tuple[str, ...] = (
             f"a{i}",
-            f"{number(b.lower)} … {number(b.upper)}",
-            f"{b.weight_upper:.4g}, {b.weight_lower:.4g}",
-            number(b.limit if b.initial is None else b.initial),
+            f"{number(bounds.lower)} … {number(bounds.upper)}",
+            f"{bounds.weight_upper:.4g}, {bounds.weight_lower:.4g}",
+            number(bounds.limit if bounds.initial is None else bounds.initial),
             number(estimate, 6),
             number(float(run.average[i]), 6),
-            number(b.limit, 6),
+            number(bounds.limit, 6),
         )
-        if printed_bounds:
+        if has_printed_bounds:
             row += (number(printed_values.mean_from_start("10", i), 6),)
         rows.append(row if truth is None else (*row, number(float(truth[i]))))
     window = run.window
-    corrected = (
+    bounds_reason = (
         "Weights of a8 as in E4, of a4 and a7 as in E24, inferred from the printed estimates. The printed a5 = 30 contradicts its "
         "bounds and weights, which give 150 (E5). The run gives the limits, which differ from the printed estimates. The other "
         f"eleven printed estimates are within {printed_values.worst_mean_percent():.1f} % of the mean over the first 10 h that follows "
         "from bounds, weights and initial values alone, without any data. This fit has "
         f"{printed_values.FREE_PARAMETERS['10']} free parameters: the time, and two weights each of a4, a7 and a8. It is a loose fit: "
         "the excess of the estimates over their limits is "
-        + ", ".join(f"a{i} {number(by, 3)} (printed {number(above, 3)})" for i, (above, by) in excess.items())
+        + ", ".join(
+            f"a{i} {number(mean_excess, 3)} (printed {number(printed_excess, 3)})"
+            for i, (printed_excess, mean_excess) in excess.items()
+        )
         + ". "
-        if printed_bounds
+        if has_printed_bounds
         else "Bounds are the printed ones, scaled to the cell's capacity, unless the cell file has its own. "
     )
     return Table(
@@ -117,10 +121,10 @@ def table_10(experiment: Experiment) -> Table:
         "Step 2: a1 to a12 by Algorithm 1",
         columns,
         tuple(rows),
-        Reproduction.FITTED if printed_bounds else Reproduction.NO_DATA,
-        f"{corrected}Run on {procedure.smallest.name}: {run.outcome}; t_int = {window.t_int_s:.1f} s ({window.start_reason}), "
+        Reproduction.FITTED if has_printed_bounds else Reproduction.NO_DATA,
+        f"{bounds_reason}Run on {procedure.smallest.name}: {run.outcome}; t_int = {window.t_int_s:.1f} s ({window.start_reason}), "
         f"t_unst = {window.t_unst_s:.0f} s ({window.end_reason}). The estimates are the limits of the bounds, on any data (E3).",
-        free=printed_values.FREE_PARAMETERS["10"] if printed_bounds else 0,
+        free=printed_values.FREE_PARAMETERS["10"] if has_printed_bounds else 0,
     )
 
 
@@ -138,7 +142,7 @@ def table_11(experiment: Experiment) -> Table:
     rows = []
     validating = [capture.name for capture in procedure.validating]
     for name, run in procedure.dynamic.items():
-        flowing = np.abs(run.current_a) > 0.01 * procedure.cell.cell.capacity_ah
+        flowing = np.abs(run.current_a) > REST_C_RATE * procedure.cell.cell.capacity_ah
         aligned, above = run.aligned, run.above(KNEE_SOC)
         row = [
             name,
