@@ -233,7 +233,7 @@ def outcomes(procedures: list[Procedure]) -> Iterator[tuple[str, str, str, str]]
     """Yield for each claim: key, number of cells that meet it, range of the values, verdict."""
     for key in CLAIMS:
         result = claim(key, procedures)
-        yield key, f"{result.met} of {len(result.results)}", result.span, result.verdict.value
+        yield key, f"{result.captures_met} of {len(result.results)}", result.span, result.verdict.value
 
 
 class FastInStep3(Procedure):
@@ -242,7 +242,7 @@ class FastInStep3(Procedure):
     @property
     def step_3(self) -> list[Capture]:
         """Return all loads."""
-        return self.of(Kind.CONSTANT, Kind.RELAXATION)
+        return self.captures_of(Kind.CONSTANT, Kind.RELAXATION)
 
 
 class OwnInStep3(FastInStep3):
@@ -310,7 +310,7 @@ def steps_met(procedures: dict[str, Procedure]) -> Iterator[tuple[str, str, str]
             claim("steps, mean", [default_procedure[name] for name in names])
             for names in (list(default_procedure), ROOM)
         )
-        yield variant_name, *(f"{claim_result.met} of {len(claim_result.results)}" for claim_result in result)
+        yield variant_name, *(f"{claim_result.captures_met} of {len(claim_result.results)}" for claim_result in result)
 
 
 def steps_by_variant(procedures: dict[str, Procedure]) -> Table:

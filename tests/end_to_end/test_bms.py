@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.simulation.simulated_bms import SPREAD_V, SimulatedBms
+from bms_estimator.simulation.simulated_bms import MAX_CELL_DEVIATION_V, SimulatedBms
 from bms_estimator.simulation.simulated_pack import SimulatedPack, constant
 from tests.command_line import PROGRAM
 from tests.mosquitto import Broker, Listener
@@ -58,6 +58,6 @@ folder = "{tmp_path / "state"}"
     assert state["temperature_c"] == 25.0
     assert len(state["cells_v"]) == CELLS
     assert math.fsum(state["cells_v"]) == pytest.approx(state["voltage_v"], abs=0.02)
-    assert max(state["cells_v"]) - min(state["cells_v"]) < 2 * SPREAD_V + 1e-3
+    assert max(state["cells_v"]) - min(state["cells_v"]) < 2 * MAX_CELL_DEVIATION_V + 1e-3
     assert state["cells_v"][state["cell_lowest"] - 1] == min(state["cells_v"])
     assert (state["frames_lost"], state["crc_errors"]) == (0, 0)

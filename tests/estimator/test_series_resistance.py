@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.thesis.adapt_steps import Start, steps_2_and_3
+from bms_estimator.calibration.thesis.adapt_steps import CaptureWithSoc, steps_2_and_3
 from bms_estimator.calibration.thesis.prediction import predict
 from bms_estimator.calibration.thesis.series_resistance import (
     LOWEST_SOC,
     fit_series_resistance,
     series_resistance,
-    summed,
+    series_resistance_from_sums,
 )
 from bms_estimator.checkpoint.identity import fields, without_observer
 from bms_estimator.checkpoint.restore import restore_state
@@ -52,9 +52,9 @@ def load() -> SampleBlock:
 def test_live_r_s_equals_that_of_steps_2_and_3_on_a_capture(load: SampleBlock) -> None:
     estimator = make_thesis_estimator()
     estimator.run(load)
-    offline = steps_2_and_3(TRUTH, [Start(load, FIRST_SOC)], LOWEST_SOC)
+    offline = steps_2_and_3(TRUTH, [CaptureWithSoc(load, FIRST_SOC)], LOWEST_SOC)
     run = predict(TRUTH, load, FIRST_SOC, a=offline.run.average, lowest_soc=LOWEST_SOC)
-    expected, live_fit = series_resistance(TRUTH, run), summed(estimator.record[0])
+    expected, live_fit = series_resistance(TRUTH, run), series_resistance_from_sums(estimator.record[0])
     live = dict(zip(np.floor(live_fit.soc * BINS), live_fit.r_s_ohm, strict=True))
     count = np.bincount(np.floor(run.soc * BINS).astype(int), np.abs(run.current_a) > 0.06, BINS)
     pairs = [
@@ -93,7 +93,7 @@ def test_r_s_by_4_2_is_published_and_is_null_until_a_current_flows(load: SampleB
     estimator.run(load[600:])
     report, offline = (
         make_parameters_payload(estimator, 0.0),
-        steps_2_and_3(TRUTH, [Start(load, FIRST_SOC)], LOWEST_SOC),
+        steps_2_and_3(TRUTH, [CaptureWithSoc(load, FIRST_SOC)], LOWEST_SOC),
     )
     r_s, a15 = report.elements["r_s_ohm"], report.a["a15"]
     assert r_s.value == pytest.approx(float(offline.r_s(np.array(report.soc))), rel=R_S_ERROR)

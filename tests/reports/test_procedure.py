@@ -195,7 +195,7 @@ def test_dynamic_against_static_is_their_ratio(leaf_procedure):
     for key, limit in (("order", 1.0), ("ratio", 0.003 / 0.358)):
         (result,) = claim(f"dynamic against static, {key}", [leaf_procedure]).results
         assert (result.value, result.limit) == (pytest.approx(0.543 / 0.517, abs=0.01), limit)
-        assert not result.met
+        assert not result.is_met
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_dynamic_against_static_is_their_ratio(leaf_procedure):
 def test_claim_holds_if_met_on_more_than_half(met, verdict):
     results = tuple(Result(f"load {i}", 1.0 if i < met else 2.0, 1.5) for i in range(4))
     claim_result = Claim("mean", "Table 11", "mean error at most 1.5 %", results)
-    assert (claim_result.met, claim_result.verdict) == (met, verdict)
+    assert (claim_result.captures_met, claim_result.verdict) == (met, verdict)
     assert claim_result.span == {0: "2", 2: "1 to 2", 3: "1 to 2"}[met]
     assert f"met on {met} of 4 captures (values {claim_result.span})" in claim_result.sentence
 

@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
-from bms_estimator.simulation.simulated_bms import SPREAD_V, BmsFault, SimulatedBms
+from bms_estimator.simulation.simulated_bms import MAX_CELL_DEVIATION_V, BmsFault, SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
@@ -125,7 +125,7 @@ async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
     complete_rows = [row for row in record.cells if not any(math.isnan(v) for v in row)]
     assert len(complete_rows) >= 3
     assert {len(row) for row in complete_rows} == {CELLS}
-    assert max(abs(v - sum(row) / CELLS) for row in complete_rows for v in row) < 2 * SPREAD_V + 1e-3
+    assert max(abs(v - sum(row) / CELLS) for row in complete_rows for v in row) < 2 * MAX_CELL_DEVIATION_V + 1e-3
     replay = RawCapture(path)
     replayed = np.concatenate(list(replay))
     for column in ("time_s", "voltage_v", "current_a", "temperature_c", "status"):

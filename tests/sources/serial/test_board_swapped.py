@@ -30,7 +30,7 @@ class RunningBoard:
         self._board = VirtualBoard(
             lambda _: Reading(0.5, PACK_V, 25.0), serial=serial, parts=BoardParts(divider=divider)
         )
-        self._board._sequence, self._board._ns = sequence, int(age_s * 1e9)
+        self._board._sequence, self._board._clock_ns = sequence, int(age_s * 1e9)
 
     def hello(self) -> bytes:
         hello: Hello = self._board._hello()
@@ -40,9 +40,9 @@ class RunningBoard:
         """Return the next ``count`` samples."""
         frames = []
         for _ in range(count):
-            self._board._line.clear()
+            self._board._unsent.clear()
             self._board._take_sample()
-            frames.append(bytes(self._board._line))
+            frames.append(bytes(self._board._unsent))
         return frames
 
 
