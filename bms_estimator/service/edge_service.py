@@ -75,7 +75,9 @@ async def _keep_alive(
     while True:
         if source.health().task_idle_s <= SOURCE_HUNG_S:
             notifier.alive(name)
-        status = f"no samples: {source.message}" if source.message else f"{edge.store.waiting} blocks not sent"
+        status = (
+            f"no samples: {source.silence_reason}" if source.silence_reason else f"{edge.store.waiting} blocks not sent"
+        )
         if status != sent_status:
             notifier.status(name, status)
             sent_status = status
