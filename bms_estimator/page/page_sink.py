@@ -52,7 +52,7 @@ class PageSink:
         """Store a snapshot for the page, without blocking."""
         now_s = asyncio.get_running_loop().time()
         messages, self._sent = self._messages.live_messages(self._sent, snapshot, now_s)
-        self._put(self._messages.must_deliver(self._before, snapshot) + messages)
+        self._put(self._messages.guaranteed_messages(self._before, snapshot) + messages)
         self._before = snapshot
 
     def _put(self, messages: list[Message]) -> None:
