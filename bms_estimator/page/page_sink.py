@@ -30,7 +30,7 @@ class PageSink:
     def __init__(self, pages: "Pages", settings: PageSettings, pack: str, history: Path | None = None) -> None:
         self._pages, self._settings, self._pack, self._history = pages, settings, pack, history
         self._messages = MessageBuilder("", pack)
-        self._before: Snapshot | None = None
+        self._previous: Snapshot | None = None
         self._sent = PublishedState()
         self._hub = PackTopics()
         self._stack = contextlib.AsyncExitStack()
@@ -52,8 +52,8 @@ class PageSink:
         """Store a snapshot for the page, without blocking."""
         now_s = asyncio.get_running_loop().time()
         messages, self._sent = self._messages.live_messages(self._sent, snapshot, now_s)
-        self._put(self._messages.guaranteed_messages(self._before, snapshot) + messages)
-        self._before = snapshot
+        self._put(self._messages.guaranteed_messages(self._previous, snapshot) + messages)
+        self._previous = snapshot
 
     def _put(self, messages: list[Message]) -> None:
         root = f"{self._messages.root}/"
@@ -88,7 +88,7 @@ class Pages:
             if page.settings != settings:
                 raise UserError(f"page: packs that share listen = {settings.listen} must share token_file and hosts")
             if history:
-                page.past.add(pack, history)
+                page.history_query.add(pack, history)
             await page.start()
             yield page.hub
         finally:
@@ -103,18 +103,18 @@ class _Page:
 
     def __init__(self, settings: PageSettings, opened: Callable[[str], object]) -> None:
         self.settings, self.packs = settings, 0
-        self.hub, self.past = PackTopics(), HistoryQuery()
-        self._server = PageServer(settings, self.hub, self.past, opened=opened)
-        self._started: asyncio.Task[PageServer] | None = None
+        self.hub, self.history_query = PackTopics(), HistoryQuery()
+        self._server = PageServer(settings, self.hub, self.history_query, opened=opened)
+        self._start_task: asyncio.Task[PageServer] | None = None
 
     async def start(self) -> None:
         """Start the server, unless an earlier pack started it."""
-        if self._started is None:
-            self._started = asyncio.ensure_future(self._server.__aenter__())
-        await asyncio.shield(self._started)
+        if self._start_task is None:
+            self._start_task = asyncio.ensure_future(self._server.__aenter__())
+        await asyncio.shield(self._start_task)
 
     async def stop(self) -> None:
         """End the server, if it was started."""
-        if self._started is not None:
-            await asyncio.wait([self._started])
+        if self._start_task is not None:
+            await asyncio.wait([self._start_task])
             await self._server.__aexit__(None, None, None)
