@@ -42,7 +42,7 @@ class Subscriber:
         on_message: Called with each message of a device after it is stored.
         on_link_change: Called after the broker was connected or lost; ``lost_since`` distinguishes the two.
         connect: Opens a connection; default: over TCP.
-        left_out: Called with the name of a device that is not stored because there are too many.
+        on_hidden: Called with the name of a device that is not stored because there are too many.
         clock: Wall clock and monotonic clock.
         first_delay_s: Delay before a lost broker is retried [s]; it grows as in ``Backoff``.
 
@@ -57,14 +57,14 @@ class Subscriber:
         on_link_change: Callable[[], None] = lambda: None,
         *,
         connect: Connect | None = None,
-        left_out: Callable[[str], object] = str,
+        on_hidden: Callable[[str], object] = str,
         clock: Clock | None = None,
         first_delay_s: float = FIRST_DELAY_S,
     ) -> None:
         check(settings)
         self._on_message, self._on_link_change, self._clock = on_message, on_link_change, clock or Clock()
         self._topic = f"{settings.base_topic}/#"
-        self._cache = TopicCache(settings.base_topic, left_out)
+        self._cache = TopicCache(settings.base_topic, on_hidden)
         self._delivery = DeliveryStats()
         self._lost_since: float | None = self._clock.wall()
         options = ConnectOptions(

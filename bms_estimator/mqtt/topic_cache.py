@@ -65,11 +65,11 @@ class TopicCache:
 
     Args:
         base_topic: First part of all topics.
-        left_out: Called with the name of a device that is not stored: a new device, or a device that was replaced.
+        on_hidden: Called with the name of a device that is not stored: a new device, or a device that was replaced.
     """
 
-    def __init__(self, base_topic: str, left_out: Callable[[str], object] = str) -> None:
-        self._root, self._left_out = f"{base_topic}/", left_out
+    def __init__(self, base_topic: str, on_hidden: Callable[[str], object] = str) -> None:
+        self._root, self._on_hidden = f"{base_topic}/", on_hidden
         self.devices: dict[str, DeviceTopics] = {}
         """Devices by name, in the order of their first message."""
         self._hidden: set[str] = set()
@@ -137,7 +137,7 @@ class TopicCache:
     def _hide(self, name: str) -> None:
         if len(self._hidden) < MAX_HIDDEN:
             self._hidden.add(name)
-        self._left_out(name)
+        self._on_hidden(name)
 
     def _remove_topic(self, name: str, topic: str) -> DeviceMessage | None:
         self._hidden.discard(name)

@@ -47,6 +47,6 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
         hub.set_link_state(subscriber.trouble or "the broker is lost" if lost else None)
 
     async with PageServer(settings, hub, history, retry=False) as server:
-        subscriber = Subscriber(broker, on_message, on_link_change, left_out=on_hidden)
+        subscriber = Subscriber(broker, on_message, on_link_change, on_hidden=on_hidden)
         async with subscriber:
             yield server.url

@@ -38,7 +38,7 @@ class PageServer(WebServer):
         settings: Address and access of the page.
         hub: Present state of the packs.
         history: History of the packs.
-        opened: Called with the address of the page once the server listens.
+        on_listening: Called with the address of the page once the server listens.
         retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
     Raises:
@@ -51,10 +51,12 @@ class PageServer(WebServer):
         hub: PackTopics,
         history: HistoryQuery,
         *,
-        opened: Callable[[str], object] = str,
+        on_listening: Callable[[str], object] = str,
         retry: bool = True,
     ) -> None:
-        super().__init__(settings, FILES, hub, {"/history": self._answer_history}, opened=opened, retry=retry)
+        super().__init__(
+            settings, FILES, hub, {"/history": self._answer_history}, on_listening=on_listening, retry=retry
+        )
         self._history = history
         self._query_slots = asyncio.Semaphore(MAX_HISTORY_QUERIES)
 

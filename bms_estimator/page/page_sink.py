@@ -66,12 +66,12 @@ class Pages:
     """Page servers of a process, one for each configured address.
 
     Args:
-        opened: Called with the address of each server once it listens.
+        on_listening: Called with the address of each server once it listens.
     """
 
-    def __init__(self, opened: Callable[[str], object] = str) -> None:
-        self._opened = opened
-        self._open: dict[str, _Page] = {}
+    def __init__(self, on_listening: Callable[[str], object] = str) -> None:
+        self._on_listening = on_listening
+        self._by_address: dict[str, _Page] = {}
 
     @contextlib.asynccontextmanager
     async def serving(self, settings: PageSettings, pack: str, history: Path | None) -> AsyncIterator[PackTopics]:
@@ -80,9 +80,9 @@ class Pages:
         Raises:
             UserError: Two packs have one address with different tokens, or the token cannot be read.
         """
-        page = self._open.get(settings.listen)
+        page = self._by_address.get(settings.listen)
         if page is None:
-            page = self._open[settings.listen] = _Page(settings, self._opened)
+            page = self._by_address[settings.listen] = _Page(settings, self._on_listening)
         page.packs += 1
         try:
             if page.settings != settings:
@@ -94,17 +94,17 @@ class Pages:
         finally:
             page.packs -= 1
             if not page.packs:
-                del self._open[settings.listen]
+                del self._by_address[settings.listen]
                 await page.stop()
 
 
 class _Page:
     """Page server and the number of its packs."""
 
-    def __init__(self, settings: PageSettings, opened: Callable[[str], object]) -> None:
+    def __init__(self, settings: PageSettings, on_listening: Callable[[str], object]) -> None:
         self.settings, self.packs = settings, 0
         self.hub, self.history_query = PackTopics(), HistoryQuery()
-        self._server = PageServer(settings, self.hub, self.history_query, opened=opened)
+        self._server = PageServer(settings, self.hub, self.history_query, on_listening=on_listening)
         self._start_task: asyncio.Task[PageServer] | None = None
 
     async def start(self) -> None:

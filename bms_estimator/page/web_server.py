@@ -70,7 +70,7 @@ class WebServer:
         files: Static files by the path of their URL.
         latest: Content of the event stream ``/events``.
         handlers: Handlers of queries, by path.
-        opened: Called with the address once the server listens.
+        on_listening: Called with the address once the server listens.
         retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
     Raises:
@@ -84,10 +84,10 @@ class WebServer:
         latest: LatestValues,
         handlers: Mapping[str, Handler],
         *,
-        opened: Callable[[str], object] = str,
+        on_listening: Callable[[str], object] = str,
         retry: bool = True,
     ) -> None:
-        self._latest, self._opened, self._retry = latest, opened, retry
+        self._latest, self._on_listening, self._retry = latest, on_listening, retry
         self._access: AccessControl = make_access_control(settings)
         self._configured_address, self._listening = settings.address, settings.address
         self._files = {path: _load_file(file) for path, file in files.items()}
@@ -152,7 +152,7 @@ class WebServer:
         self._listener = listener
         self._listening = self._configured_address._replace(port=port)
         log.info("live page", url=self.url)
-        self._opened(self.url)
+        self._on_listening(self.url)
 
     async def _listen_later(self, runner: web.AppRunner) -> None:
         while True:

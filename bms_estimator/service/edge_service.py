@@ -48,7 +48,7 @@ async def serve_edge(
     stop, name = stop_on_signal(stop), settings.pack.name
     notifier = notifier or SystemdNotifier([name], activity="sending samples of")
     set_level(name, settings.log.level)
-    source = open_line_source(settings) or SerialSource(settings.sensor, memory=KnownBoardFile(folder, name))
+    source = open_line_source(settings) or SerialSource(settings.sensor, board_file=KnownBoardFile(folder, name))
     with instance_lock(folder, name):
         async with BlockSender(settings.edge, name, folder) as edge, source:
             notifier.ready(name)

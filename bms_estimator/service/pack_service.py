@@ -78,7 +78,7 @@ async def run_pack_service(
     all_sinks = [*sinks, *export_sinks(settings)]
     requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = KnownBoardFile(folder, settings.pack.name) if folder else None
-    source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, memory=memory)
+    source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, board_file=memory)
     if database and settings.store.history_days:
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)

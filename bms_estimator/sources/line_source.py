@@ -146,7 +146,9 @@ class LineSource:
         """Return the health of the task that runs the producer."""
         now_s = self._monotonic()
         return SourceHealth(
-            now_s - self._last_check_s, self._wall_offset_s + now_s - self._block_arrival_s, self._lines.qsize()
+            task_idle_s=now_s - self._last_check_s,
+            block_age_s=self._wall_offset_s + now_s - self._block_arrival_s,
+            queued_reads=self._lines.qsize(),
         )
 
     async def __aenter__(self) -> Self:

@@ -235,7 +235,7 @@ async def test_address_in_use_is_reported_and_retried(hub, history, monkeypatch)
         with pytest.raises(UserError, match=r"page\.listen = 127\.0\.0\.1:\d+: .*in use"):
             async with PageServer(settings, hub, history, retry=False):
                 pass
-        server = await PageServer(settings, hub, history, opened=opened.put_nowait).__aenter__()
+        server = await PageServer(settings, hub, history, on_listening=opened.put_nowait).__aenter__()
         assert opened.empty()
     async with asyncio.timeout(LONG_S):
         url = await opened.get()

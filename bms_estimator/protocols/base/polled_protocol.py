@@ -139,7 +139,7 @@ class PolledProtocol(ReadingProtocol):
                 frames.append(buffer[start:parsed_end])
                 start = self._find_start(buffer, parsed_end)
                 continue
-            if incomplete < 0:  # inside an incomplete frame it is parsed again later
+            if incomplete < 0:  # the bytes of an incomplete frame are parsed again with the next read
                 if length is ParseResult.MORE:
                     incomplete = start
                 elif length is ParseResult.LENGTH:
@@ -160,8 +160,8 @@ class PolledProtocol(ReadingProtocol):
 
     def _find_start(self, data: bytes, at: int) -> int:
         """Return the position of the next possible frame start; -1 without one."""
-        found = self._start.search(data, at)
-        return found.start() if found else -1
+        match = self._start.search(data, at)
+        return match.start() if match else -1
 
     def _skip(self, count: int) -> None:
         """Skip bytes outside of frames."""

@@ -260,6 +260,7 @@ def advance_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool
         wraps = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
         step_us += max(wraps, 0) * MODULUS
     time_s = d.origin_s + (d.elapsed_us + step_us) * _US
+    # advance of the board's clock that neither the sequence numbers nor the arrival times explain
     excess_s = (step_us - (lost + 1) * d.period_us) * _US - (arrival_s - d.arrival_s)
     if (
         excess_s > MAX_ADVANCE_S
@@ -304,7 +305,7 @@ def check_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) ->
             if not d.reset_pending:
                 require_new_hello(d, arrival_s)  # the hello after the reset was lost; the next one is no further reset
             uptime_s = board_us * _US  # time since the reset
-            if is_early(d, arrival_s, d.time_s + uptime_s):
+            if is_early(d, arrival_s, d.time_s + uptime_s):  # implausible, so that the arrival time alone counts
                 uptime_s = 0.0
                 d.clock_jumps += 1
             restart_clock(d, arrival_s, uptime_s)

@@ -33,7 +33,10 @@ def read_curve(path: Path) -> CurveColumns | None:
         UserError: The columns are there, but their values are not a curve.
     """
     rows = _rows(path, OCV_COLUMNS)
-    return None if rows is None else _make_curve(path, rows, has_hysteresis=not np.isnan(rows[:, 2]).all())
+    if rows is None:
+        return None
+    hysteresis_v = rows[:, 2]
+    return _make_curve(path, rows, has_hysteresis=not np.isnan(hysteresis_v).all())
 
 
 def read_polarisation(path: Path) -> Floats | None:
@@ -47,7 +50,7 @@ def read_polarisation(path: Path) -> Floats | None:
         UserError: The columns exist, but a row lacks a number.
     """
     rows = _rows(path, POLARISATION_COLUMNS, excluded_column="time_s")
-    if rows is not None and (rows.shape[0] == 0 or not np.isfinite(rows[:, :2]).all()):
+    if rows is not None and (rows.shape[0] == 0 or not np.isfinite(rows[:, :2]).all()):  # temperature is optional
         raise UserError(
             f"{path}: {'no rows' if rows.shape[0] == 0 else 'a value is missing'}: give current_a and voltage_v"
         )

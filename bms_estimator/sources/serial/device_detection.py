@@ -77,7 +77,7 @@ def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
                 timeout_s = BOOT_TIMEOUT_S if rate == BAUD and baud is None else PROTOCOL_TIMEOUT_S * len(decoders)
                 if (found := _query_in_turn(line, decoders, timeout_s)) is not None:
                     return DetectedDevice(found, rate, *_describe(decoders[found]))
-                if reason == "silent":
+                if reason == "silent":  # the first other reason is reported
                     reason = _failure_reason(list(decoders.values()))
     except NoPortError as error:
         return str(error).removeprefix(f"{port}: ")

@@ -50,7 +50,7 @@ class SerialSource:
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
-        memory: File that stores the pack's board. It is used only if the board reports a serial number. None: the board is
+        board_file: File that stores the pack's board. It is used only if the board reports a serial number. None: the board is
             not stored.
         tap: Receives a copy of each arrival time and chunk that the decoder is fed.
         wall: Wall clock [s since 1970].
@@ -63,7 +63,7 @@ class SerialSource:
         self,
         settings: SensorSettings,
         *,
-        memory: KnownBoardFile | None = None,
+        board_file: KnownBoardFile | None = None,
         tap: ReadTap | None = None,
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
@@ -78,7 +78,7 @@ class SerialSource:
         self._decoder = make_protocol(settings)
         has_serial_number = settings.protocol == "binary"  # other devices report no serial number
         self._board_check = BoardCheck(
-            lambda: make_protocol(settings), settings.serial or "", memory if has_serial_number else None
+            lambda: make_protocol(settings), settings.serial or "", board_file if has_serial_number else None
         )
         self._discovery = PortDiscovery(settings.port, monotonic)
         self._port = SerialPort(
@@ -133,7 +133,9 @@ class SerialSource:
         """Return the health of the port and its task."""
         now_s = self._port.now_s
         return SourceHealth(
-            self._monotonic() - self._last_check_s, now_s - self._block_arrival_s, self._port.queued_chunks
+            task_idle_s=self._monotonic() - self._last_check_s,
+            block_age_s=now_s - self._block_arrival_s,
+            queued_reads=self._port.queued_chunks,
         )
 
     async def __aenter__(self) -> Self:

@@ -74,7 +74,7 @@ async def source(
     port: Path | str, memory: KnownBoardFile | None = None, **settings: Any
 ) -> AsyncIterator[RecordingSource]:
     reader = RecordingSource(
-        SensorSettings(port=str(port), **settings), memory=memory, first_retry_s=0.05, silent_s=0.3
+        SensorSettings(port=str(port), **settings), board_file=memory, first_retry_s=0.05, silent_s=0.3
     )
     reader.blocks = []
 
