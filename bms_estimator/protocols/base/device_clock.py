@@ -22,9 +22,9 @@ class DeviceClock:
 
     Delayed samples arrive together, and the device's timestamps give their times. A timestamp that steps back, or leads the
     arrival, shows that the clock was set or the device restarted. Then the arrival time is used. The arrival time is also
-    used after the timestamp has been constant for ``MAX_CONSTANT_S``. A slow clock, such as that of a sleeping device or of one that sends
-    milliseconds in place of seconds, would lose charge. The lost time is added in one step, and arrival times are used
-    from then on.
+    used after the timestamp has been constant for ``MAX_CONSTANT_S``. A slow clock would lose charge. Examples are a device
+    that sleeps, and a device that sends milliseconds in place of seconds. The time that a slow clock has lost is added in
+    one step, and arrival times are used from then on.
 
     Attributes:
         jumps: Number of rejected timestamps.

@@ -120,7 +120,7 @@ class RequestDispatcher:
         if name in FORMER_READS:
             raise UserError(f"no such request: subscribe to {prefix}{name}")
         if name not in self._allowed:
-            raise UserError(f"{name}: not allowed; the pack file's mqtt.commands names what is")
+            raise UserError(f"{name}: not allowed; mqtt.commands in the pack file lists the allowed commands")
         if name not in self._handlers:
             raise UserError(f"{name}: cannot be asked here")
         return self._handlers[name]

@@ -137,7 +137,7 @@ class SampleAssembler:
         if retained:
             self._counters["retained"] += bool(bindings)
             return
-        conflict = False
+        has_conflict = False
         for binding, match in bindings:
             cell = int(match[1]) if match.re.groups else None
             try:
@@ -148,8 +148,8 @@ class SampleAssembler:
                 self._faults[binding.quantity] = f"{binding.quantity}: {topic}: {error}"
             else:
                 self._faults.pop(binding.quantity, None)
-                conflict |= self._update_conflict(binding, now_s)
-        self._counters["publisher_errors"] += conflict
+                has_conflict |= self._update_conflict(binding, now_s)
+        self._counters["publisher_errors"] += has_conflict
 
     def line(self, now_s: float) -> bytes:
         """Return the line of a complete sample; empty without one."""

@@ -89,7 +89,7 @@ class BoardCheck:
         if self._is_rejected:
             self._drop((chunk,))
             return ()
-        if self.pending_protocol is None:
+        if self.pending_protocol is None:  # the board may have been exchanged on the open port
             if self.serial and (new_serial := decoder.serial_number_in(chunk[1])) is not None:
                 self._check(new_serial, (chunk,))
             return (chunk,)
