@@ -14,7 +14,7 @@ class ScriptedSource:
 
     def __init__(self) -> None:
         self.counters: dict[str, int] = {"frames_received": 0, "frames_lost": 0, "crc_errors": 0, "reconnects": 0}
-        self.message: str | None = None
+        self.silence_reason: str | None = None
         self.board: dict[str, str] = {}
         self.clock_ppm: float | None = None
         self.cells: CellBlock = NO_CELLS

@@ -101,7 +101,7 @@ class AlarmMonitor:
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts)
-        self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.message or "")
+        self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.silence_reason or "")
         if (hooks := self._hooks()) is not None:
             self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall())
         return self._report_changes()

@@ -80,7 +80,7 @@ async def run_pack_service(
         all_sinks.append(History(database, days=settings.store.history_days))
     requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = KnownBoardFile(folder, settings.pack.name) if folder else None
-    source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, memory=memory)
+    source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, board_file=memory)
     outbox = Outbox(database, max_messages=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     publish_raw: PublishRaw | None = None

@@ -291,8 +291,8 @@ class Publisher:
         silent_s = now_s - self._sample_s
         if silent_s <= self._fresh_s:
             return None
-        if self._source.message:
-            return self._source.message
+        if self._source.silence_reason:
+            return self._source.silence_reason
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
         dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped().items()}

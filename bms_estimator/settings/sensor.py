@@ -17,7 +17,7 @@ def _filled(sensor: dict[str, object]) -> dict[str, object]:
     protocol = sensor.get("protocol")
     if not isinstance(protocol, str) or protocol not in DEVICES:
         return sensor
-    declared = vars(DEVICES[protocol].resolution)
+    declared = vars(DEVICES[protocol].sensor_defaults)
     return {name: value for name, value in declared.items() if value is not None} | sensor
 
 

@@ -21,18 +21,18 @@ class SourceHealth(NamedTuple):
 
 
 class ReadTap(Protocol):
-    """Receiver of a copy of each chunk that the decoder is fed, such as a recorder. It must neither block nor raise."""
+    """Receives a copy of each chunk before it is decoded, for example to record it. It must neither block nor raise."""
 
     @property
     def missed_reads(self) -> int:
-        """Number of chunks that it could not store."""
+        """Number of chunks that the receiver could not store."""
 
     def write(self, arrival_s: float, data: bytes) -> None:
         """Receive one chunk."""
 
 
 class Source(Protocol):
-    """An async iterator of SAMPLE blocks with fault counters.
+    """Async iterator of sample blocks, with fault counters.
 
     The iterator of a device never ends by itself. That of a capture or a table ends with the last sample.
     """
@@ -42,7 +42,7 @@ class Source(Protocol):
         """Counts since start: ``frames_received``, ``frames_lost``, ``crc_errors``, ``reconnects`` and faults by kind."""
 
     @property
-    def message(self) -> str | None:
+    def silence_reason(self) -> str | None:
         """Reason why no samples arrive, as text; None while they arrive."""
 
     @property

@@ -124,7 +124,9 @@ async def test_the_printed_command_shows_the_topics(free_port):
         pytest.skip("mosquitto_sub is not installed (apt install mosquitto-clients)")
     async with DemoBroker(free_port) as broker, aiomqtt.Client("127.0.0.1", free_port) as service:
         await publish_all(service)
-        process = await asyncio.create_subprocess_shell(f"{broker.subscribe_command} -C 3", stdout=asyncio.subprocess.PIPE)
+        process = await asyncio.create_subprocess_shell(
+            f"{broker.subscribe_command} -C 3", stdout=asyncio.subprocess.PIPE
+        )
         async with asyncio.timeout(LONG_S):
             shown, _ = await process.communicate()
         assert sorted(shown.decode().split()[::2]) == sorted(RETAINED[:3])

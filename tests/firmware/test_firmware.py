@@ -361,4 +361,4 @@ async def test_serial_source_sets_the_rate_and_reads_the_samples(tmp_path: Path)
                     break
             assert board.counters["frames_lost"] == 0
             assert board.counters["crc_errors"] == 0
-            assert board.message is None
+            assert board.silence_reason is None

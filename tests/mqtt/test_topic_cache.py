@@ -24,7 +24,7 @@ def test_all_published_messages_are_stored_by_device_and_topic():
     messages = MessageBuilder("site/bms", "pack")
     for message in (
         *messages.birth_messages(),
-        *messages.must_deliver(None, ONE),
+        *messages.guaranteed_messages(None, ONE),
         *messages.live_messages(PublishedState(), ONE, NOW)[0],
     ):
         cache.take(message.topic, message.payload, NOW)
@@ -35,7 +35,7 @@ def test_all_published_messages_are_stored_by_device_and_topic():
     assert device.topics["availability"] == "online"
     assert {"health", "info", "parameters", "event", "sensor/availability", "schema"} <= set(device.topics)
     assert not any("homeassistant/" in topic for topic in device.topics)
-    assert set(device.heard_s.values()) == {NOW}
+    assert set(device.received_s.values()) == {NOW}
 
 
 def test_invalid_json_is_returned_as_text():

@@ -170,7 +170,7 @@ async def test_dropped_pack_is_removed_from_the_list() -> None:
         assert (await read(reader))["packs"] == {"names": ["attic", "cellar"], "hidden": 0}
         hub.put("attic", "state", state(0.0))
         hub.drop("attic")
-        hub.hide(7)
+        hub.set_hidden_count(7)
         assert await read(reader) == {"packs": {"names": ["cellar"], "hidden": 7}}
 
 

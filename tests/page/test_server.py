@@ -45,7 +45,7 @@ async def browsing(
     """Start a server. Yield a client with cookies for its address."""
     jar = aiohttp.CookieJar(unsafe=True)  # accepts cookies of an IP address
     async with (
-        PageServer(settings or PageSettings(listen="127.0.0.1:0"), hub, history, patient=False) as server,
+        PageServer(settings or PageSettings(listen="127.0.0.1:0"), hub, history, retry=False) as server,
         aiohttp.ClientSession(server.url, cookie_jar=jar) as session,
     ):
         yield session
@@ -233,9 +233,9 @@ async def test_address_in_use_is_reported_and_retried(hub, history, monkeypatch)
     with socket.create_server(("127.0.0.1", 0)) as other:
         settings = PageSettings(listen=f"127.0.0.1:{other.getsockname()[1]}")
         with pytest.raises(UserError, match=r"page\.listen = 127\.0\.0\.1:\d+: .*in use"):
-            async with PageServer(settings, hub, history, patient=False):
+            async with PageServer(settings, hub, history, retry=False):
                 pass
-        server = await PageServer(settings, hub, history, opened=opened.put_nowait).__aenter__()
+        server = await PageServer(settings, hub, history, on_listening=opened.put_nowait).__aenter__()
         assert opened.empty()
     async with asyncio.timeout(LONG_S):
         url = await opened.get()

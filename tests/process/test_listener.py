@@ -28,7 +28,7 @@ async def test_a_thousand_idle_connections_leave_descriptors_and_an_authorized_c
     token.write_text("0123456789abcdef")
     settings = PageSettings(listen="127.0.0.1:0", token_file=token)
     with few_descriptors():
-        async with PageServer(settings, PackTopics(), HistoryQuery(), patient=False) as server:
+        async with PageServer(settings, PackTopics(), HistoryQuery(), retry=False) as server:
             await _answered_under_attack(server, tmp_path)
 
 
@@ -45,7 +45,7 @@ async def _answered_under_attack(server: PageServer, tmp_path: Path) -> None:
 
 async def test_a_client_without_a_complete_header_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listener_module, "HEADER_S", 0.05)
-    async with PageServer(PageSettings(listen="127.0.0.1:0"), PackTopics(), HistoryQuery(), patient=False) as server:
+    async with PageServer(PageSettings(listen="127.0.0.1:0"), PackTopics(), HistoryQuery(), retry=False) as server:
         port = int(server.url.rsplit(":", 1)[1].strip("/"))
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(b"GET / HTTP/1.1\r\nHost: loc")

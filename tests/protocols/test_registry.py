@@ -13,11 +13,11 @@ from bms_estimator.settings.sensor import SensorSettings
 from tests.patience import LONG_S
 
 NEW_DEVICE = """
-from bms_estimator.protocols.base.device import Device, Resolution
+from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.devices.text import TextProtocol
 
 DEVICE = Device(
-    "shunt", lambda sign, _: TextProtocol(current_sign=sign), Resolution(2400, "charge_positive", 5.0, 0.05, 0.02, 0.3)
+    "shunt", lambda sign, _: TextProtocol(current_sign=sign), SensorDefaults(2400, "charge_positive", 5.0, 0.05, 0.02, 0.3)
 )
 """
 SCRIPT = """

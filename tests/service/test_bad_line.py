@@ -96,7 +96,7 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
     sink, stop = Collector(), asyncio.Event()
     task = asyncio.create_task(run_estimation_loop(settings, CELL, source=board, sinks=[sink], stop=stop))
     async with asyncio.timeout(LONG_S):
-        while "no frame yet" not in (board.message or ""):  # noqa: ASYNC110 - the board has no event for it
+        while "no frame yet" not in (board.silence_reason or ""):  # noqa: ASYNC110 - the board has no event for it
             await asyncio.sleep(0.01)
     line.write(hello)
     try:

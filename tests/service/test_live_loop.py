@@ -186,8 +186,8 @@ async def test_the_drift_of_the_board_s_clock_is_published_once_it_is_measured()
 
 async def test_the_reason_for_missing_samples_is_published() -> None:
     async with running() as run:
-        run.source.message = "waiting for /dev/ttyUSB0: it does not exist"
-        snapshot = await run.sink.until(lambda s: s.health.sensor_message == run.source.message)
+        run.source.silence_reason = "waiting for /dev/ttyUSB0: it does not exist"
+        snapshot = await run.sink.until(lambda s: s.health.sensor_message == run.source.silence_reason)
     assert snapshot.estimate is None
 
 

@@ -108,7 +108,7 @@ async def test_systemctl_status_shows_the_soc_or_the_reason_for_missing_samples(
     arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
     task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **arguments))
     assert await systemd.wait_for("READY=1") == "READY=1\nSTATUS=estimating pack"
-    source.message = "waiting for /dev/none: it does not exist"
+    source.silence_reason = "waiting for /dev/none: it does not exist"
     await systemd.wait_for("STATUS=estimating pack: no samples: ")
     source.give((0.0, 0.1, 3.8))
     assert (await systemd.wait_for("STATUS=estimating pack: SOC 0.")).startswith("STATUS=estimating pack: SOC 0.5")

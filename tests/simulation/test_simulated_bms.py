@@ -103,18 +103,18 @@ async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
     with CaptureRecorder(path, header) as recording:
         async with read_bms(bms, protocol, recording) as (board, record):
             await record.wait_for_more(2)
-            assert (board.message, board.counters["crc_errors"], board.counters["noise_bytes"]) == (None, 0, 0)
+            assert (board.silence_reason, board.counters["crc_errors"], board.counters["noise_bytes"]) == (None, 0, 0)
             for fault, names in FAULT_COUNTERS.items():
                 before = sum(board.counters[counter] for counter in names)
                 bms.inject(fault)
                 await until(lambda: sum(board.counters[c] for c in names) > before)  # noqa: B023 - awaited here
                 await record.wait_for_more(1)
             bms.inject(BmsFault.SILENCE, 1_000_000)
-            await until(lambda: board.message)
-            assert "open, but silent" in (board.message or "")
+            await until(lambda: board.silence_reason)
+            assert "open, but silent" in (board.silence_reason or "")
             bms.clear_faults()
             await record.wait_for_more(1)
-            assert board.message is None
+            assert board.silence_reason is None
             counters = board.counters
     live = np.concatenate(record.blocks)
     step_v, step_a, step_k = RESOLUTIONS[name]

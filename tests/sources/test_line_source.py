@@ -54,7 +54,7 @@ async def take(source: LineSource, samples: int) -> SampleBlock:
 async def wait_for_message(source: LineSource, expected: str) -> None:
     """Wait until the source reports this message."""
     async with asyncio.timeout(LONG_S):
-        while source.message != expected:  # noqa: ASYNC110 - it has no event for it
+        while source.silence_reason != expected:  # noqa: ASYNC110 - it has no event for it
             await asyncio.sleep(0.001)
 
 
@@ -72,7 +72,7 @@ async def test_lost_source_is_reopened_with_reason_and_counter():
     assert block["current_a"].tolist() == [-2.0, -2.0]
     assert block["temperature_c"].tolist() == [21.5, 21.5]
     assert np.array_equal(source.cells, [[3.2625, np.nan]], equal_nan=True)
-    assert source.message is None
+    assert source.silence_reason is None
     assert source.counters["frames_received"] == 2
     assert source.counters["reconnects"] == 1
     reasons = [line["reason"] for line in logged if line["event"] == "no samples"]

@@ -100,7 +100,7 @@ async def replayed(
         at_once: True: the blocks are as long as the capture allows. False: one sample a block.
     """
     now_s, result, sink = 0.0, ReplayResult(), Collector()
-    source = Replay(open_capture(path, settings_.sensor), longest_s=math.inf if at_once else 0.05)
+    source = Replay(open_capture(path, settings_.sensor), max_block_s=math.inf if at_once else 0.05)
     estimator = new_estimator(settings_, cell)
     clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
     publisher = Publisher(

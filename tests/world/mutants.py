@@ -73,7 +73,7 @@ def no_check_of_board_clock() -> Iterator[None]:
     original = FrameDecoder._decode
 
     def decode(self: FrameDecoder, *arguments: Any) -> Any:
-        self._state["least_late_s"], self._state["period_us"] = -math.inf, 1e12  # no sample counts as early
+        self._state["min_delay_s"], self._state["period_us"] = -math.inf, 1e12  # no sample counts as early
         return original(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:

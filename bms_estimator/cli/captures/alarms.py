@@ -96,7 +96,7 @@ def alarms(
     with _quiet(), standard_input() if str(capture) == "-" else nullcontext(capture) as path:
         with show_compile_progress():
             opened = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
-        source = Replay(opened, longest_s=STEP_S)
+        source = Replay(opened, max_block_s=STEP_S)
         result = asyncio.run(_evaluate(settings, model, source))
         if source.samples == 0:
             raise UserError(f"{path}: contains no sample")

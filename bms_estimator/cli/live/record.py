@@ -129,7 +129,7 @@ class Progress:
 
     def line(self) -> Text:
         """Return the progress as one line."""
-        message = f"  {self._source.message}" if self._source.message else ""
+        message = f"  {self._source.silence_reason}" if self._source.silence_reason else ""
         now_s, frames = time.monotonic(), self._source.counters["frames_received"]
         if now_s - self._last[0] >= 1.0:
             self._rate_hz = (frames - self._last[1]) / (now_s - self._last[0])

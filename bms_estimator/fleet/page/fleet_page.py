@@ -71,7 +71,7 @@ async def fleet_page(
         return _json(details)
 
     async with (
-        WebServer(settings, FILES, latest, {"/packs": packs, "/pack": pack}, patient=False) as page,
+        WebServer(settings, FILES, latest, {"/packs": packs, "/pack": pack}, retry=False) as page,
         FleetFeed(server, view, latest.set_link_state),
     ):
         tasks = [asyncio.create_task(_send_overviews(view, latest, step_s), name="fleet page")]

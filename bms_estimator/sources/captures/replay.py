@@ -64,13 +64,15 @@ class RawCapture:
         self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
     ) -> None:
         recorded = read_sensor_settings(path)
-        used = sensor or recorded
-        if used.protocol != recorded.protocol:
+        decoder_settings = sensor or recorded
+        if decoder_settings.protocol != recorded.protocol:
             raise UserError(
-                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {used.protocol!r}: "
+                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {decoder_settings.protocol!r}: "
                 "give settings with that protocol, or none"
             )
-        self.decoder = make_protocol(used.model_copy(update={"current_sign": current_sign or used.current_sign}))
+        self.decoder = make_protocol(
+            decoder_settings.model_copy(update={"current_sign": current_sign or decoder_settings.current_sign})
+        )
         self.damaged, self.unread_bytes = False, 0
         self._path = path
         self._read_bytes, self._size = 0, path.stat().st_size
@@ -103,11 +105,11 @@ class Replay:
     Args:
         capture: Capture to replay.
         speed: Speed relative to the recording; None: full speed.
-        longest_s: At full speed, maximum duration of a block on the samples' clock [s].
+        max_block_s: At full speed, maximum duration of a block on the samples' clock [s].
         monotonic: Monotonic clock [s].
     """
 
-    message: str | None = None
+    silence_reason: str | None = None
     """Reason why no samples arrive; None, because a capture always has a next sample or ends."""
 
     def __init__(
@@ -115,12 +117,12 @@ class Replay:
         capture: Capture,
         *,
         speed: float | None = None,
-        longest_s: float = math.inf,
+        max_block_s: float = math.inf,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.capture = capture
         self._decoder = capture.decoder if isinstance(capture, RawCapture) else None
-        self._speed, self._longest_s, self._monotonic = speed, longest_s, monotonic
+        self._speed, self._max_block_s, self._monotonic = speed, max_block_s, monotonic
         self.samples = 0
         self.cells: CellBlock = NO_CELLS
 
@@ -157,7 +159,7 @@ class Replay:
     async def _unpaced(self) -> AsyncIterator[SampleBlock]:
         for block in self.capture:
             cells = self._cells()
-            for part in _parts(block["time_s"], self._longest_s):
+            for part in _parts(block["time_s"], self._max_block_s):
                 self.cells = cells[part]
                 yield block[part]
 
@@ -183,13 +185,13 @@ class Replay:
             last_s, elapsed_s = float(block["time_s"][-1]), float(due_s[-1])
 
 
-def _parts(time_s: NDArray[np.float64], longest_s: float) -> Iterator[slice]:
+def _parts(time_s: NDArray[np.float64], max_block_s: float) -> Iterator[slice]:
     """Yield slices that divide a block into parts of limited duration."""
-    if math.isinf(longest_s):
+    if math.isinf(max_block_s):
         yield slice(None)
         return
-    number = np.floor(_elapsed(time_s, float(time_s[0])) / longest_s)
-    edges = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), time_s.size]
+    part_number = np.floor(_elapsed(time_s, float(time_s[0])) / max_block_s)
+    edges = [0, *(np.flatnonzero(np.diff(part_number)) + 1).tolist(), time_s.size]
     for first, end in itertools.pairwise(edges):
         yield slice(first, end)
 

@@ -26,7 +26,7 @@ async def publish(client: Listener, device: str, voltage_v: float) -> None:
     for message in (
         *messages.birth_messages(),
         *messages.live_messages(PublishedState(), snapshot, NOW)[0],
-        *messages.must_deliver(None, snapshot),
+        *messages.guaranteed_messages(None, snapshot),
     ):
         await client.publish(message.topic, message.payload, qos=1, retain=message.retain)
 

@@ -298,7 +298,7 @@ async def test_simulated_device_is_read_by_the_serial_source(name: str, cells: i
                 assert set(block["temperature_c"]) == {21.0}
                 if source.cells.shape[1] == cells:
                     break
-            assert source.message is None
+            assert source.silence_reason is None
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
         assert source.cells.sum() == pytest.approx(49.87 * source.cells.shape[0] * (cells > 0), abs=0.01 * cells)

@@ -23,7 +23,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from bms_estimator.sinks.exports.prometheus import PrometheusSink
 from bms_estimator.sinks.exports.prometheus_metrics import (
-    KINDS,
+    COUNTER_FIELDS,
     LIST_ITEMS,
     name_and_factor,
 )
@@ -106,7 +106,7 @@ async def test_occupied_address_raises_an_error() -> None:
 
 def test_tables_contain_only_existing_fields() -> None:
     fields = set(Estimate.model_fields) | set(Health.model_fields)
-    assert {*KINDS, *LIST_ITEMS} <= fields
+    assert {*COUNTER_FIELDS, *LIST_ITEMS} <= fields
 
 
 def test_units_are_converted_to_base_units() -> None:

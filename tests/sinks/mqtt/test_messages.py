@@ -44,14 +44,14 @@ def test_retained_messages_have_qos_1_and_live_ones_qos_0():
 
 
 def test_states_must_be_delivered_and_need_samples():
-    [state] = MESSAGES.must_deliver(ONE, ONE)
+    [state] = MESSAGES.guaranteed_messages(ONE, ONE)
     assert (state.topic, state.qos, state.retain) == ("bms/pack/state", 1, False)
-    assert topics(MESSAGES.must_deliver(ONE, ONE)) == ["state"]
-    assert MESSAGES.must_deliver(ONE, NOTHING_YET) == []
+    assert topics(MESSAGES.guaranteed_messages(ONE, ONE)) == ["state"]
+    assert MESSAGES.guaranteed_messages(ONE, NOTHING_YET) == []
 
 
 def test_events_must_be_delivered_and_precede_the_state():
-    event, *_, state = MESSAGES.must_deliver(None, ONE)
+    event, *_, state = MESSAGES.guaranteed_messages(None, ONE)
     assert (event.topic, event.qos, event.retain) == ("bms/pack/event", 1, False)
     payload = json.loads(event.payload)
     assert (payload["name"], payload["time"]) == ("start", ONE.health.publish_time)
@@ -96,7 +96,7 @@ def test_correct_availabilities_are_those_published_last():
 
 
 def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missing():
-    state = json.loads(MESSAGES.must_deliver(ONE, ONE)[0].payload)
+    state = json.loads(MESSAGES.guaranteed_messages(ONE, ONE)[0].payload)
     schema_fields = schema()["state"]["properties"]
     assert set(state) == set(schema_fields) == set(schema()["state"]["required"])
     assert all("description" in field for field in schema_fields.values())
@@ -107,7 +107,7 @@ def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missi
 
 def test_every_payload_is_json_without_nan():
     messages, _ = MESSAGES.live_messages(PublishedState(), ONE, NOW)
-    for message in (*messages, *MESSAGES.must_deliver(None, ONE)):
+    for message in (*messages, *MESSAGES.guaranteed_messages(None, ONE)):
         if message.topic != "bms/pack/sensor/availability":
             json.loads(message.payload, parse_constant=pytest.fail)
 
@@ -117,7 +117,7 @@ def test_messages_are_far_below_the_size_limit_of_the_example():
     assert limit
     messages, _ = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     assert (
-        max(len(m.payload) for m in (*messages, *MESSAGES.must_deliver(None, ONE), *MESSAGES.birth_messages()))
+        max(len(m.payload) for m in (*messages, *MESSAGES.guaranteed_messages(None, ONE), *MESSAGES.birth_messages()))
         < int(limit[1]) / 10
     )
 
@@ -145,8 +145,10 @@ def test_changed_alarms_are_published_and_all_to_a_new_broker():
     payload = json.loads(message.payload)
     assert payload == raised.model_dump()
     assert set(payload) == set(schema()["alarm"]["properties"])
-    assert [json.loads(m.payload)["name"] for m in MESSAGES.must_deliver(before, after)[:-1]] == ["alarm_raised"]
-    assert [json.loads(m.payload)["name"] for m in MESSAGES.must_deliver(after, before)[:-1]] == ["alarm_cleared"]
+    assert [json.loads(m.payload)["name"] for m in MESSAGES.guaranteed_messages(before, after)[:-1]] == ["alarm_raised"]
+    assert [json.loads(m.payload)["name"] for m in MESSAGES.guaranteed_messages(after, before)[:-1]] == [
+        "alarm_cleared"
+    ]
 
 
 def test_retained_message_of_an_unmonitored_alarm_is_removed():

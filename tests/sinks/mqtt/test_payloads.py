@@ -55,7 +55,10 @@ def test_messages_have_qos_and_retain_of_the_topic_table() -> None:
     messages, snapshot = MessageBuilder("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
     messages_by_topic = {
         m.topic.removeprefix("bms/pack/"): m
-        for m in (*messages.must_deliver(None, snapshot), *messages.live_messages(PublishedState(), snapshot, NOW)[0])
+        for m in (
+            *messages.guaranteed_messages(None, snapshot),
+            *messages.live_messages(PublishedState(), snapshot, NOW)[0],
+        )
     }
     assert messages_by_topic["alarm/soc_low"].qos == TOPICS["alarm"].qos
     assert messages_by_topic["alarm/soc_low"].retain

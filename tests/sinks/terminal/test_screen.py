@@ -25,7 +25,7 @@ def pack_view(topics: dict[str, Any] | None = None, device: str = "pack", snapsh
     published, messages = TopicCache("bms"), MessageBuilder("bms", device)
     for message in (
         *messages.birth_messages(),
-        *messages.must_deliver(None, snapshot),
+        *messages.guaranteed_messages(None, snapshot),
         *messages.live_messages(PublishedState(), snapshot, NOW)[0],
     ):
         published.take(message.topic, message.payload, NOW)

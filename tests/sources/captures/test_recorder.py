@@ -91,7 +91,7 @@ async def test_full_disk_ends_the_recording_but_not_the_samples(tmp_path: Path, 
     with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(mode="text")) as recording:
         settings = SensorSettings(port=str(line.path), protocol="text")
         async with SerialSource(settings, tap=recording) as source, asyncio.timeout(LONG_S):
-            while "no frame yet" not in (source.message or ""):  # noqa: ASYNC110 - the source has no event for it
+            while "no frame yet" not in (source.silence_reason or ""):  # noqa: ASYNC110 - the source has no event for it
                 await asyncio.sleep(0.01)
             blocks = aiter(source)
             disk.fails = True

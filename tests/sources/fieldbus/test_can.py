@@ -15,7 +15,7 @@ from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.factory import open_line_source
-from bms_estimator.sources.fieldbus.can import BUS_OFF, CanProducer
+from bms_estimator.sources.fieldbus.can import BUS_OFF_BIT, CanProducer
 from bms_estimator.sources.line_source import SourceUnavailableError
 from tests.patience import LONG_S
 from tests.serial_line import Line
@@ -75,7 +75,7 @@ async def test_bus_off_is_reported_until_the_next_frame(channel: str, sender: ca
     producer = CanProducer(source(interface="virtual", channel=channel))
     async with aclosing(producer.iter_lines()) as lines:
         assert await next_line(lines) == CONNECTED
-        assert PYLONTECH.arbitration_id & BUS_OFF  # the virtual bus filters error frames, too
+        assert PYLONTECH.arbitration_id & BUS_OFF_BIT  # the virtual bus filters error frames, too
         sender.send(can.Message(arbitration_id=0x356, is_extended_id=False, is_error_frame=True))
         async with asyncio.timeout(LONG_S):
             while producer.counters["error_frames"] == 0:  # noqa: ASYNC110 - it has no event for it
@@ -126,12 +126,12 @@ async def test_current_of_the_samples_is_positive_on_discharge(channel: str, sen
     async with asyncio.timeout(LONG_S), line_source:
         blocks = aiter(line_source)
         next_block = asyncio.ensure_future(anext(blocks))
-        while "connected" not in (line_source.message or ""):  # noqa: ASYNC110 - it has no event for it
+        while "connected" not in (line_source.silence_reason or ""):  # noqa: ASYNC110 - it has no event for it
             await asyncio.sleep(0.001)
         sender.send(PYLONTECH)
         block = await next_block
         assert block[["current_a", "voltage_v", "temperature_c"]].tolist() == [(12.3, 52.34, 21.5)]
-        assert line_source.message is None
+        assert line_source.silence_reason is None
 
 
 async def test_unknown_option_of_the_interface_is_reported() -> None:

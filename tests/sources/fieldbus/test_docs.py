@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.fieldbus.can_signals import CanMap, FrameId
+from bms_estimator.sources.fieldbus.can_signals import CanDecoder, FrameId
 
 TEXT = (Path(__file__).parents[3] / "docs" / "pack" / "fieldbus.md").read_text(encoding="utf-8")
 
@@ -28,7 +28,7 @@ def test_example_of_a_dbc_file_fits_the_settings_before_it(tmp_path: Path) -> No
     path = tmp_path / "pack.dbc"
     path.write_text(match[2])
     table = tomllib.loads(match[1])["source"] | {"dbc": str(path)}
-    frames = CanMap(CanSource.model_validate(table))
+    frames = CanDecoder(CanSource.model_validate(table))
     assert frames.frame_ids == (FrameId(0x6B0, False), FrameId(0x18FF0001, True))
     assert frames.feed(0.0, 0x18FF0001, True, bytes.fromhex("e40ce50c")) is None
     reading = frames.feed(0.0, 0x6B0, False, bytes.fromhex("ff85020815000000"))

@@ -16,8 +16,8 @@ from bms_estimator.sources.fieldbus.modbus_registers import (
     decode,
     decode_reading,
     list_values,
-    plan,
-    split,
+    plan_requests,
+    split_request,
 )
 
 FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
@@ -53,7 +53,7 @@ def test_requests_cover_every_register_once_within_the_maximum_length(wanted: li
         Value("cells", Register(address=address, type=kind, table="input" if is_input else "holding"))
         for address, kind, is_input in wanted
     ]
-    requests = plan(values)
+    requests = plan_requests(values)
     assert sorted((v for request in requests for v in request.values), key=repr) == sorted(values, key=repr)
     for request in requests:
         assert 1 <= request.words <= MAX_WORDS
@@ -68,18 +68,18 @@ def test_requests_cover_every_register_once_within_the_maximum_length(wanted: li
 
 
 def test_device_with_a_profile_is_read_in_as_few_requests_as_possible() -> None:
-    (request,) = plan(list_values(source(profile="victron-gx")))
+    (request,) = plan_requests(list_values(source(profile="victron-gx")))
     assert (request.table, request.address, request.words) == ("holding", 259, 4)
     assert request.described == "source.voltage, source.current, source.temperature (holding registers 259 to 262)"
-    seplos = plan(list_values(source(profile="seplos-v3")))
+    seplos = plan_requests(list_values(source(profile="seplos-v3")))
     assert [(r.table, r.address, r.words) for r in seplos] == [("input", 0x1000, 10), ("input", 0x1100, 16)]
 
 
 def test_rejected_request_is_split_by_quantity_and_without_gaps() -> None:
-    (request,) = plan(list_values(source(profile="victron-gx")))
-    assert [(r.address, r.words) for r in split(request)] == [(259, 1), (261, 1), (262, 1)]
-    (single_value_request,) = split(split(request)[0])
-    assert split(single_value_request) == (single_value_request,)
+    (request,) = plan_requests(list_values(source(profile="victron-gx")))
+    assert [(r.address, r.words) for r in split_request(request)] == [(259, 1), (261, 1), (262, 1)]
+    (single_value_request,) = split_request(split_request(request)[0])
+    assert split_request(single_value_request) == (single_value_request,)
 
 
 def test_readings_of_devices_with_profiles() -> None:

@@ -53,10 +53,10 @@ async def test_nothing_is_sent_to_a_device_with_another_protocol(line: Line) -> 
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
     async with run_source(source, []):
-        await until(lambda: source.message and "silent" in source.message)
+        await until(lambda: source.silence_reason and "silent" in source.silence_reason)
         assert line.received() == b""
         line.write(100 * ASH_RESET)
-        await until(lambda: source.message and "no valid frame" in source.message)
+        await until(lambda: source.silence_reason and "no valid frame" in source.silence_reason)
         assert line.received() == b""
 
 
@@ -64,7 +64,7 @@ async def test_hello_is_requested_after_the_first_frame(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
     async with run_source(source, []):
-        await until(lambda: source.message and "no frame yet" in source.message)
+        await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
         line.write(b"\0" + hello_command())  # any frame with a valid CRC
         received = b""
 
@@ -112,10 +112,10 @@ async def test_auto_rejects_another_board_and_reopens_its_own(only_port: Path) -
     async with run_source(source, blocks):
         async with plugged_in(only_port, serial=1):
             await until(lambda: source._board_check.serial)
-        await until(lambda: source.message)
+        await until(lambda: source.silence_reason)
         async with plugged_in(only_port, serial=2, voltage_v=11.1):
-            await until(lambda: source.message and "refused" in source.message)
-            assert "board 00000002 is not the pack's, 00000001" in (source.message or "")
+            await until(lambda: source.silence_reason and "refused" in source.silence_reason)
+            assert "board 00000002 is not the pack's, 00000001" in (source.silence_reason or "")
             await until(lambda: source.counters["reconnects"] >= 2)  # the board is checked a second time
         blocks_before = len(blocks)
         async with plugged_in(only_port, serial=1):
@@ -129,9 +129,9 @@ async def test_auto_reports_what_replaced_its_board(only_port: Path) -> None:
     async with run_source(source, []):
         async with plugged_in(only_port, serial=1):
             await until(lambda: source._board_check.serial)
-        await until(lambda: source.message)
+        await until(lambda: source.silence_reason)
         with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, symlink(only_port, other.path):
             task = asyncio.create_task(other.run())
-            await until(lambda: source.message and "prints text" in source.message)
+            await until(lambda: source.silence_reason and "prints text" in source.silence_reason)
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)

@@ -110,7 +110,7 @@ async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Li
     async with source:
         task = asyncio.create_task(store_blocks())
         try:
-            await until(lambda: source.message and "no frame yet" in source.message)
+            await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
             line.write(ours.hello() + b"".join(ours.frames(10)))
             await until(lambda: source._board_check.serial)
             received = line.received()
@@ -123,7 +123,9 @@ async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Li
 
             await until(is_requested)
             line.write(other.hello() + b"".join(other.frames(10)))
-            await until(lambda: source.message and "board 00000002 is not the pack's, 00000001" in source.message)
+            await until(
+                lambda: source.silence_reason and "board 00000002 is not the pack's, 00000001" in source.silence_reason
+            )
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)

@@ -74,7 +74,7 @@ async def source(
     port: Path | str, memory: KnownBoardFile | None = None, **settings: Any
 ) -> AsyncIterator[RecordingSource]:
     reader = RecordingSource(
-        SensorSettings(port=str(port), **settings), memory=memory, first_retry_s=0.05, silent_s=0.3
+        SensorSettings(port=str(port), **settings), board_file=memory, first_retry_s=0.05, silent_s=0.3
     )
     reader.blocks = []
 
@@ -116,10 +116,10 @@ async def test_other_board_on_the_configured_port_is_rejected_after_a_restart(
     async with source(port, memory), board(port):
         await wait_until_stored(memory, "00000001")
     async with source(port, memory) as reader, board(port, serial=2, voltage_v=OTHERS_V):
-        await until(lambda: reader.message and "refused" in reader.message)
+        await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
         message = f"{port}: refused: board 00000002 is not the pack's, 00000001: connect that one, or, to use this board instead, run"
-        assert message in (reader.message or "")
-        assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (reader.message or "")
+        assert message in (reader.silence_reason or "")
+        assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (reader.silence_reason or "")
         await until(lambda: reader.counters["reconnects"] >= 1)
         assert reader.blocks == []
 
@@ -129,9 +129,9 @@ async def test_other_board_on_the_configured_port_is_rejected_within_a_run(folde
     async with source(port) as reader:
         async with board(port):
             await until(lambda: reader._board_check.serial)
-        await until(lambda: reader.message)
+        await until(lambda: reader.silence_reason)
         async with board(port, serial=2, voltage_v=OTHERS_V):
-            await until(lambda: reader.message and "refused" in reader.message)
+            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
         blocks_before = len(reader.blocks)
         async with board(port):
             await until(lambda: len(reader.blocks) > blocks_before)
@@ -142,9 +142,9 @@ async def test_first_board_is_rejected_if_another_is_configured(folder: Path, me
     port = folder / "ttyUSB0"
     async with source(port, memory, serial="0000002a") as reader:
         async with board(port, voltage_v=OTHERS_V):
-            await until(lambda: reader.message and "refused" in reader.message)
-            assert "board 00000001 is not the pack's, 0000002a" in (reader.message or "")
-            assert "set sensor.serial" in (reader.message or "")
+            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
+            assert "board 00000001 is not the pack's, 0000002a" in (reader.silence_reason or "")
+            assert "set sensor.serial" in (reader.silence_reason or "")
         async with board(port, serial=42):
             await until(lambda: reader.blocks)
         assert reader.voltage_v == pytest.approx(OURS_V, abs=0.1)
@@ -158,7 +158,7 @@ async def test_board_without_serial_number_is_rejected(folder: Path, memory: Kno
             assert reader.board["serial"] == ""
     assert memory.load() == {}
     async with source(port, memory, serial="00000001") as reader, board(port, serial=0):
-        await until(lambda: "board without a serial number is not the pack's" in (reader.message or ""))
+        await until(lambda: "board without a serial number is not the pack's" in (reader.silence_reason or ""))
 
 
 async def test_other_board_behind_the_open_adapter_is_rejected(folder: Path) -> None:
@@ -169,7 +169,9 @@ async def test_other_board_behind_the_open_adapter_is_rejected(folder: Path) -> 
         virtual._stored[20] = 2
         virtual._converter = VirtualBoard(lambda _: Reading(0.5, 1.0), parts=BoardParts(divider=9.0))._converter
         virtual.reset()
-        await until(lambda: reader.message and "board 00000002 is not the pack's, 00000001" in reader.message)
+        await until(
+            lambda: reader.silence_reason and "board 00000002 is not the pack's, 00000001" in reader.silence_reason
+        )
     assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
@@ -178,7 +180,7 @@ async def test_board_is_found_on_another_port(folder: Path, memory: KnownBoardFi
     async with source(port, memory) as reader:
         async with board(port):
             await until(lambda: reader._board_check.serial)
-        await until(lambda: reader.message)
+        await until(lambda: reader.silence_reason)
         blocks_before = len(reader.blocks)
         async with board(folder / "ttyUSB1", serial=2, voltage_v=OTHERS_V), board(folder / "ttyUSB2"):
             await until(lambda: len(reader.blocks) > blocks_before)
@@ -262,7 +264,7 @@ async def test_running_service_uses_a_newly_accepted_board(
         async with board(port):
             await wait_until_stored(memory, "00000001")
         async with board(port, serial=2, voltage_v=OTHERS_V):
-            await until(lambda: reader.message and "refused" in reader.message)
+            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
             code, text, _ = run(capsys, "board", "--accept", pack)
             assert code == 0
             assert f"{memory.path}: board 00000001 removed; the service accepts the next board that connects\n" in text
@@ -277,10 +279,10 @@ async def test_deleted_board_file_accepts_no_other_board(folder: Path, memory: K
             await wait_until_stored(memory, "00000001")
         memory.path.unlink()
         async with board(port, serial=2):
-            await until(lambda: reader.message and "refused" in reader.message)
+            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
             refused = reader.counters["reconnects"]
             await until(lambda: reader.counters["reconnects"] > refused)
-            assert "refused" in (reader.message or "")
+            assert "refused" in (reader.silence_reason or "")
 
 
 async def test_other_board_after_a_restart_is_reported_in_health(

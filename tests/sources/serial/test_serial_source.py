@@ -81,13 +81,13 @@ def count(blocks: list[SampleBlock]) -> int:
 
 async def test_missing_port_is_reported_and_retried(line: Line) -> None:
     async with board(line) as source:
-        await until(lambda: source.message and "does not exist" in source.message)
-        assert str(line.path) in (source.message or "")
+        await until(lambda: source.silence_reason and "does not exist" in source.silence_reason)
+        assert str(line.path) in (source.silence_reason or "")
         line.plug()
-        await until(lambda: source.message and "no frame yet" in source.message)
+        await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
         line.write(b"3.80,0.10\r\n3.81,0.20\r\n")
         samples = await take(source, 2)
-        assert source.message is None
+        assert source.silence_reason is None
     assert samples["voltage_v"].tolist() == [3.80, 3.81]
     assert source.counters["reconnects"] == 0
 
@@ -95,13 +95,13 @@ async def test_missing_port_is_reported_and_retried(line: Line) -> None:
 async def test_unplugged_board_is_reopened(line: Line) -> None:
     line.plug()
     async with board(line) as source:
-        await until(lambda: source.message and "no frame yet" in source.message)
+        await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
         line.write(b"3.80,0.10\n")
         await take(source, 1)
         line.unplug()
-        await until(lambda: source.message is not None)
+        await until(lambda: source.silence_reason is not None)
         line.plug()
-        await until(lambda: source.message and "no frame yet" in source.message)
+        await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
         line.write(b"3.70,0.10\n")
         samples = await take(source, 1)
     assert samples["voltage_v"].tolist() == [3.70]
@@ -126,11 +126,11 @@ async def test_process_that_holds_the_port_is_found_in_a_thread(line: Line, monk
         assert other.stdout
         await asyncio.to_thread(other.stdout.readline)
         async with board(line) as source:
-            await until(lambda: source.message and f"(pid {other.pid})" in source.message)
+            await until(lambda: source.silence_reason and f"(pid {other.pid})" in source.silence_reason)
             assert threads
             assert threading.current_thread() not in threads
             other.communicate()
-            await until(lambda: source.message and "no frame yet" in source.message)
+            await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
     finally:
         other.communicate()
 
@@ -153,10 +153,10 @@ async def test_port_that_fails_while_opened_is_retried(line: Line, part: object,
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(part, name, fail)
         async with board(line) as source:
-            await until(lambda: source.message and f"{line.path}: cannot be opened" in source.message)
-            message, probed = source.message, probe(str(line.path))
+            await until(lambda: source.silence_reason and f"{line.path}: cannot be opened" in source.silence_reason)
+            message, probed = source.silence_reason, probe(str(line.path))
             patch.undo()
-            await until(lambda: source.message and "no frame yet" in source.message)
+            await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
     assert str(error.args[-1]) in (message or "")
     assert probed.startswith("cannot be opened")
 
@@ -167,29 +167,29 @@ async def test_ports_that_vanish_while_listed_are_retried(tmp_path: Path) -> Non
         patch.setattr(Path, "is_dir", lambda _: True)  # as if the folder vanished after this check
         patch.setattr(list_ports, "comports", list)
         async with SerialSource(SensorSettings(port="auto")) as source:
-            await until(lambda: source.message == "waiting for auto: no USB serial port is connected")
+            await until(lambda: source.silence_reason == "waiting for auto: no USB serial port is connected")
 
 
 async def test_silent_board_and_wrong_baud_rate_have_different_messages(line: Line) -> None:
     line.plug()
     async with board(line) as source:
         drain_task = asyncio.create_task(drain(source))
-        await until(lambda: source.message and "silent" in source.message)
+        await until(lambda: source.silence_reason and "silent" in source.silence_reason)
         async with asyncio.timeout(LONG_S):
-            while "baud" not in (source.message or ""):
+            while "baud" not in (source.silence_reason or ""):
                 line.write(bytes(range(128, 256)))
                 await asyncio.sleep(0.05)
-        assert "at 115200 baud" in (source.message or "")
-        assert "wrong baud rate" in (source.message or "")
+        assert "at 115200 baud" in (source.silence_reason or "")
+        assert "wrong baud rate" in (source.silence_reason or "")
         line.write(b"\n3.80,0.10\n")
-        await until(lambda: source.message is None)
+        await until(lambda: source.silence_reason is None)
     await drain_task
 
 
 async def test_current_sign_is_applied_once(line: Line) -> None:
     line.plug()
     async with board(line, settings={"current_sign": "charge_positive"}) as source:
-        await until(lambda: source.message and "no frame yet" in source.message)
+        await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
         line.write(b"3.80,-0.25\n")
         samples = await take(source, 1)
     assert samples["current_a"].tolist() == [0.25]
@@ -203,7 +203,7 @@ async def test_tap_receives_the_bytes_of_the_decoder(line: Line) -> None:
     tap = Tap()
     line.plug()
     async with board(line, tap=tap, wall=lambda: 1e9, monotonic=lambda: 5.0) as source:
-        await until(lambda: source.message and "no frame yet" in source.message)
+        await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
         line.write(b"junk\n3.80,0.10\n")
         await take(source, 1)
     assert b"".join(data for _, data in tap) == b"junk\n3.80,0.10\n"
