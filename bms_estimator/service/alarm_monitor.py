@@ -11,11 +11,10 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import HookHealth
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.alarm_limits import charging_a, silent_limit_s, watched
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.source import Source
+from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarms import AlarmEvaluator, Change, SampleCounts
 from bms_estimator.telemetry.health import sample_counters, suspicions
@@ -37,7 +36,7 @@ class AlarmMonitor:
         settings: The pack's settings.
         cell: The pack as one object.
         estimator: Estimator; read only.
-        source: Supplies counters, cell voltages, and the reason why no samples arrive.
+        source: Supplies counters, and the reason why no samples arrive.
         clock: The clocks.
         on_alarm: Called with each change of an alarm, as soon as it occurs.
         hooks: Successes and failures of alarm hooks; None without hooks.
@@ -71,18 +70,18 @@ class AlarmMonitor:
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
 
-    def add(self, block: SampleBlock, trace: TraceBlock, now_s: float) -> bool:
-        """Add a block of samples and its estimates; evaluate the alarms if this is due.
+    def add(self, received: ReceivedSamples, trace: TraceBlock, now_s: float) -> bool:
+        """Add received samples and their estimates; evaluate the alarms if this is due.
 
         Args:
-            block: Samples.
+            received: Samples and cell voltages.
             trace: Estimates of the accepted samples.
             now_s: Monotonic clock [s].
 
         Returns:
             True if an alarm has changed.
         """
-        self.alarms.add(block, trace, self._source.cells)
+        self.alarms.add(received.samples, trace, received.cells_v)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
         is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
         return is_due and self.evaluate(now_s)

@@ -11,13 +11,13 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.clock import since_boot
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.sample import SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog
-from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
+from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 CHECK_INTERVAL_S = 1.0
 """Interval between two checks for silence and faults [s]."""
@@ -128,11 +128,6 @@ class LineSource:
         return self._producer.board
 
     @property
-    def cells(self) -> CellBlock:
-        """Cell voltages of the last block."""
-        return self._decoder.cells
-
-    @property
     def clock_ppm(self) -> float | None:
         """Rate error of the device's clock [1e-6]; None if unknown."""
         return self._decoder.clock_ppm
@@ -166,14 +161,14 @@ class LineSource:
                 task.cancel()
             _done, tasks = await asyncio.wait(tasks, timeout=CHECK_INTERVAL_S)
 
-    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks as lines arrive. A line goes to the tap when its block is requested."""
         while (chunk := await self._lines.get()) is not None:
             block = self._decode(*chunk)
             if block.size:
                 self._block_arrival_s = chunk[0]
                 self._silence_reason, self._logged_reason, self._retry_s = None, "", self._first_retry_s
-                yield block
+                yield ReceivedSamples(block, self._decoder.cells)
         if self._produce_task is not None and not self._produce_task.cancelled():
             self._produce_task.result()
 

@@ -31,8 +31,17 @@ class ReadTap(Protocol):
         """Receive one chunk."""
 
 
+class ReceivedSamples(NamedTuple):
+    """Block of samples and the cell voltages that were measured with it."""
+
+    samples: SampleBlock
+    """Samples, shape (n,), dtype SAMPLE."""
+    cells_v: CellBlock
+    """Cell voltages of the samples, shape (n, m) [V]; ``NO_CELLS`` if none are measured."""
+
+
 class Source(Protocol):
-    """Async iterator of sample blocks, with fault counters.
+    """Async iterator of samples, with fault counters.
 
     The iterator of a device never ends by itself. That of a capture or a table ends with the last sample.
     """
@@ -53,11 +62,7 @@ class Source(Protocol):
     def clock_ppm(self) -> float | None:
         """Rate error of the board's clock relative to the host's [1e-6]; None if unknown."""
 
-    @property
-    def cells(self) -> CellBlock:
-        """Cell voltages of the latest block; ``NO_CELLS`` where no cells are measured."""
-
-    def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks of samples; none of them is empty."""
 
     async def __aenter__(self) -> Self:

@@ -7,9 +7,10 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.source import ReceivedSamples
 from tests.collector import Collector
 from tests.scripted_source import ScriptedSource
 
@@ -44,7 +45,7 @@ def test_a_raised_alarm_is_published_before_the_next_snapshot_is_due() -> None:
     publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock)
     for now_s, voltage_v in ((0.0, 3.8), (1.0, 3.8), (2.0, 6.0), (3.0, 6.0)):
         block = np.array([(now_s, 0.0, voltage_v, 25.0, 0)], dtype=SAMPLE)
-        publisher.add(block, estimator.run(block))
+        publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
     raised = [[alarm.name for alarm in each.alarms if alarm.active] for each in sink.snapshots]
     assert raised == [[], ["pack_over_voltage"]]
     assert [each.estimate is None for each in sink.snapshots] == [False, True]

@@ -57,9 +57,9 @@ class SampleRecord:
         return sum(block.size for block in self.blocks)
 
     async def read(self, source: SerialSource) -> None:
-        async for block in source:
+        async for block, cells_v in source:
             self.blocks.append(block.copy())
-            self.cells += source.cells.tolist()
+            self.cells += cells_v.tolist()
 
     async def wait_for_more(self, samples: int) -> None:
         """Wait until this number of further samples has arrived."""

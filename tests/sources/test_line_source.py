@@ -16,6 +16,7 @@ from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.line_source import LineProducer, LineSource, SourceUnavailableError
+from bms_estimator.sources.source import ReceivedSamples
 from tests.patience import LONG_S
 
 TEXT = SensorSettings(protocol="text")
@@ -40,15 +41,20 @@ class ScriptedProducer(LineProducer):
             await asyncio.Event().wait()
 
 
+async def take_received(source: LineSource, samples: int) -> list[ReceivedSamples]:
+    """Return the next samples as received."""
+    taken: list[ReceivedSamples] = []
+    async with asyncio.timeout(LONG_S):
+        async for received in source:
+            taken.append(received)
+            if sum(each.samples.size for each in taken) >= samples:
+                break
+    return taken
+
+
 async def take(source: LineSource, samples: int) -> SampleBlock:
     """Return the next samples."""
-    blocks: list[SampleBlock] = []
-    async with asyncio.timeout(LONG_S):
-        async for block in source:
-            blocks.append(block)
-            if sum(b.size for b in blocks) >= samples:
-                break
-    return np.concatenate(blocks)
+    return np.concatenate([received.samples for received in await take_received(source, samples)])
 
 
 async def wait_for_message(source: LineSource, expected: str) -> None:
@@ -67,11 +73,12 @@ async def test_lost_source_is_reopened_with_reason_and_counter():
     source = LineSource(ScriptedProducer(*script), TEXT, first_retry_s=0.001)
     with capture_logs() as logged:
         async with source:
-            block = await take(source, 2)
+            taken = await take_received(source, 2)
+    block = np.concatenate([received.samples for received in taken])
     assert block["voltage_v"].tolist() == [52.1, 52.2]
     assert block["current_a"].tolist() == [-2.0, -2.0]
     assert block["temperature_c"].tolist() == [21.5, 21.5]
-    assert np.array_equal(source.cells, [[3.2625, np.nan]], equal_nan=True)
+    assert np.array_equal(taken[-1].cells_v, [[3.2625, np.nan]], equal_nan=True)
     assert source.silence_reason is None
     assert source.counters["frames_received"] == 2
     assert source.counters["reconnects"] == 1

@@ -52,7 +52,7 @@ async def test_missing_and_implausible_table_values_are_nan(tmp_path: Path, word
     path = tmp_path / "hot.csv"
     path.write_text(f"{HEAD}0,1,3.7,1e308\n1,1,3.7,-61\n2,1,3.7,{'nan' if word == '1e999' else word}\n3,1,3.7,25\n")
     replay = Replay(open_capture(path))
-    blocks = [block async for block in replay]
+    blocks = [block async for block, _ in replay]
     assert np.concatenate(blocks)["temperature_c"].tolist() == pytest.approx(
         [math.nan, math.nan, math.nan, 25], nan_ok=True
     )

@@ -107,9 +107,9 @@ async def replayed(
         settings_, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
     )
     publisher.alarm_monitor.restore(saved_state)
-    async for block in source:
-        now_s = float(block["time_s"][-1])
-        publisher.add(block, estimator.run(block))
+    async for received in source:
+        now_s = float(received.samples["time_s"][-1])
+        publisher.add(received, estimator.run(received.samples))
     publisher.publish_last()
     result.snapshots, result.saved_state = sink.snapshots, publisher.alarm_monitor.alarms.saved_state
     return result

@@ -125,9 +125,9 @@ async def _evaluate(settings: Settings, cell: PackModel, source: Replay) -> Alar
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
     monitor = AlarmMonitor(settings, cell, estimator, source, clock, changes.append)
-    async for block in source:
-        now_s = max(now_s, float(block["time_s"][-1]))
-        monitor.add(block, estimator.run(block), now_s)
+    async for received in source:
+        now_s = max(now_s, float(received.samples["time_s"][-1]))
+        monitor.add(received, estimator.run(received.samples), now_s)
     monitor.evaluate(now_s)
     reported = monitor.report
     raised, latched = _pair_changes(changes), {alarm.name for alarm in reported if alarm.latched}

@@ -123,15 +123,15 @@ async def _replay(settings: Settings, cell: PackModel, source: Replay, table: Ta
         stack.enter_context(table or nullcontext())
         update_progress = stack.enter_context(_progress(source))
         started_s, impossible = time.perf_counter(), None
-        async for block in source:
-            trace = estimator.run(block)
+        async for received in source:
+            trace = estimator.run(received.samples)
             summary.add(trace)
-            if trace.size < block.size:
-                impossible = out_of_range_reason(block, estimator.settings[0]) or impossible
+            if trace.size < received.samples.size:
+                impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible
             if table:
                 table.write(trace)
             if publisher:
-                publisher.add(block, trace)
+                publisher.add(received, trace)
                 await asyncio.sleep(0)
             update_progress()
         wall_s = time.perf_counter() - started_s

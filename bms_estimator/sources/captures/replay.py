@@ -19,6 +19,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, read_sensor_settings
 from bms_estimator.sources.captures.tables import READERS, ColumnTable, Sign, convert_table, table_reader
+from bms_estimator.sources.source import ReceivedSamples
 
 PACED_INTERVAL_S = 0.05
 """Interval at which a paced replay yields due samples [s]."""
@@ -124,7 +125,6 @@ class Replay:
         self._decoder = capture.decoder if isinstance(capture, RawCapture) else None
         self._speed, self._max_block_s, self._monotonic = speed, max_block_s, monotonic
         self.samples = 0
-        self.cells: CellBlock = NO_CELLS
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -150,24 +150,23 @@ class Replay:
     async def __aexit__(self, *_: object) -> None:
         """Do nothing; the file is closed by the iteration."""
 
-    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks of samples; none of them is empty."""
-        async for block in self._unpaced() if self._speed is None else self._paced(self._speed):
-            self.samples += block.size
-            yield block
+        async for received in self._unpaced() if self._speed is None else self._paced(self._speed):
+            self.samples += received.samples.size
+            yield received
 
-    async def _unpaced(self) -> AsyncIterator[SampleBlock]:
+    async def _unpaced(self) -> AsyncIterator[ReceivedSamples]:
         for block in self.capture:
             cells = self._cells()
             for part in _parts(block["time_s"], self._max_block_s):
-                self.cells = cells[part]
-                yield block[part]
+                yield ReceivedSamples(block[part], cells[part])
 
     def _cells(self) -> CellBlock:
         """Return the cell voltages of the capture's last block."""
         return self._decoder.cells if self._decoder else NO_CELLS
 
-    async def _paced(self, speed: float) -> AsyncIterator[SampleBlock]:
+    async def _paced(self, speed: float) -> AsyncIterator[ReceivedSamples]:
         """Yield each sample when it is due; the first one immediately."""
         start_s, last_s, elapsed_s = self._monotonic(), math.nan, 0.0
         for block in self.capture:
@@ -177,8 +176,7 @@ class Replay:
                 now_s = speed * (self._monotonic() - start_s)
                 end = int(np.searchsorted(due_s, now_s, side="right"))
                 if end > first:
-                    self.cells = self._cells()[first:end]
-                    yield block[first:end]
+                    yield ReceivedSamples(block[first:end], self._cells()[first:end])
                     first = end
                 else:
                     await asyncio.sleep(min((due_s[first] - now_s) / speed + PACED_INTERVAL_S, 1.0))

@@ -11,7 +11,7 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.sample import SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S
 from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
@@ -23,7 +23,7 @@ from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.port_discovery import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
 from bms_estimator.sources.serial.serial_port import SerialPort
-from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
+from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 if TYPE_CHECKING:
     import serial
@@ -120,11 +120,6 @@ class SerialSource:
         return self._decoder.board
 
     @property
-    def cells(self) -> CellBlock:
-        """Cell voltages of the last block [V]."""
-        return self._decoder.cells
-
-    @property
     def clock_ppm(self) -> float | None:
         """Rate error of the board's clock relative to the host's [1e-6]; None if unknown."""
         return self._decoder.clock_ppm
@@ -150,7 +145,7 @@ class SerialSource:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 
-    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks as bytes arrive.
 
         A chunk goes to the tap when its block is requested, so that nothing is recorded that the caller has not received.
@@ -163,7 +158,7 @@ class SerialSource:
                     if self._silence_reason is not None:
                         self._silence_reason, self._rejected = None, False
                         self._port.reset_backoff()
-                    yield block
+                    yield ReceivedSamples(block, self._decoder.cells)
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 

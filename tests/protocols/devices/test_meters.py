@@ -293,15 +293,15 @@ async def test_simulated_device_is_read_by_the_serial_source(name: str, cells: i
         sensor = SensorSettings.model_validate({"protocol": name, "port": meter.path})
         running = asyncio.create_task(meter.run())
         async with asyncio.timeout(LONG_S), SerialSource(sensor) as source:
-            async for block in source:
+            async for block, cells_v in source:
                 assert voltages_and_currents(block) == [(49.87, -3.25)] * block.size
                 assert set(block["temperature_c"]) == {21.0}
-                if source.cells.shape[1] == cells:
+                if cells_v.shape[1] == cells:
                     break
             assert source.silence_reason is None
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
-        assert source.cells.sum() == pytest.approx(49.87 * source.cells.shape[0] * (cells > 0), abs=0.01 * cells)
+        assert cells_v.sum() == pytest.approx(49.87 * cells_v.shape[0] * (cells > 0), abs=0.01 * cells)
 
 
 def test_silence_does_not_count_as_a_protocol_fault() -> None:

@@ -100,7 +100,7 @@ async def test_full_disk_ends_the_recording_but_not_the_samples(tmp_path: Path, 
             while not recording.ended.done():  # noqa: ASYNC110 - another thread sets the future
                 await asyncio.sleep(0.01)
             line.write(b"3.82,0.1\n")
-            assert (await anext(blocks))["voltage_v"].tolist() == [3.82]
+            assert (await anext(blocks)).samples["voltage_v"].tolist() == [3.82]
             assert source.counters["missed_reads"] >= 1
     assert isinstance(error := recording.ended.exception(), OSError)
     assert error.errno == errno.ENOSPC

@@ -129,7 +129,7 @@ async def test_current_of_the_samples_is_positive_on_discharge(channel: str, sen
         while "connected" not in (line_source.silence_reason or ""):  # noqa: ASYNC110 - it has no event for it
             await asyncio.sleep(0.001)
         sender.send(PYLONTECH)
-        block = await next_block
+        block, _ = await next_block
         assert block[["current_a", "voltage_v", "temperature_c"]].tolist() == [(12.3, 52.34, 21.5)]
         assert line_source.silence_reason is None
 

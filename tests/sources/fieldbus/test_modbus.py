@@ -206,7 +206,7 @@ async def test_current_is_positive_on_discharge_and_samples_continue_after_a_rec
     async with asyncio.timeout(LONG_S), source:
         blocks = aiter(source)
         async with tcp_device(registers, UNIT, port):
-            block = await anext(blocks)
+            block, _ = await anext(blocks)
         assert block[["current_a", "voltage_v", "temperature_c"]].tolist() == [(12.3, 52.34, 21.5)]
         assert source.silence_reason is None
         async with tcp_device(registers, UNIT, port):

@@ -37,8 +37,8 @@ async def run_source(source: SerialSource, blocks: list[SampleBlock]):
     """Run the source. Append its blocks to ``blocks``."""
 
     async def store_blocks() -> None:
-        async for block in source:
-            blocks.append(block.copy())  # noqa: PERF401 - others read the list meanwhile
+        async for block, _ in source:
+            blocks.append(block.copy())
 
     async with source:
         task = asyncio.create_task(store_blocks())

@@ -104,8 +104,8 @@ async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Li
     ours, other = RunningBoard(1, 6.1), RunningBoard(2, 9.0, 50_000, 900.0)
 
     async def store_blocks() -> None:
-        async for block in source:
-            blocks.append(block)  # noqa: PERF401 - the test reads the list meanwhile
+        async for block, _ in source:
+            blocks.append(block)
 
     async with source:
         task = asyncio.create_task(store_blocks())

@@ -46,7 +46,7 @@ async def until(condition: Callable[[], object]) -> None:
 async def take(source: SerialSource, samples: int) -> SampleBlock:
     blocks: list[SampleBlock] = []
     async with asyncio.timeout(LONG_S):
-        async for block in source:
+        async for block, _ in source:
             blocks.append(block.copy())
             if sum(b.size for b in blocks) >= samples:
                 break
@@ -71,8 +71,8 @@ async def run_tasks(*tasks: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
 
 
 async def keep(source: SerialSource, blocks: list[SampleBlock]) -> None:
-    async for block in source:
-        blocks.append(block.copy())  # noqa: PERF401 - others read the list meanwhile
+    async for block, _ in source:
+        blocks.append(block.copy())
 
 
 def count(blocks: list[SampleBlock]) -> int:
