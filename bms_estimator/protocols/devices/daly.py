@@ -120,6 +120,8 @@ class DalyProtocol(PolledProtocol):
             if arrival_s - self._cells_s < MAX_ATTACHED_AGE_S
             else []
         )
+        while self._cell_count is None and cells_v and not cells_v[-1] > 0.0:
+            cells_v.pop()  # unused positions of the last frame have 0 V
         has_recent_probes = arrival_s - self._probes_s < MAX_ATTACHED_AGE_S
         probes_c = self._join_frames(self._probes_c, PROBES_PER_FRAME, self._probe_count) if has_recent_probes else []
         # each cell voltage is part of one sample only; temperatures are repeated for up to ``MAX_ATTACHED_AGE_S``
@@ -137,19 +139,14 @@ class DalyProtocol(PolledProtocol):
         Args:
             frames: Frames by number.
             values_per_frame: Number of values in one frame.
-            count: Number of values; None: unknown. Trailing values that are NaN or at most 0 are then omitted, because unused
-                positions of a frame have such values.
+            count: Number of values; None: unknown, so that the unused positions of the last frame are also returned.
         """
         if not frames:
             return []
         missing_frame = [math.nan] * values_per_frame
         numbers = range(self._first_frame_number, max(frames) + 1)
         values = [value for number in numbers for value in frames.get(number, missing_frame)]
-        if count is not None:
-            return (values + [math.nan] * count)[:count]
-        while values and not values[-1] > 0.0:
-            values.pop()
-        return values
+        return values if count is None else (values + [math.nan] * count)[:count]
 
 
 DEVICE = Device(

@@ -367,3 +367,11 @@ def test_batch_of_reads_gives_the_same_samples_and_cells() -> None:
         batch_block = batch_decoder.feed_reads(arrivals_s, ends, np.frombuffer(2 * data, dtype=np.uint8))
         np.testing.assert_array_equal(batch_block, np.concatenate(blocks))
         assert single_reads_decoder.counters == batch_decoder.counters
+
+
+def test_daly_without_probe_count_averages_probes_at_and_below_zero() -> None:
+    temperatures_c = (21, 0, -9)
+    raw = bytes(daly.ZERO_C + celsius for celsius in temperatures_c)
+    probes = with_checksum(bytes((daly.START, 0x01, daly.PROBES, 8, 1)) + raw + bytes(daly.PROBES_PER_FRAME - len(raw)))
+    [sample], _ = decode(make_decoder("daly"), probes + frames.DALY_PACK)
+    assert sample["temperature_c"] == 4.0
