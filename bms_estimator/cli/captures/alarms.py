@@ -18,7 +18,7 @@ from rich.table import Table
 
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
-    OR_FUEL_CELL_HELP,
+    CELL_OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
     SignOfCurrent,
@@ -70,7 +70,7 @@ class AlarmResult:
 
 def alarms(
     capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
-    cell: Annotated[str | None, typer.Option(help=OR_FUEL_CELL_HELP, show_default=False)] = None,
+    cell: Annotated[str | None, typer.Option(help=CELL_OR_FUEL_CELL_HELP, show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[
         Path | None,

@@ -19,12 +19,12 @@ from rich.table import Table
 from bms_estimator.cli.captures.replay_summary import Result, Summary
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
-    OR_FUEL_CELL_HELP,
+    CELL_OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
     Force,
     SignOfCurrent,
-    check_out,
+    check_output_file,
 )
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
@@ -51,7 +51,7 @@ MAX_GLITCHES = 0.01
 
 def replay(
     capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
-    cell: Annotated[str | None, typer.Option(help=OR_FUEL_CELL_HELP, show_default=False)] = None,
+    cell: Annotated[str | None, typer.Option(help=CELL_OR_FUEL_CELL_HELP, show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[Path | None, typer.Option(help="settings file of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
@@ -89,7 +89,7 @@ def replay(
         settings = with_pack(settings, initial_soc=soc)
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
     if out is not None:
-        check_out(out, [capture], force=force)
+        check_output_file(out, [capture], force=force)
     with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
         with show_compile_progress():
             source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)

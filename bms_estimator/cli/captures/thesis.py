@@ -19,11 +19,11 @@ from bms_estimator.cli.options.capture_options import (
     CELL_HELP,
     CapacityAh,
     SignOfCurrent,
-    check_once,
     name_of,
+    reject_duplicates,
 )
 from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.pack_options import TABLE_RESOLUTION_V
+from bms_estimator.cli.options.pack_options import LABORATORY_RESOLUTION_V
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports import report_items
@@ -45,7 +45,7 @@ def thesis(
     capacity_ah: CapacityAh = None,
     resolution_v: Annotated[
         float, typer.Option(parser=decimal(1e-9), help="voltage resolution (LSB) of the captures [V]")
-    ] = TABLE_RESOLUTION_V,
+    ] = LABORATORY_RESOLUTION_V,
     current_sign: SignOfCurrent = None,
     out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
     table: Annotated[
@@ -80,7 +80,7 @@ def _recorded(
 ) -> Recorded:
     if cell is None:
         raise UserError("captures require --cell NAME|CELL.toml, which gives capacity, limits and bounds of the cell")
-    check_once(captures)
+    reject_duplicates(captures)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     named = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
     return Recorded(load_cell(cell, capacity_ah), named, resolution_v)

@@ -20,9 +20,9 @@ from bms_estimator.cli.options.capture_options import (
     InitialSoc,
     NewCellFile,
     SignOfCurrent,
-    check_once,
-    check_out,
-    write_as_named,
+    check_output_file,
+    reject_duplicates,
+    write_cell_named_as_file,
 )
 from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.captures.replay import load_capture
@@ -48,11 +48,11 @@ def adapt_command(
     The captures are replayed with the cell file of --cell and with the new cell file.
     The new file is written only if the error score of its replays is at most 5 % higher (docs/cell/adapt.md).
     """
-    check_out(out, captures, force=force)
-    check_once(captures)
+    check_output_file(out, captures, force=force)
+    reject_duplicates(captures)
     model = load_cell(cell, capacity_ah)
     adaptation = adapt([load_capture(path, current_sign=current_sign) for path in captures], model, soc=soc)
-    write_as_named(out, adaptation.cell, _remarks(cell, adaptation))
+    write_cell_named_as_file(out, adaptation.cell, _remarks(cell, adaptation))
     if as_json:
         sys.stdout.write(json.dumps(_json(out, adaptation)) + "\n")
         return

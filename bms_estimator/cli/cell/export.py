@@ -11,7 +11,7 @@ import typer
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.restore import restore_state
-from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_out, name_of
+from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_output_file, name_of
 from bms_estimator.cli.options.pack_options import load_pack, unpacked_cell
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import identified_cell, ocv_correction_with_std, relative_capacity
@@ -72,7 +72,7 @@ def export(
     file = CheckpointFile(checkpoint.parent if checkpoint else state_folder(settings), settings, model)
     if checkpoint:
         file.path = checkpoint
-    check_out(out, [pack, file.path], force=force)
+    check_output_file(out, [pack, file.path], force=force)
     if checkpoint and not checkpoint.exists():
         raise UserError(f"--checkpoint {checkpoint}: no such file")
     content = file.load()

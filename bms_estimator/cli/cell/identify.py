@@ -15,7 +15,7 @@ from rich.table import Table
 from bms_estimator.calibration.elements.identify import CaptureFit, Identification, identify
 from bms_estimator.cli.cell.identify_fuel_cell import identify_fuel_cell
 from bms_estimator.cli.options.capture_options import (
-    OR_FUEL_CELL_HELP,
+    CELL_OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
     CapturesFromRest,
@@ -23,9 +23,9 @@ from bms_estimator.cli.options.capture_options import (
     InitialSoc,
     NewCellFile,
     SignOfCurrent,
-    check_once,
-    check_out,
-    write_as_named,
+    check_output_file,
+    reject_duplicates,
+    write_cell_named_as_file,
 )
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.model.cell import is_fuel_cell, load_cell
@@ -35,7 +35,7 @@ from bms_estimator.sources.captures.replay import load_capture
 
 def identify_command(
     captures: CapturesFromRest,
-    cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; supplies capacity and OCV", show_default=False)],
+    cell: Annotated[str, typer.Option(help=f"{CELL_OR_FUEL_CELL_HELP}; supplies capacity and OCV", show_default=False)],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
     soc: InitialSoc = None,
@@ -65,8 +65,8 @@ def identify_command(
     For a fuel cell, give polarization curves (columns current_a, voltage_v) and captures under load
     (docs/theory/fuel-cell.md).
     """
-    check_out(out, captures, force=force)
-    check_once(captures)
+    check_output_file(out, captures, force=force)
+    reject_duplicates(captures)
     if is_fuel_cell(cell):
         if capacity_ah is not None or soc is not None or keep_ocv:
             raise UserError(f"{cell} is a fuel cell: --capacity-ah, --soc and --keep-ocv apply only to batteries")
@@ -78,7 +78,7 @@ def identify_command(
     identification = identify(loaded, model, refine_ocv=not keep_ocv, initial_soc=soc, temperature_c=temperature_c)
     seconds = time.perf_counter() - started_s
     start = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
-    write_as_named(out, identification.cell, _remarks(start, identification))
+    write_cell_named_as_file(out, identification.cell, _remarks(start, identification))
     if as_json:
         sys.stdout.write(json.dumps(_json(out, identification, seconds)) + "\n")
     else:

@@ -37,9 +37,9 @@ from bms_estimator.cli.options.capture_options import (
     Force,
     NewCellFile,
     SignOfCurrent,
-    check_once,
-    check_out,
+    check_output_file,
     name_of,
+    reject_duplicates,
     unique_names,
 )
 from bms_estimator.cli.options.number_options import decimal, whole
@@ -183,8 +183,8 @@ def ocv(
     The cell file also contains resistances, estimated from the rests and the most similar generic cell.
     `identify` improves these resistances.
     """
-    check_out(out, captures, force=force)
-    check_once(captures)
+    check_output_file(out, captures, force=force)
+    reject_duplicates(captures)
     recordings, curves = [], []
     for name, path in zip(unique_names([path.name for path in captures], captures), captures, strict=True):
         columns = read_curve(path)

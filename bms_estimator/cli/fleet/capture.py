@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.capture_options import Force, check_out
+from bms_estimator.cli.options.capture_options import Force, check_output_file
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.sinks.trace_file import table_sink
@@ -58,7 +58,7 @@ def capture(
     The server stores samples for some days (setting `server.raw_days`). They are written in the order of sending.
     With the settings that `fleet packs show PACK --out FOLDER` writes, `replay` gives the workers' estimates.
     """
-    check_out(out, [], force=force)
+    check_output_file(out, [], force=force)
     sink = table_sink(out)
     since_s, until_s = epoch_s(since, -math.inf), epoch_s(until, math.inf)
     fetched = asyncio.run(fetch_blocks(pack, since_s, until_s, (server, creds, ca)))

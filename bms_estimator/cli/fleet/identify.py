@@ -20,7 +20,7 @@ from rich.table import Table
 from bms_estimator.cli.fleet.capture import Since, Until, epoch_s
 from bms_estimator.cli.fleet.packs import known_packs, refuse_unknown
 from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.capture_options import AsJson, Force, check_out
+from bms_estimator.cli.options.capture_options import AsJson, Force, check_output_file
 from bms_estimator.cli.options.number_options import whole
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
@@ -69,7 +69,7 @@ def identify(
     """
     address = (server, creds, ca)
     names = _names(packs or [], from_file)
-    check_out(out / RESULTS, [], force=force)
+    check_output_file(out / RESULTS, [], force=force)
     known = asyncio.run(known_packs(address))
     refuse_unknown(names, known)
     results = list["ReidentificationResult"]()

@@ -11,7 +11,7 @@ from typing import IO, Annotated
 
 import typer
 
-from bms_estimator.cli.options.capture_options import Force, check_out
+from bms_estimator.cli.options.capture_options import Force, check_output_file
 from bms_estimator.cli.options.number_options import whole
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
@@ -62,7 +62,7 @@ def history(
     settings = load_settings(pack)
     path = (folder or state_folder(settings)) / f"{settings.pack.name}.sqlite"
     if out is not None:
-        check_out(out, [pack, path], force=force)
+        check_output_file(out, [pack, path], force=force)
     since_s = since.replace(tzinfo=UTC).timestamp() if since else 0.0
     until_s = until.replace(tzinfo=UTC).timestamp() if until else time.time() + MINUTE_S
     header: Sequence[str] = PastEvent._fields if events else Minute._fields
