@@ -58,7 +58,7 @@ def _json(validation: Validation) -> dict[str, Any]:
             "resting": _errors(validation.resting),
             "loaded": _errors(validation.loaded),
             "extra_series_resistance_ohm": _number(validation.extra_ohm),
-            "with_extra_series_resistance": _errors(validation.without_extra_ohm),
+            "with_extra_series_resistance": _errors(validation.with_extra_ohm),
             "warnings": list(validation.warnings),
         }
     )
@@ -87,7 +87,7 @@ def _tables(capture: Path, validation: Validation) -> Group:
         "SOC > 0.1": validation.above,
         "  at rest": validation.resting,
         "  under load": validation.loaded,
-        f"  with {1e3 * validation.extra_ohm:+.2f} mohm in series": validation.without_extra_ohm,
+        f"  with {1e3 * validation.extra_ohm:+.2f} mohm in series": validation.with_extra_ohm,
     }
     for name, e in rows.items():
         if e.samples:
