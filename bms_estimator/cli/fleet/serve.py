@@ -143,7 +143,7 @@ def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, .
         raise UserError(f"--node {number}: --of names only {len(nodes)} nodes")
     try:
         if not all(parse_listen(node).loopback for node in nodes):
-            settings.refuse_open(f"--of {of}")
+            settings.reject_unprotected(f"--of {of}")
     except ValueError as error:
         raise UserError(f"--of {of}: {error}") from None
     return nodes

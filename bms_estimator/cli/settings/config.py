@@ -21,7 +21,7 @@ from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.access_control import make_access_control
 from bms_estimator.process.systemd import is_for_the_service
 from bms_estimator.service.alarm_hooks import hook_warnings
-from bms_estimator.settings.alarm_limits import out_of_range, watched
+from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.settings.mqtt import MqttSettings
@@ -102,7 +102,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     settings, cell = load_pack(file)
     warnings = [
         *implausible_settings(settings, cell),
-        *out_of_range(settings, cell),
+        *implausible_limits(settings, cell),
         *hook_warnings(settings),
         *_failed_conditions(cell),
     ]
@@ -171,7 +171,7 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         values["observer.delta_1"] = delta(exponent=a[8], offset=a[9], amplitude=a[7])
         # SOC below which C_tl is negative, (2.12) of the thesis
         values["observer.delta_2"] = delta(exponent=a[11], offset=a[12], amplitude=a[10])
-    for alarm in watched(settings, cell):
+    for alarm in monitored_alarms(settings, cell):
         values[f"alarms.{alarm.name}.limit"], values[f"alarms.{alarm.name}.clear"] = alarm.limit, alarm.clear
     return values
 
@@ -220,5 +220,5 @@ def _summary(settings: Settings, cell: PackModel) -> str:
     board = f"{settings.sensor.protocol} board on {settings.sensor.port}"
     return (
         f"{settings.pack.name}: {ratings.name}, {ratings.series_count} in series, {ratings.nominal_voltage_v:g} V, {capacity}; "
-        f"{settings.source.described if settings.source else board}; {broker}"
+        f"{settings.source.short_description if settings.source else board}; {broker}"
     )
