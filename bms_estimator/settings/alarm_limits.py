@@ -105,8 +105,9 @@ def _default_silent_limit_s(settings: Settings) -> float:
 
 def min_charge_current_a(cell: PackModel) -> float:
     """Return the minimum current that counts as charging [A]."""
-    one_c_a = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
-    return MIN_CHARGE_C * one_c_a
+    # a fuel cell has no capacity
+    reference_a = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
+    return MIN_CHARGE_C * reference_a
 
 
 def implausible_limits(settings: Settings, cell: PackModel) -> list[str]:

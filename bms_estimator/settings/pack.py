@@ -1,4 +1,4 @@
-"""Settings of one pack, from ``pack.toml``. The name of a setting ends in its unit."""
+"""Settings of one pack, from ``pack.toml``. The name of a setting with a unit ends in the unit."""
 
 from pathlib import Path
 from typing import Annotated, Literal

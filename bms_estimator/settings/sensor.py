@@ -10,7 +10,7 @@ from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
 
 ALLOWED_WITH_SOURCE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
 """Values that settings of a serial device may have if there is a ``[source]``, by setting. The first value is the
-default, so that a file that contains all defaults is valid. A ``[source]`` sets the protocol text itself."""
+default, so that a file that contains all defaults is valid. The protocol text is allowed, because a ``[source]`` sets it."""
 
 
 def _with_device_resolution(sensor: dict[str, object]) -> dict[str, object]:

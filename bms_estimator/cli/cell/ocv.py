@@ -199,6 +199,7 @@ def ocv(
     series_count = _cells_in_series(np.concatenate([*voltages_v, *(curve.ocv_v for curve in curves)]), series)
     ocv_sources = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=series_count)
     fit_curve: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
+    # unpaired curves still contain the overpotential of RC pairs, which are known only with the generic cell
     preliminary_v = fit_curve(ocv_sources.points)(NODES)
     generic = nearest_generic_cell(NODES, preliminary_v, ocv_sources.capacity_ah, series_count)
     ladder, elements = _elements(generic, ocv_sources, recordings)

@@ -165,7 +165,8 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         "publish_period_s": 1.0 / settings.publish.rate_hz,
     }
     if isinstance(cell, CellModel):
-        a = {i: cell.bounds(i).limit for i in range(7, 13)}  # a7..a9 of C_ts, a10..a12 of C_tl, as adapted
+        # values to which the observer adapts a7..a9 of C_ts and a10..a12 of C_tl
+        a = {i: cell.bounds(i).limit for i in range(7, 13)}
         values["pack.capacity_ah"] = cell.cell.capacity_ah
         # SOC below which C_ts is negative, (2.11) of the thesis
         values["observer.delta_1"] = delta(exponent=a[8], offset=a[9], amplitude=a[7])
@@ -196,7 +197,7 @@ def _unreadable(
 def _failed_conditions(cell: PackModel) -> list[str]:
     """Return a warning for each condition of Lemma 4.1.1 of the thesis that the cell's bounds fail.
 
-    A fuel cell, which has no observer of the thesis, gives no warning.
+    A fuel cell has no such bounds, and gives no warning.
     """
     if not isinstance(cell, CellModel):
         return []
