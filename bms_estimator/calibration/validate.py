@@ -57,7 +57,7 @@ class Validation:
         loaded: Errors over the samples of ``above`` with current.
         extra_ohm: Additional series resistance that minimizes the errors ``above`` [ohm]. Its cause may be a contact,
             the temperature or age.
-        without_extra_ohm: Errors over the samples of ``above`` that remain after ``extra_ohm`` was added to the model.
+        with_extra_ohm: Errors over the samples of ``above`` that remain after ``extra_ohm`` was added to the model.
         warnings: Contradictions between capture and cell.
         time_s: Shape (n,), times of the good samples, from 0 [s].
         error_v: Shape (n,), measured less simulated voltage [V].
@@ -74,7 +74,7 @@ class Validation:
     resting: Errors
     loaded: Errors
     extra_ohm: float
-    without_extra_ohm: Errors
+    with_extra_ohm: Errors
     warnings: tuple[str, ...]
     time_s: Floats
     error_v: Floats
@@ -121,7 +121,7 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
         resting=_errors(error_v[above & resting], load.voltage_v[above & resting]),
         loaded=_errors(error_v[above & ~resting], load.voltage_v[above & ~resting]),
         extra_ohm=extra_ohm,
-        without_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, load.voltage_v[above]),
+        with_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, load.voltage_v[above]),
         warnings=tuple(warnings),
         time_s=load.time_s,
         error_v=error_v,

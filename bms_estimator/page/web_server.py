@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.page.access_control import HEADERS, AccessControl, make_access_control
 from bms_estimator.page.event_stream import LatestValues, Reader
 from bms_estimator.process.listener import CONNECTIONS, Listener
-from bms_estimator.settings.page import Listen, PageSettings
+from bms_estimator.settings.page import ListenAddress, PageSettings
 
 PING_S = 5.0
 """Interval of keep-alive events to a silent reader [s]; the page counts the connection as lost after three of them."""
@@ -253,5 +253,5 @@ def _load_file(file: File) -> _LoadedFile:
     return _LoadedFile(body, file.media_type, f'"{hashlib.sha256(body).hexdigest()[:16]}"')
 
 
-def _address_text(listen: Listen) -> str:
+def _address_text(listen: ListenAddress) -> str:
     return f"{listen.host}:{listen.port}"

@@ -34,7 +34,7 @@ def test_the_true_cell_has_the_noise_as_error():
 def test_an_additional_series_resistance_is_measured():
     result = validate(Columns(capture(steps(), cell=with_series_resistance(0.005)), "steps"), TRUTH)
     assert result.extra_ohm == pytest.approx(0.005, abs=1e-4)
-    assert result.without_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < result.above.voltage_rms_v
+    assert result.with_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < result.above.voltage_rms_v
     assert result.resting.voltage_rms_v < 1e-3 < result.loaded.voltage_rms_v
 
 

@@ -17,7 +17,7 @@ from bms_estimator.model.events import events
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
-from bms_estimator.settings.alarm_limits import AlarmDefinition, out_of_range, watched
+from bms_estimator.settings.alarm_limits import AlarmDefinition, implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarm_state import AlarmState
@@ -245,7 +245,7 @@ async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_pat
 def make_evaluator(alarms: dict[str, Any] | None = None) -> AlarmEvaluator:
     """Return an evaluator for ``PACK`` with these settings of the alarms."""
     return AlarmEvaluator(
-        watched(settings(alarms), PACK),
+        monitored_alarms(settings(alarms), PACK),
         charging_a=0.2,
         gap_s=5.0,
         inputs=Inputs(lost_s=10.0, series=2),
@@ -293,26 +293,26 @@ def test_a_saved_alarm_with_an_invalid_value_is_rejected() -> None:
 )
 def test_a_clear_level_beyond_the_limit_is_rejected(alarms: dict[str, Any], reason: str) -> None:
     with pytest.raises(UserError, match=reason):
-        watched(settings(alarms), PACK)
+        monitored_alarms(settings(alarms), PACK)
 
 
 def test_a_limit_out_of_the_pack_s_range_is_reported() -> None:
-    assert out_of_range(settings(), PACK) == []
-    (line,) = out_of_range(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
+    assert implausible_limits(settings(), PACK) == []
+    (line,) = implausible_limits(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
     assert line.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 3.65 to 4.5 V")
 
 
 def test_limits_follow_from_chemistry_size_and_settings() -> None:
     lfp_pack = load_cell("lfp", 100.0).pack(16, 2)
-    lfp = {alarm.name: alarm for alarm in watched(settings(), lfp_pack)}
+    lfp = {alarm.name: alarm for alarm in monitored_alarms(settings(), lfp_pack)}
     assert (lfp["pack_over_voltage"].limit, lfp["pack_over_voltage"].clear) == pytest.approx((58.4, 54.4))
     assert (lfp["discharge_over_current"].limit, lfp["charge_over_current"].limit) == (1000.0, 200.0)
     limits = {"pack_over_voltage": {"limit_v": 57.6}, "cell_imbalance": {"enabled": False}}
-    configured = {alarm.name: alarm for alarm in watched(settings(limits), lfp_pack)}
+    configured = {alarm.name: alarm for alarm in monitored_alarms(settings(limits), lfp_pack)}
     assert configured["pack_over_voltage"].clear == pytest.approx(53.6)
     assert configured["pack_over_voltage"].latch
     assert "cell_imbalance" not in configured
-    stack = {alarm.name for alarm in watched(settings(), load_fuel_cell("pem_30w"))}
+    stack = {alarm.name for alarm in monitored_alarms(settings(), load_fuel_cell("pem_30w"))}
     assert not stack & {"cell_over_voltage", "cell_under_voltage", "charge_over_current", "charging_below_freezing"}
 
 

@@ -28,7 +28,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us
 from bms_estimator.process.private_file import write_private
 from bms_estimator.process.systemd import credential
-from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSettings, reachable
+from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSettings, client_address
 
 log = structlog.get_logger(__name__)
 
@@ -287,7 +287,7 @@ async def connect(node: Node, credentials_file: Path | None) -> Client:
     Raises:
         NatsError: The server rejects the connection.
     """
-    host, port = reachable(node.nats)
+    host, port = client_address(node.nats)
     url = f"{_scheme(node)}://{f'[{host}]' if ':' in host else host}:{port}"
     tls = {"tls": _own_certificate(node.tls)} if node.tls else {}
     users = {"user_credentials": credentials_file} if credentials_file else {}
@@ -321,7 +321,7 @@ async def _wait_for_monitor(
 
 async def _query_monitor(node: Node, path: str) -> Mapping[str, object]:
     """Return the response of the server's monitor; empty without a response."""
-    host, port = reachable(node.monitor)
+    host, port = client_address(node.monitor)
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/{path}"
     with contextlib.suppress(aiohttp.ClientError, TimeoutError, ValueError):
         async with aiohttp.request("GET", url, timeout=aiohttp.ClientTimeout(total=MONITOR_TIMEOUT_S)) as response:
@@ -340,7 +340,7 @@ def _listen_address(cluster_address: str) -> str:
     A loopback address is used unchanged. For any other address the node listens on all interfaces, because a host name
     may resolve to any of them.
     """
-    listen = reachable(cluster_address)
+    listen = client_address(cluster_address)
     return cluster_address if listen.loopback else f"0.0.0.0:{listen.port}"
 
 

@@ -44,7 +44,7 @@ class BleProducer(LineProducer):
     @property
     def name(self) -> str:
         """Name of the BMS."""
-        return self._settings.described
+        return self._settings.short_description
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -35,7 +35,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.polled_source import PolledSource
+from bms_estimator.settings.base_source import BaseSource
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES, split_records
 
@@ -79,10 +79,10 @@ class CaptureHeader:
 _VERSION_ADAPTER, _HEADER_ADAPTER = TypeAdapter(_HeaderVersion), TypeAdapter(CaptureHeader)
 
 
-def make_header(sensor: SensorSettings, source: PolledSource | None = None) -> CaptureHeader:
+def make_header(sensor: SensorSettings, source: BaseSource | None = None) -> CaptureHeader:
     """Return the header of a capture of ``source``; None: of the serial device of ``sensor``."""
     if source is not None:
-        return CaptureHeader(sensor.protocol, source.described, baud=0, current_sign=sensor.current_sign)
+        return CaptureHeader(sensor.protocol, source.short_description, baud=0, current_sign=sensor.current_sign)
     return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign, address=sensor.address)
 
 

@@ -51,7 +51,7 @@ class CanProducer(LineProducer):
     @property
     def name(self) -> str:
         """Name of the bus."""
-        return self._settings.described
+        return self._settings.short_description
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -158,7 +158,7 @@ def _signals(settings: CanSource) -> Iterator[tuple[SignalKey, Signal]]:
     yield ("current", 0), settings.current
     if settings.temperature is not None:
         yield ("temperature", 0), settings.temperature
-    members = [signal for cells in settings.cells for signal in cells.members()]
+    members = [signal for cells in settings.cells for signal in cells.cell_signals()]
     yield from ((("cells", number), signal) for number, signal in enumerate(members))
 
 

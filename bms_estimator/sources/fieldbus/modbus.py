@@ -71,7 +71,7 @@ class ModbusProducer(LineProducer):
     @property
     def name(self) -> str:
         """Address of the device."""
-        return self._settings.described
+        return self._settings.short_description
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -57,7 +57,7 @@ class LinuxSensor(LineProducer):
     @property
     def name(self) -> str:
         """Chip and files of the sensor."""
-        return self._settings.described
+        return self._settings.short_description
 
     @property
     def counters(self) -> Mapping[str, int]:

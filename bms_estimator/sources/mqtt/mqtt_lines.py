@@ -70,7 +70,7 @@ class MqttProducer(LineProducer):
     @property
     def name(self) -> str:
         """Topics and broker of the source."""
-        return f"{self._settings.described}, {self._broker.url}"
+        return f"{self._settings.short_description}, {self._broker.url}"
 
     @property
     def counters(self) -> Mapping[str, int]:

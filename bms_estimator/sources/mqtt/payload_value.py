@@ -119,7 +119,7 @@ def _to_si(value: Any, location: ValueLocation) -> float:
         found = number(value) if isinstance(value, str) else value
         if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
             raise InvalidValueError(f"no number: {_shorten(value)}")
-        value_si = location.si(float(found))
+        value_si = location.to_si(float(found))
     except (ValueError, OverflowError):
         raise InvalidValueError(f"no number: {_shorten(value)}") from None
     if not math.isfinite(value_si):

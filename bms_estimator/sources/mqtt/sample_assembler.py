@@ -54,7 +54,7 @@ class SampleAssembler:
         self._settings = settings
         self._bindings = [
             _TopicBinding(quantity, location, settings.substitute(location.path), topic, cell_pattern(topic))
-            for quantity, location in settings.places()
+            for quantity, location in settings.locations()
             for topic in settings.topics(location)
         ]
         self._availability_topic = settings.substitute(settings.availability_topic or "")

@@ -87,7 +87,7 @@ def test_no_frames_raise_with_a_dbc_file(dbc_source: CanSource, frames: list[tup
 def test_frame_of_a_profile_is_decoded() -> None:
     source_settings = source(profile="pylontech-can")
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
-    assert source_settings.sensor == {"current_sign": "charge_positive", **steps}
+    assert source_settings.sensor_defaults == {"current_sign": "charge_positive", **steps}
     decoder = CanDecoder(source_settings)
     assert decoder.frame_ids == (FrameId(0x356, False),)
     assert decoder.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
@@ -184,7 +184,7 @@ def test_missing_or_invalid_dbc_file_is_rejected(tmp_path: Path) -> None:
 
 
 def test_cells_are_numbered() -> None:
-    members = CellSignals(signal="C{}", count=2, first=0).members()
+    members = CellSignals(signal="C{}", count=2, first=0).cell_signals()
     assert [signal.signal for signal in members] == ["C0", "C1"]
 
 
@@ -195,13 +195,13 @@ def test_resolutions_of_a_profile_are_the_factors_of_its_dbc_file(profile: str) 
     assert isinstance(database, Database)
     factors = {signal.name: signal.conversion.scale for message in database.messages for signal in message.signals}
     source_settings = source(profile=profile)
-    assert source_settings.sensor["voltage_resolution_v"] == factors[source_settings.voltage.signal]
-    assert source_settings.sensor["current_resolution_a"] == factors[source_settings.current.signal]
+    assert source_settings.sensor_defaults["voltage_resolution_v"] == factors[source_settings.voltage.signal]
+    assert source_settings.sensor_defaults["current_resolution_a"] == factors[source_settings.current.signal]
 
 
 def test_configured_dbc_file_replaces_that_of_the_profile(dbc: Path) -> None:
     source_settings = source(profile="pylontech-can", dbc=str(dbc), temperature={"signal": "Temp"})
-    assert source_settings.sensor == {"current_sign": "charge_positive"}
+    assert source_settings.sensor_defaults == {"current_sign": "charge_positive"}
     assert set(CanDecoder(source_settings).frame_ids) == {FrameId(0x500, False), FrameId(0x18FF0000, True)}
 
 

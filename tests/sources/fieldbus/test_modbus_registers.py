@@ -85,7 +85,7 @@ def test_rejected_request_is_split_by_quantity_and_without_gaps() -> None:
 def test_readings_of_devices_with_profiles() -> None:
     victron = source(profile="victron-gx")
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
-    assert victron.sensor == {"current_sign": "charge_positive", **steps}
+    assert victron.sensor_defaults == {"current_sign": "charge_positive", **steps}
     words_read = (
         words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
     )
@@ -175,7 +175,7 @@ def test_settings_override_the_profile() -> None:
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_profile_is_complete(profile: str) -> None:
-    assert source(profile=profile).sensor["current_sign"] == "charge_positive"
+    assert source(profile=profile).sensor_defaults["current_sign"] == "charge_positive"
 
 
 @pytest.mark.parametrize(

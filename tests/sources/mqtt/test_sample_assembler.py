@@ -281,7 +281,7 @@ def test_no_payload_raises(payload: bytes) -> None:
     assembly = SampleAssembler(settings)
     assembly.add_message("home/pack", payload, 0.0, retained=False)
     assembly.line(1.0)
-    for name, place in settings.places():
+    for name, place in settings.locations():
         for read in (read_value, read_cells):
             try:
                 read(payload, place, name)
