@@ -31,7 +31,8 @@ def simulate_capture(
     rows = np.zeros(current_a.size, dtype=SAMPLE)
     rows["time_s"], rows["temperature_c"] = STEP_S * np.arange(current_a.size), 25.0
     curves = truth.ocv_v, truth.per_kelvin_v, truth.hysteresis_v, truth.ohm
-    voltage_v, _ = simulate(STEP_S, current_a, rows["temperature_c"], soc, 1.0, truth.capacity_ah, *curves)
+    branch = 1.0  # the cell was charged
+    voltage_v, _ = simulate(STEP_S, current_a, rows["temperature_c"], soc, branch, truth.capacity_ah, *curves)
     rows["voltage_v"], rows["current_a"] = np.round(voltage_v, 3), current_a + offset_a
     return rows
 

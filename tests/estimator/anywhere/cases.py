@@ -108,9 +108,11 @@ class Case:
 
 
 KNOWS_25 = {"file_c": (25.0,)}
+"""Cell file with data of 25 C only."""
 LFP = {"truth": PHOSPHATE, "file_c": (25.0, 5.0, -15.0)}
 CHARGES = {"load": "constant", "load_c": -0.2, "soc": 0.15, "hours": 3.0}
 WARMS = {"warms_k": 15.0, "temperature_c": 20.0, "hours": 0.4, "unseen_h": 0.2}
+"""Cell that warms itself in a room of 20 C."""
 CASES: tuple[Case, ...] = (
     Case("oxide 25C", seed=1),
     Case("oxide 25C again", seed=2),
@@ -154,6 +156,7 @@ CASES: tuple[Case, ...] = (
     Case("6S one cell -10%", weak_cell=0.9, seed=30),
     Case("6S one cell -20%", weak_cell=0.8, seed=35),
 )
+"""Cases of the summary. A cell that is called full has just been charged; a capture that is cut begins in mid-load."""
 SOC_ERRORS = (-0.2, 0.2)
 """Errors of the initial SOC."""
 

@@ -116,7 +116,8 @@ def capture(cycle: Cycle) -> tuple[SampleBlock, Floats]:
         """Return the current that flowed, the voltage and the SOC."""
         current_a = load(cycle, np.random.default_rng(3000 + cycle.seed), charge_s)
         room_c = np.full(current_a.size, 25.0)
-        return current_a, *simulate(1.0, current_a, room_c, cycle.soc, -1.0, CAPACITY_AH, *curves, **limits)
+        branch = -1.0  # the cell was discharged
+        return current_a, *simulate(1.0, current_a, room_c, cycle.soc, branch, CAPACITY_AH, *curves, **limits)
 
     # The first run shows when the charger ends the charge. The second run has no rest beyond ``REST_S`` after it.
     current_a, _, _ = run(MAX_CHARGE_S)

@@ -75,7 +75,10 @@ def simulate_partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, n
     samples = np.zeros(current_a.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
     curves = OXIDE.ocv_v, OXIDE.per_kelvin_v, OXIDE.hysteresis_v, OXIDE.ohm
-    samples["voltage_v"], true_soc = simulate(1.0, current_a, samples["temperature_c"], soc, 1.0, 3.0, *curves)
+    branch = 1.0  # the cell was charged
+    samples["voltage_v"], true_soc = simulate(
+        1.0, current_a, samples["temperature_c"], soc, branch, OXIDE.capacity_ah, *curves
+    )
     estimator = Estimator(cell, initial_soc=soc + 0.1)
     trace = estimator.run(samples)
     return trace["soc"] - true_soc, trace["soc_std"].copy(), estimator
