@@ -48,8 +48,8 @@ def capture(current_a, *, cell=TRUTH, soc=0.98, noise_v=0.5e-3, seed=0):
 def wrong_start(factor_ohm=1.7, factor_farad=0.6):
     """Return the true cell with wrong elements.
 
-    Amplitudes and offsets of resistances are multiplied by ``factor_ohm`` and those of capacitances by ``factor_farad``.
-    Exponents are multiplied by 1.3.
+    Amplitudes and offsets of resistances are multiplied by ``factor_ohm`` and those of capacitances by
+    ``factor_farad``. Exponents are multiplied by 1.3.
     """
     table = TRUTH.model_dump()
     for name, (_, amplitude, offset) in ELEMENTS.items():

@@ -35,8 +35,8 @@ def slow(
 ):
     """Return samples of discharges (1) and charges (-1) at C/20, in the order of ``directions``.
 
-    An hour of rest precedes and follows each. Each moves ``moved_fraction`` of the capacity. ``offset_v`` is added to the OCV. The cell is full at the start
-    if the first direction is a discharge, and empty otherwise.
+    An hour of rest precedes and follows each. Each moves ``moved_fraction`` of the capacity. ``offset_v`` is added to
+    the OCV. The cell is full at the start if the first direction is a discharge, and empty otherwise.
     """
     samples_per_direction = int(moved_fraction * capacity_ah / CURRENT_A * 3600.0 / STEP_S)
     rest = np.zeros(int(REST_S / STEP_S))
@@ -47,7 +47,7 @@ def slow(
     samples["time_s"] = STEP_S * np.arange(current_a.size)
     samples["current_a"] = current_a
     soc = float(directions[0] > 0.0) - np.r_[0.0, np.cumsum(current_a[:-1])] * STEP_S / 3600.0 / capacity_ah
-    # branch is 1 after charge and -1 after discharge. Before the first sample, the cell moved in the opposite direction.
+    # branch is 1 after charge and -1 after discharge. Before the first sample, the direction was the opposite one.
     branch, branch_at_sample = np.zeros(soc.size), float(directions[0])
     for i, soc_step in enumerate(np.diff(soc, prepend=soc[0])):
         branch_at_sample += (np.sign(soc_step) - branch_at_sample) * -np.expm1(-abs(soc_step) / BRANCH_SOC)

@@ -18,7 +18,7 @@ DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 TRUE_FACTORS = np.array([1.0, 1.3, 0.9, 1.05, 1.6, 0.8, 1.1, 1.4, *[1.0] * 8])
 """True parameters relative to those of the file, at index 1 to 7."""
 IMPEDANCE_OHM = 0.061
-"""High-frequency resistance of the cell of ``nafion112_oxygen``, measured by impedance, from the paper of the data set."""
+"""High-frequency resistance of the cell of ``nafion112_oxygen``, by impedance, from the paper of the data set."""
 
 
 def simulate_sources(truth: FuelCellModel, *, seed: int, highest_a: float = 8.0) -> list[Source]:

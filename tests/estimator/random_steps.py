@@ -58,7 +58,8 @@ def held_currents(hours: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def random_steps(hours: float, noise_v: float = 0.0, seed: int = 1, cell: CellModel = TRUTH) -> SampleBlock:
-    """Return samples of ``cell`` at 1 Hz under random current steps; ``noise_v`` is the std of the voltage noise [V]."""
+    """Return samples of ``cell`` at 1 Hz under random current steps; ``noise_v`` is the std of the voltage noise
+    [V]."""
     rng = np.random.default_rng(seed)
     return measured(held_currents(hours, rng), noise_v, rng, cell)
 
@@ -74,7 +75,8 @@ def measured(current_a: np.ndarray, noise_v: float, rng: np.random.Generator, ce
 
 
 def learner(file: CellModel, soc: float = FIRST_SOC, **observer: float) -> Estimator:
-    """Return an estimator without the filter that starts at ``soc``, with the learning law and other settings ``observer``."""
+    """Return an estimator without the filter that starts at ``soc``, with the learning law and other settings
+    ``observer``."""
     settings = ObserverSettings.model_validate({"law": "learning", **observer})
     return Estimator(file, settings, identifier=None, initial_soc=soc, voltage_resolution_v=RESOLUTION_V)
 

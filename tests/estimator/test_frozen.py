@@ -1,4 +1,7 @@
-"""Frozen voltages and currents are detected, and their effects are reverted. Plausibly constant values cause no fault."""
+"""Frozen voltages and currents are detected, and their effects are reverted.
+
+Plausibly constant values cause no fault.
+"""
 
 from collections.abc import Callable
 

@@ -49,7 +49,7 @@ def learned_parameters(estimator: Estimator) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def ten_minutes() -> mann_stack.Record:
-    """Return ten minutes of the stack of ``mann_stack`` at 100 Hz; its contact resistance increases by 60 mohm at 300 s."""
+    """Return ten minutes of the stack of ``mann_stack`` at 100 Hz. Its contact resistance rises by 60 mohm at 300 s."""
     time_s, current_a = mann_stack.random_steps(600.0, 500.0, seed=4)
     more_ohm = np.where(time_s < 300.0, 0.0, 0.06)
     return mann_stack.measured(time_s, current_a, seed=4, more_ohm=more_ohm).every(5)

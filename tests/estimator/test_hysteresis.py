@@ -27,8 +27,8 @@ LEVEL_S, REST_S = 240, 1200
 
 
 def load_a(rng: np.random.Generator, cycles: int) -> np.ndarray:
-    """Return a current at 1 Hz for a full cell [A]. Each cycle is a discharge to SOC 0.15 and a charge to SOC 0.95, with random
-    currents and a rest after each."""
+    """Return a current at 1 Hz for a full cell [A]. Each cycle is a discharge to SOC 0.15 and a charge to SOC 0.95,
+    with random currents and a rest after each."""
     parts, soc = [], 1.0
     for _ in range(cycles):
         for levels_a, end_soc in ((np.array([0.0, 0.75, 1.5, 3.0]), 0.15), (np.array([-0.75, -1.5]), 0.95)):
@@ -58,7 +58,7 @@ def simulate_cycles(seed: int) -> tuple[SampleBlock, np.ndarray]:
 
 
 def score_run(block: SampleBlock, soc: np.ndarray, hysteresis_v: float) -> tuple[float, float]:
-    """Return the RMS error of the SOC after the first two hours, and the fraction of time with the true SOC inside two std."""
+    """Return RMS error of the SOC and fraction of time with the true SOC inside two std, after the first two hours."""
     estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=hysteresis_v), initial_soc=1.0)
     trace = estimator.run(block)[7200:]
     error = trace["soc"] - soc[7200:]

@@ -122,7 +122,10 @@ def test_a_k_beyond_its_bound_does_not_disturb_the_parameters() -> None:
 
 
 def test_a_jump_of_a_resistance_is_learned_within_half_an_hour() -> None:
-    """R_s rises to 1.5 times its value after three hours. The samples are at 1 Hz, one for two values of ``current_a``."""
+    """R_s rises to 1.5 times its value after three hours.
+
+    The samples are at 1 Hz, one for two values of ``current_a``.
+    """
     current_a = held_currents(6.0, np.random.default_rng(2))
     jump = len(current_a) // 4
     half_an_hour_later = jump + 1800
@@ -151,7 +154,10 @@ def test_step_and_run_leave_the_same_state_to_the_last_bit(ten_hours: SampleBloc
 
 
 def test_the_result_does_not_depend_on_the_sample_rate() -> None:
-    """The same load is sampled at 100, 10 and 1 Hz. At 1 Hz the time of a current step is uncertain by half a second."""
+    """The same load is sampled at 100, 10 and 1 Hz.
+
+    At 1 Hz the time of a current step is uncertain by half a second.
+    """
     current_a = np.repeat(held_currents(2.0, np.random.default_rng(4)), 50)  # half seconds at 100 Hz
     time_s = 0.01 * np.arange(len(current_a))
     voltage_v, _ = simulate_cell((FIRST_SOC, 0.0, 0.0), time_s, current_a, TRUTH.cell.capacity_ah * 3600.0, TRUTH.a)

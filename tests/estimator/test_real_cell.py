@@ -33,7 +33,10 @@ def test_an_initial_soc_wrong_by_0_2_is_corrected_within_an_hour(data, first):
 
 @pytest.mark.parametrize("soc_error", [-0.2, 0.2])
 def test_nees_and_nis_in_mid_load_match_the_std(data, soc_error):
-    """The estimator starts after 35 % of the discharge. The first 15 min are not scored. Coverage and std are in percent."""
+    """The estimator starts after 35 % of the discharge.
+
+    The first 15 min are not scored. Coverage and std are in percent.
+    """
     cell, samples = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz").rows
     discharged = discharged_fraction(samples, cell)
     soc, first = 1.0 - discharged, int(np.argmax(discharged >= 0.35 * discharged[-1]))

@@ -24,12 +24,15 @@ FIRST_SOC = 0.98
 CURRENT_A = 0.06
 """Current above which a sample counts for R_s [A]."""
 MIN_BIN_SAMPLES = 100
-"""Minimum number of samples of an SOC bin for a comparison. In bins with fewer, one sample of the adjacent bin matters."""
+"""Minimum number of samples of an SOC bin for a comparison.
+
+In bins with fewer, one sample of the adjacent bin matters.
+"""
 R_S_ERROR = 0.002
 """Relative tolerance of R_s between the live estimate and the command `adapt`. The measured difference is 0.0008.
 
-The live estimate uses the present parameters a1..a12 of the RC pairs, but `adapt` uses their mean, (3.19) of the thesis. In
-addition, the live SOC is counted with the mean current of two samples.
+The live estimate uses the present parameters a1..a12 of the RC pairs, but `adapt` uses their mean, (3.19) of the
+thesis. In addition, the live SOC is counted with the mean current of two samples.
 """
 
 

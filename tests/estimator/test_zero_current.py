@@ -78,7 +78,7 @@ LOAD = (100, 1.0, 1), (20, SMALLEST_A, 1), (100, 1.0, 1)
 
 
 def offset_after_steps(steps, estimator=None):
-    """Run the estimator over steps of (duration [s], current [A], sample period [s]); return the offset and its std [A].
+    """Run the estimator over steps of duration [s], current [A] and sample period [s]; return offset and its std [A].
 
     Without ``estimator``, a new one is run over ``LOAD`` first.
     """
@@ -128,7 +128,10 @@ def test_a_small_load_after_a_long_rest_is_not_averaged_with_the_rest() -> None:
 
 
 def test_a_constant_small_load_stays_in_the_interval() -> None:
-    """An LFP cell on its plateau is discharged with C/600 for a day. The std covers that this current may be an offset."""
+    """An LFP cell on its plateau is discharged with C/600 for a day.
+
+    The std covers that this current may be an offset.
+    """
     hours, capacity_ah = 24.0, 100.0
     samples = np.zeros(round(3600.0 * hours) // 10, dtype=SAMPLE)
     samples["time_s"] = 10.0 * np.arange(samples.size)

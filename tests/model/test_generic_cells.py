@@ -140,7 +140,10 @@ def test_the_declared_error_of_the_ocv_covers_the_leaf_and_the_lg_m50(data):
     ],
 )
 def test_the_declared_error_of_the_ocv_covers_cells_that_were_not_used_for_it(name, discharge, charge, shared_data):
-    """The true OCV is the mean of a slow discharge and a slow charge. The SOC of each is counted with its own total charge."""
+    """The true OCV is the mean of a slow discharge and a slow charge.
+
+    The SOC of each is counted with its own total charge.
+    """
     soc = np.linspace(0.0, 1.0, 101)
     discharged_ah, discharge_v = charge_and_voltage(shared_data / f"{discharge}.csv.gz", 1)
     charged_ah, charge_v = charge_and_voltage(shared_data / f"{charge}.csv.gz", -1)

@@ -1,8 +1,8 @@
 """Computed errata of the thesis, compared with results by hand, by simulation, or by an identity.
 
-Numbers in parentheses are equations of the thesis. ``bms_estimator.reports.errata`` lists the errata by number. x2 and x3 are
-the voltages of both RC pairs, y is the terminal voltage, e the voltage error of the observer, u = -N e its input, N the
-Nussbaum gain, and ^ marks an estimate.
+Numbers in parentheses are equations of the thesis. ``bms_estimator.reports.errata`` lists the errata by number. x2 and
+x3 are the voltages of both RC pairs, y is the terminal voltage, e the voltage error of the observer, u = -N e its
+input, N the Nussbaum gain, and ^ marks an estimate.
 """
 
 import math
@@ -144,14 +144,16 @@ def test_simulated_loads_have_their_nominal_resistance():
     assert math.isinf(resistance_ohm(""))
 
 
-def test_products_of_table_10_against_another_battery():
+def test_rc_products_of_table_10_have_these_mean_errors_against_chen_and_mora():
+    """R_ts C_ts and R_tl C_tl of the thesis's pack are compared with those of another battery [%], as in Fig. 29."""
     assert printed_pack.product_errors() == pytest.approx((13.096, 8.942), abs=0.001)
 
 
 def test_the_derivative_of_the_overpotential_needs_the_rate_of_the_soc():
     """Erratum 23: (4.60) with dE/dx1 x1' equals y1', and with dE/dx1 alone it does not.
 
-    The current is constant, so that di/dt = 0.
+    x1 is the SOC, E the open-circuit voltage, and y1 = -x2 - x3 the overpotential. The current is constant, so that
+    di/dt = 0.
     """
     a, current_a, dt_s = CHEN_MORA.a, ONE_C_A, 1e-3
     before = (0.5, 0.004, 0.007)
@@ -190,8 +192,8 @@ def simulation():
 def solve_shift_of_a2(start, law):
     """Return the change of a2 in the first minute by (3.16) of scheme 1 or (3.17) of scheme 2.
 
-    scipy solves the equations of cell, observer and law with tolerances instead of a fixed step: (2.2), (2.3), (3.2), (3.3) and
-    (3.12) to (3.14).
+    scipy solves the equations of cell, observer and law with tolerances instead of a fixed step: (2.2), (2.3), (3.2),
+    (3.3) and (3.12) to (3.14).
     """
     cell, initial_a = CHEN_MORA.a, np.array(printed_values.CHEN_MORA_ROUNDED)
     return_rates = np.array([100.0 if law == "scheme-2" and i in printed_values.SMALL else 0.0 for i in range(1, 16)])
@@ -284,8 +286,8 @@ def test_differences_between_printed_and_true_currents_are_mostly_an_offset():
 
 
 def test_estimates_of_table_10_contain_a_part_of_their_initial_values(corrections):
-    """Erratum 33: a10 starts at 3.63e7 and its mean is 36.4 above the limit of 6000. a12 starts at 4.2e7, and its mean is 29.3
-    above the limit of 3666.67.
+    """Erratum 33: a10 starts at 3.63e7 and its mean is 36.4 above the limit of 6000. a12 starts at 4.2e7, and its mean
+    is 29.3 above the limit of 3666.67.
     """
     assert "a10 lies 36.4 above its limit after a start at 3.6e+07" in corrections["E33"]
     assert "a12 lies 29.3 above its limit after a start at 4.2e+07" in corrections["E33"]

@@ -1,8 +1,8 @@
 """Limits, means and deltas of the thesis's parameters a1..a15, compared with results by hand.
 
-The limit of a parameter is the mean of its upper and lower bound with the weights x and y (Lemma 4.1.3). Its estimate is the
-mean (3.19) of its way from the initial value to the limit. delta1 (2.11) and delta2 (2.12) are the SOCs at which C_ts and C_tl
-are zero. Errata are those of ``bms_estimator.reports.errata``.
+The limit of a parameter is the mean of its upper and lower bound with the weights x and y (Lemma 4.1.3). Its estimate
+is the mean (3.19) over the time in which it moves from the initial value to the limit. delta1 (2.11) and delta2 (2.12)
+are the SOCs at which C_ts and C_tl are zero. Errata are those of ``bms_estimator.reports.errata``.
 """
 
 import numpy as np
@@ -93,7 +93,10 @@ def test_printed_weights_do_not_give_the_digits_of_table_5(index):
 
 
 def test_no_other_integer_weights_up_to_800_give_the_printed_digits_of_a7():
-    """By erratum 32, 196 and 182 are the only integers that give the estimate. The duration of the mean follows from a4."""
+    """By erratum 32, 196 and 182 are the only integers that give the estimate.
+
+    The duration of the mean follows from a4.
+    """
     durations_s, initial_value, estimate = (328.12, 328.4), 510.0, 759.2573
     x, y = (grid.ravel() for grid in np.mgrid[1:801, 1:801])
     limit = (1000.0 * x + 500.0 * y) / (x + y)

@@ -1,8 +1,8 @@
 """Procedure of chapter 5 of the thesis on captures: use of each capture, requirements, and results.
 
-Step 1 fits the OCV to relaxation tests, step 2 the RC pairs to the constant load with the smallest current, and step 3 R_s to
-constant loads with small currents and to relaxation tests. Other loads validate the result. It is the dynamic model; the
-elements of the static model are those of one SOC.
+Step 1 fits the OCV to relaxation tests, step 2 the RC pairs to the constant load with the smallest current, and step 3
+R_s to constant loads with small currents and to relaxation tests. Other loads validate the result. It is the dynamic
+model; the elements of the static model are those of one SOC.
 """
 
 import re

@@ -77,9 +77,9 @@ CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]]
 }
 """For each alarm: parts of a capture, sections of the settings, and expected transitions.
 
-A transition is the time since the start of the capture [s], and True if the alarm is raised or False if it is cleared then. At
-a time of 0, the transition may be at any time. An alarm without a second transition is latched. The time of raising contains
-the delay of the alarm.
+A transition is the time since the start of the capture [s], and True if the alarm is raised or False if it is cleared
+then. At a time of 0, the transition may be at any time. An alarm without a second transition is latched. The time of
+raising contains the delay of the alarm.
 """
 
 
@@ -151,7 +151,7 @@ def _transitions(result: ReplayResult) -> list[tuple[float, str, bool]]:
 def _take_values(
     state: AlarmState, *values: float, step_s: float = 1.0, begin_s: float = 0.0
 ) -> list[tuple[float, bool]]:
-    """Update the alarm with values at intervals of ``step_s``; return the times at which it is raised (True) or cleared."""
+    """Update the alarm with values every ``step_s``; return the times at which it is raised (True) or cleared."""
     times_s = begin_s + step_s * np.arange(len(values))
     steps_s = np.full(len(values), step_s)
     return [
@@ -160,7 +160,7 @@ def _take_values(
 
 
 def _make_state(**changes: Any) -> AlarmState:
-    """Return the state of an alarm with a limit of 10, a clear level of 8, and delays of 2 s and 3 s, unless changed."""
+    """Return the state of an alarm with limit 10, clear level 8, and delays of 2 s and 3 s, except for ``changes``."""
     rule = {"severity": "warning", "limit": 10.0, "clear": 8.0, "delay_s": 2.0, "clear_delay_s": 3.0, "latch": False}
     return AlarmState(AlarmDefinition(**{"name": "pack_over_voltage", **rule, **changes}))
 
@@ -433,7 +433,10 @@ def test_damaged_saved_quantities_are_rejected() -> None:
 
 @pytest.mark.parametrize("spacing_s", [0.0, 0.1, 1.0])
 def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: float) -> None:
-    """A burst is two samples, and there are two bursts a minute. The voltage is above the limit from the fifth burst on."""
+    """A burst is two samples, and there are two bursts a minute.
+
+    The voltage is above the limit from the fifth burst on.
+    """
     alarms = make_evaluator({"pack_over_voltage": {"delay_s": 10.0}})
     for burst in range(12):
         block = np.zeros(2, dtype=SAMPLE)

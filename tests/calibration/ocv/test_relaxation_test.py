@@ -100,7 +100,8 @@ def test_a_longer_rest_is_more_certain():
 
 @pytest.mark.parametrize("noise_v", [1e-3, 2e-3, 5e-3])
 def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
-    """The noise is up to five times the remaining relaxation at the end of a rest, so that the time constant is uncertain."""
+    """The noise is up to five times the remaining relaxation at the end of a rest, so that the time constant is
+    uncertain."""
     errors_over_std, error_v = [], []
     for seed in range(3):
         result = relaxation_test(relaxation(noise_v=noise_v, seed=seed), CAPACITY_AH, name="mine")

@@ -1,7 +1,7 @@
 """Adaptation laws of the thesis (schemes 1 to 3 and the improved law), and its Algorithm 1 over a whole discharge.
 
-Numbers in parentheses are equations of the thesis. a1..a12 are the parameters of the RC pairs, a13..a15 those of R_s. k is the
-adaptive gain, and e is the error of the voltage that drives both.
+Numbers in parentheses are equations of the thesis. a1..a12 are the parameters of the RC pairs, a13..a15 those of R_s. k
+is the adaptive gain, and e is the error of the voltage that drives both.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 """Means of the parameters a1..a15 over a time window, (3.19) of the thesis.
 
-The window begins at t_int, when errors and parameters have settled. It ends at t_unst, before the model becomes unstable at a
-low SOC. Both ends are detected or given.
+The window begins at t_int, when errors and parameters have settled. It ends at t_unst, before the model becomes
+unstable at a low SOC. Both ends are detected or given.
 """
 
 import numpy as np

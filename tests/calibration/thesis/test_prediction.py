@@ -1,7 +1,7 @@
 """Prediction of the voltage by models of the thesis, and SOC by interpolation.
 
-The models are that of constant parameters a1..a15, (5.3), and the static model of chapter 6, whose elements do not depend on
-the SOC. The SOC by interpolation of the OCV is (7.1).
+The models are that of constant parameters a1..a15, (5.3), and the static model of chapter 6, whose elements do not
+depend on the SOC. The SOC by interpolation of the OCV is (7.1).
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Step 3 of the thesis's procedure for a known cell: R_s in bins of the SOC by (4.2), and the fit of a13..a15 by (2.9)."""
+"""Step 3 of the thesis's procedure for a known cell: R_s in SOC bins by (4.2), and the fit of a13..a15 by (2.9)."""
 
 import numpy as np
 import pytest

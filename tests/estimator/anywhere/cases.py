@@ -1,8 +1,9 @@
 """Short simulated captures of typical loads and conditions, identical on every machine.
 
-The estimator starts in mid-load with an SOC 0.2 too low or 0.2 too high. The RC ladder of the cell file is fitted to the true
-impedance at the temperatures of the file. The file has errors of the size that it declares: an OCV that is off by some
-millivolts and along the SOC axis, resistances of another cell of the same type, and a capacity error of one percent.
+The estimator starts in mid-load with an SOC 0.2 too low or 0.2 too high. The RC ladder of the cell file is fitted to
+the true impedance at the temperatures of the file. The file has errors of the size that it declares: an OCV that is off
+by some millivolts and along the SOC axis, resistances of another cell of the same type, and a capacity error of one
+percent.
 """
 
 from dataclasses import dataclass, replace
@@ -172,7 +173,8 @@ class Capture:
 
 
 def load_a(case: Case, seconds: int) -> Floats:
-    """Return the current of a case at 1 Hz [A]: random levels of some seconds, stops, and some regeneration in warm cells."""
+    """Return the current of a case at 1 Hz [A]: random levels of some seconds, stops, and regeneration in warm
+    cells."""
     rng = np.random.default_rng(case.seed)
     one_c = case.truth.capacity_ah
     if case.load == "constant":
@@ -255,8 +257,8 @@ def rising(curve_v: Floats) -> Floats:
 def ladder(truth: Truth, temperatures_c: tuple[float, ...], rng: np.random.Generator) -> Ladder:
     """Return the RC ladder of another cell of the same type.
 
-    It is fitted to the true impedance at each SOC by relative non-negative least squares. Random factors then make it that of
-    another cell.
+    It is fitted to the true impedance at each SOC by relative non-negative least squares. Random factors then make it
+    that of another cell.
     """
     branches = 1.0 / (1.0 + 1j * RAD_S[:, None] * np.array([0.0, *TAU_S]))
     common_factor = np.exp(R_STD * rng.standard_normal())

@@ -21,8 +21,8 @@ MIN_UPDATES_OF_BLOCK = 0.5
 class Run:
     """Results at each sample, arrays of shape (n,).
 
-    ``innovation_v`` and its variance S in ``variance_v2`` are those of the last update of the filter. ``updated`` is True at
-    the samples that complete an update.
+    ``innovation_v`` and its variance S in ``variance_v2`` are those of the last update of the filter. ``updated`` is
+    True at the samples that complete an update.
     """
 
     time_s: Floats

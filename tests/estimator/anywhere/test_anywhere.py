@@ -104,8 +104,8 @@ def test_a_capacity_wrong_by_20_percent_is_corrected(table, case: str) -> None:
 def test_nees_matches_the_std(table) -> None:
     """Errors within one capture are correlated, so that each capture is one degree of freedom of the NEES.
 
-    Packs are excluded, because their weak cell is not a random draw. The lower bound is the 0.1 % quantile: an interval that
-    is too wide is a smaller fault, and the std covers effects that these captures do not contain.
+    Packs are excluded, because their weak cell is not a random draw. The lower bound is the 0.1 % quantile: an interval
+    that is too wide is a smaller fault, and the std covers effects that these captures do not contain.
     """
     nees = [np.mean([r.score.nees for r in table if r.case == case.name]) for case in CASES if case.weak_cell == 1.0]
     low, high = chi2.ppf([0.001, 0.975], len(nees))

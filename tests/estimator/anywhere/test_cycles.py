@@ -17,7 +17,7 @@ LIMITS = {
     "lco": (88, 65, 8.0),
     "lto": (95, 85, 7.1),
 }
-"""Lower limits of the share of time inside two std, for the mean and for the worst capture, and upper limit of the RMSE [%]."""
+"""Minimum share of time inside two std, of the mean and of the worst capture, and maximum RMSE [%]."""
 LAST_DIGIT = 0.15
 """Allowed change of a summary value: it is rounded to 0.1, and exp and log of other processors differ in the last bit."""
 

@@ -77,13 +77,15 @@ def simulate(
     low_v=-math.inf,
     high_v=math.inf,
 ):
-    """Return terminal voltage [V] and SOC at each sample, from rest at ``soc``. A current is constant until the next sample.
+    """Return terminal voltage [V] and SOC at each sample, from rest at ``soc``. A current is constant until the next
+    sample.
 
-    ``branch`` is the initial hysteresis: -1 after a discharge, 1 after a charge. A constant loss of 1 W finally warms the cell by ``warms_k`` above ``room_c``. A charger limits the voltage to ``high_v`` [V]
-    and stops at C/20. A protection ends the discharge below ``low_v`` [V]. The function writes the current that flowed to
-    ``current_a`` [A].
+    ``branch`` is the initial hysteresis: -1 after a discharge, 1 after a charge. A constant loss of 1 W finally warms
+    the cell by ``warms_k`` above ``room_c``. A charger limits the voltage to ``high_v`` [V] and stops at C/20. A
+    protection ends the discharge below ``low_v`` [V]. The function writes the current that flowed to ``current_a`` [A].
     """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
+    # x are the filtered currents of the processes [A], fast and slow the two parts of the hysteresis, -1..1.
     x, fast, slow, rise_k = np.zeros(len(TAU_S)), branch, branch, 0.0
     stopped = 0.0  # sign of the current that a limit has stopped
     for n in range(len(current_a)):
@@ -138,13 +140,14 @@ def rising(low: float, high: float) -> Floats:
 
 
 def resistances(milliohm: tuple[float, ...]) -> Floats:
-    """Return the resistances over SOC from those at mid SOC, shape (401, 8) [ohm]."""
+    """Return the resistances of the eight processes over SOC, shape (401, 8) [ohm], from those at mid SOC [mohm]."""
     shapes = [rising(0.4, 0.0), rising(1.0, 0.3), rising(2.5, 0.8), rising(2.0, 0.5), *4 * [rising(3.0, 0.2)]]
     return 1e-3 * np.array(milliohm) * np.column_stack(shapes)
 
 
 def smooth(rng: np.random.Generator, length_soc: float) -> Floats:
-    """Return a random smooth curve over ``GRID``: a normal process of variance 1 with the correlation length ``length_soc``."""
+    """Return a random smooth curve over ``GRID``: a normal process of variance 1 with the correlation length
+    ``length_soc``."""
     # Sum of waves with a Gaussian spectrum. Waves beyond k * length_soc = 4 are negligible.
     k = np.pi * np.arange(0.0, 4.0 / length_soc / np.pi)
     amplitude = np.exp(-0.25 * (k * length_soc) ** 2)

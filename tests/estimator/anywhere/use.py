@@ -39,7 +39,8 @@ def cycles(rng: np.random.Generator, one_c: float, count: int, by_soc: float, re
 def days(rng: np.random.Generator, one_c: float, count: int, soc: float) -> Floats:
     """Return currents of ``count`` days from an initial ``soc`` [A].
 
-    Two drives, each with a rest, are followed by a charge and a rest if the SOC is below 0.5. This repeats until the end.
+    Two drives, each with a rest, are followed by a charge and a rest if the SOC is below 0.5. This repeats until the
+    end.
     """
     parts = [np.zeros(0)]
     while sum(part.size for part in parts) < count * DAY_S:

@@ -1,6 +1,7 @@
 """Elements and exact response of Chen and Mora's cell model.
 
-delta1 and delta2 are the SOCs at which the capacitances C_ts and C_tl are zero: delta(a8, a9, a7) and delta(a11, a12, a10).
+delta1 and delta2 are the SOCs at which the capacitances C_ts and C_tl are zero: delta(a8, a9, a7) and delta(a11, a12,
+a10).
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 """Kalman filter: comparison of Jacobians, update and mixtures with their definitions, and operation over hours.
 
-``s`` is a record of EKF_STATE and ``p`` of EKF_SETTINGS. x_k are the currents through the RC pairs, and h is the derivative of
-the predicted voltage by the state.
+``s`` is a record of EKF_STATE and ``p`` of EKF_SETTINGS. x_k are the currents through the RC pairs, and h is the
+derivative of the predicted voltage by the state.
 """
 
 from itertools import pairwise
@@ -108,8 +108,8 @@ def test_h_of_the_soc_is_the_secant_of_the_ocv_between_plus_and_minus_one_std() 
 def test_the_covariance_is_propagated_by_the_derivative_of_the_mean() -> None:
     """Without Q, the predicted covariance is F P F'. F is computed by finite differences.
 
-    Q is the prediction from a covariance of 0. ``curve_soc`` is so large that the error of the OCV hardly depends on the SOC,
-    because F omits this dependence.
+    Q is the prediction from a covariance of 0. ``curve_soc`` is so large that the error of the OCV hardly depends on
+    the SOC, because F omits this dependence.
     """
     p = make_settings(curve_soc=0.3)
 
@@ -134,7 +134,7 @@ def test_the_covariance_is_propagated_by_the_derivative_of_the_mean() -> None:
     assert f[X, OFFSET] < -0.9
     without_q = predict(mean, covariance)[1] - predict(mean, zero)[1]
     expected, nodes = f @ covariance @ f.T, np.arange(NODE, STATES)
-    # Q of the nodes depends on P, so that their variances are compared with a tolerance.
+    # Q of the OCV nodes depends on P, so that their variances are compared with a tolerance.
     assert without_q[nodes, nodes] == pytest.approx(expected[nodes, nodes], abs=1.0 / ekf_noise.AGED_SOC)
     without_q[nodes, nodes] = expected[nodes, nodes]
     assert without_q == pytest.approx(expected, rel=1e-6, abs=1e-12)
@@ -224,7 +224,7 @@ def test_rc_currents_at_switch_on_are_those_of_a_stationary_random_load() -> Non
 
 @pytest.mark.parametrize(("first_c", "rms_c"), [(0.0, 0.3), (-0.2, 0.3), (1.0, 1.0), (2.5, 1.285), (-6.0, 1.285)])
 def test_the_first_sample_of_a_drive_is_treated_as_a_possible_peak(first_c: float, rms_c: float) -> None:
-    """The first sample sets the RMS of the load, on which the model's error depends, at most to the long-term RMS of 1.285 C."""
+    """The RMS of the load, on which the model's error depends, starts at most at the long-term RMS of 1.285 C."""
     p = make_settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
@@ -250,11 +250,12 @@ def test_measurement_variance_grows_outside_the_temperatures_of_the_cell_file() 
     variances = []
     for s["temperature_c"] in (10.0, 30.0, 60.0, -60.0):
         variances.append(ekf_noise.measurement_variance(s, p, 1.0, 5) / p["model_v"] ** 2)
+    # The std doubles within ``OUTSIDE_K`` (30 K) of the range.
     assert variances == pytest.approx([1.0, 1.0, 4.0, 9.0])
 
 
 def test_errors_do_not_decrease_above_the_temperatures_of_the_cell_file() -> None:
-    """Resistances decrease at high temperatures, but errors of the model do not."""
+    """Resistances decrease at high temperatures, but errors of the model increase by half of their value in 15 K."""
     p = make_settings(low_c=0.0, high_c=30.0)
     s = make_state(p)
     variances = []
@@ -275,7 +276,7 @@ def test_bias_inflation_is_near_one_for_white_innovations_and_grows_for_persiste
     # The mean is above 1, because ratios below 1 count as 1.
     assert np.mean(slow_inflations) == pytest.approx(1.3, abs=0.3)
     for _ in range(7200):
-        ekf.adapt_bias_inflation(s, 0, 1.0, 0.2)
+        ekf.adapt_bias_inflation(s, 0, 1.0, 0.2)  # small, but always of the same sign
     assert s["slow_inflation"][0] > 30.0
     assert s["fast_inflation"][0] > 3.0
 
@@ -305,7 +306,7 @@ def test_a_single_innovation_after_a_gap_causes_no_bias_inflation(drive) -> None
 
 
 def test_rc_currents_after_a_gap_have_the_std_of_an_unknown_load() -> None:
-    """The std is compared with 4000 draws of a load, a constant level plus a Gauss-Markov process, over three minutes."""
+    """The std is that of 4000 draws of a load, a constant level plus a Gauss-Markov process, over three minutes."""
     p, rng = make_settings(), np.random.default_rng(6)
     load_a, correlation_s, gap_s, draws = 2.0, p["load_s"], 180, 4000
     level_a = load_a * rng.standard_normal(draws)

@@ -1,7 +1,7 @@
 """Fits of a1..a15 to the map of circuit elements over SOC: accuracy, standard errors, limits, and forgetting.
 
-The map has the elements R_ts, R_tl, C_ts, C_tl and R_s in bins of the SOC. Each element has an amplitude, an exponent and an
-offset: a1..a3 for R_ts, and so on.
+The map has the elements R_ts, R_tl, C_ts, C_tl and R_s in bins of the SOC. Each element has an amplitude, an exponent
+and an offset: a1..a3 for R_ts, and so on.
 """
 
 import math

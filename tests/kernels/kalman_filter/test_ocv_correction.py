@@ -96,8 +96,8 @@ def test_repeated_cycles_do_not_make_the_soc_overconfident() -> None:
 
 
 def test_the_ocv_of_a_generic_cell_is_learned_as_far_as_the_soc_is_known() -> None:
-    """The cycles between SOC 0.35 and 0.85 reach no steep part of the OCV that would determine the SOC. Therefore neither SOC
-    nor OCV becomes certain.
+    """The cycles between SOC 0.35 and 0.85 reach no steep part of the OCV that would determine the SOC. Therefore
+    neither SOC nor OCV becomes certain.
     """
     error, std, estimator = simulate_partial_cycles(GENERIC, cycles=6)
     assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95

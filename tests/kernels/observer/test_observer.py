@@ -1,7 +1,8 @@
 """Observer of the thesis: exact steps, limits of the parameters, tracking of the voltage, and lock.
 
-Numbers in parentheses are equations of the thesis. docs/theory/thesis.md lists the differences between observer and thesis.
-k is the adaptive gain, and N(k) the Nussbaum gain. The lock is lost while the error of the voltage is too large.
+Numbers in parentheses are equations of the thesis. docs/theory/thesis.md lists the differences between observer and
+thesis. k is the adaptive gain, and N(k) the Nussbaum gain. The lock is lost while the error of the voltage is too
+large.
 """
 
 import numpy as np
@@ -56,8 +57,8 @@ def test_a_step_of_the_rc_voltages_equals_the_matrix_exponential(
 
 @pytest.mark.parametrize("rate_hz", [0.1, 1.0, 10.0, 100.0])
 def test_parameters_converge_to_the_limits_of_the_thesis_at_every_sample_rate(rate_hz: float) -> None:
-    """The limits are those of Lemma 4.1.3. The parameters converge at rates of 100 to 130 per second, so that explicit Euler
-    would diverge at 10 Hz and below.
+    """The limits are those of Lemma 4.1.3. The parameters converge at rates of 100 to 130 per second, so that explicit
+    Euler would diverge at 10 Hz and below.
     """
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, initial_soc=1.0, identifier=None)
@@ -73,7 +74,10 @@ def test_limits_of_the_parameters_are_those_of_table_5_of_the_thesis() -> None:
 
 
 def test_the_voltage_error_falls_below_ten_microvolts_within_20_seconds() -> None:
-    """Theorem 4.1.2 of the thesis is partly wrong (erratum 3). The test checks the right part, that the output is tracked."""
+    """Theorem 4.1.2 of the thesis is partly wrong (erratum 3).
+
+    The test checks the right part, that the output is tracked.
+    """
     cell = load_cell("chen_mora")
     trace = Estimator(cell, THESIS_LAW, initial_soc=1.0, identifier=None).run(
         simulate_discharge(cell, hours=0.2, rate_hz=100.0, current_a=1e-4)
@@ -100,9 +104,9 @@ SAMPLES_PER_HOUR = 360_000
 def simulate_thesis_pack_on_an_adc(bits: int, hours: int = 16) -> SampleBlock:
     """Return samples at 100 Hz of the thesis's pack, measured by a real converter (erratum 2).
 
-    The pack has 22.2 V and 6.6 Ah and is discharged with 0.416 A. A divider for 0 to 25 V and an ADC with half a step of
-    noise measure its voltage. The load ends before the SOC falls below delta1 and delta2, at which the simulated pack would
-    become unstable (erratum 14).
+    The pack has 22.2 V and 6.6 Ah and is discharged with 0.416 A. A divider for 0 to 25 V and an ADC with half a step
+    of noise measure its voltage. The load ends before the SOC falls below delta1 and delta2, at which the simulated
+    pack would become unstable (erratum 14).
     """
     cell = load_cell("thunder_power_6s")
     time_s = np.arange(hours * SAMPLES_PER_HOUR) * 0.01
@@ -145,10 +149,13 @@ def test_without_a_dead_zone_the_lock_is_lost_and_regained_and_losses_are_counte
 
 
 def test_the_gain_is_rearmed_before_its_sign_changes() -> None:
-    """Load steps also increase k, on which the sign of N(k) depends. They must not cause a loss of lock within months."""
+    """Load steps also increase k, on which the sign of N(k) depends.
+
+    They must not cause a loss of lock within months.
+    """
     cell = load_cell("chen_mora")
     time_s = np.arange(0.0, 40_000.0, 1.0)
-    current_a = np.where(time_s // 20 % 2 == 0, 0.5, -0.5)
+    current_a = np.where(time_s // 20 % 2 == 0, 0.5, -0.5)  # a step every 20 s
     voltage_v, _ = simulate_cell((0.5, 0.0, 0.0), time_s, current_a, 0.275 * 3600, cell.a)
     estimator = Estimator(cell, ObserverSettings(**{"lambda": 50.0}), initial_soc=0.5, identifier=None)
     trace = estimator.run(make_samples(time_s, current_a, voltage_v))
@@ -187,8 +194,8 @@ def test_a_gain_that_starts_at_zero_is_not_rearmed(nussbaum: str) -> None:
 
 
 def test_the_estimate_stays_finite_when_a_new_target_makes_a_capacitance_negative() -> None:
-    """A new target of a7 moves delta1, below which C_ts is negative, above the SOC within one sample. The deltas are updated
-    before the states.
+    """A new target of a7 moves delta1, below which C_ts is negative, above the SOC within one sample. The deltas are
+    updated before the states.
     """
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, initial_soc=0.5, identifier=None)
@@ -216,7 +223,7 @@ def test_adaptation_stops_below_delta1_and_delta2_and_the_stop_is_reported() -> 
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2", "scheme-3"])
-def test_schemes_of_the_thesis_track_the_cell_that_they_start_from(law: str) -> None:
+def test_schemes_of_the_thesis_track_a_cell_with_their_initial_parameters(law: str) -> None:
     cell = load_cell("chen_mora").model_copy(update={"adaptation": {}})
     settings = ObserverSettings(law=law, dead_zone_v=0.0, rearm_gain=None)  # type: ignore[arg-type]
     estimator = Estimator(cell, settings, initial_soc=1.0, identifier=None)
