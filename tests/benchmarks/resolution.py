@@ -26,7 +26,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.sampling import Sampling
-from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, WRONG, Case, cell_file, load_a
+from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, SOC_ERRORS, Case, cell_file, load_a
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.truth import simulate
 
@@ -121,12 +121,12 @@ def scores(source: Source, *, is_declared: bool = True, seeds: Iterable[int] = S
     """Return the scores of each run of a kind of source."""
     for case in cases_of(source, seeds):
         samples, soc = sample_source(case, source)
-        for wrong in WRONG:
+        for soc_error in SOC_ERRORS:
             sampling = {"sampling": source.sampling} if is_declared else {}
             estimator = Estimator(
                 cell_file(case),
                 voltage_resolution_v=source.volt_step,
-                initial_soc=float(np.clip(soc[0] + wrong, 0.0, 1.0)),
+                initial_soc=float(np.clip(soc[0] + soc_error, 0.0, 1.0)),
                 **sampling,
             )
             trace = estimator.run(samples)

@@ -18,6 +18,7 @@ def with_health(**changes: Any) -> Snapshot:
 
 
 def event_names(before: Snapshot | None, after: Snapshot) -> list[str]:
+    """Return the names of the events between two snapshots."""
     return [event.name for event in events(before, after)]
 
 
@@ -37,14 +38,14 @@ def test_a_start_without_a_sensor_causes_no_offline_event():
     assert event_names(without_sensor, with_health(sensor_online=True)) == ["sensor_online"]
 
 
-def test_a_lost_sensor_causes_one_event_with_its_reason():
+def test_a_lost_sensor_causes_one_event_with_the_reason():
     sensor_lost = with_health(sensor_online=False, sensor_message="no board")
     [event] = events(ONE, sensor_lost)
     assert (event.name, event.text, event.time) == ("sensor_offline", "no board", sensor_lost.health.publish_time)
     assert event_names(sensor_lost, with_health(sensor_online=False, sensor_message="silent for 9 s")) == []
 
 
-def test_diagnostics_cause_events_at_start_and_end_but_not_for_changed_numbers():
+def test_a_diagnostic_causes_an_event_at_its_start_and_end_but_not_if_its_numbers_change():
     states = [with_health(suspects=suspects) for suspects in ([], [AT_41_C], [AT_42_C], [AT_42_C, "x"], ["x"], [])]
     events_of_changes = [events(*pair) for pair in itertools.pairwise(states)]
     assert [[(event.name, event.text) for event in changes] for changes in events_of_changes] == [

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.model.cell import ChenMoraOcv, TableOcv, load_cell
-from tests.calibration.simulated_relaxation import BAD, relaxation
+from tests.calibration.simulated_relaxation import INVALID_CAPTURES, relaxation
 from tests.command_line import run
 
 RELAXATION_FILE = "cell5_relaxation_c2.csv.gz"
@@ -111,9 +111,9 @@ def test_number_of_cells_is_estimated_from_the_voltage(tmp_path, capsys):
     assert load_cell(tmp_path / "p.toml").cell.series_count == 6
 
 
-@pytest.mark.parametrize("why", BAD)
+@pytest.mark.parametrize("why", INVALID_CAPTURES)
 def test_invalid_input_ends_with_code_2(tmp_path, capsys, why):
-    make, capacity_ah, message = BAD[why]
+    make, capacity_ah, message = INVALID_CAPTURES[why]
     capture, out = save(tmp_path / "bad.csv", make()), tmp_path / "c.toml"
     code, text, err = run(capsys, "ocv", capture, "--capacity-ah", capacity_ah, "--out", out)
     assert (code, text) == (2, "")
