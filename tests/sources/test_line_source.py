@@ -22,7 +22,7 @@ TEXT = SensorSettings(protocol="text")
 
 
 class ScriptedProducer(LineProducer):
-    """Producer that yields or raises the items of the next script at each start, and waits forever after the last one."""
+    """Producer that yields or raises the items of the next script at each start. After the last script it waits."""
 
     name = "a device"
 

@@ -241,7 +241,7 @@ def test_older_jk_temperature_above_100_is_negative() -> None:
 
 
 def newer_jk_response(address: int, **values: int) -> bytes:
-    """Return the newer response of the pack with this address. ``values`` are its ``millivolts`` or ``milliamperes``."""
+    """Return the newer response of the pack with this address, with its ``millivolts`` or ``milliamperes`` if given."""
     frame = bytearray(frames.JK_NEWER_FRAME)
     for name, offset in (("millivolts", 150), ("milliamperes", 158)):
         if name in values:

@@ -135,7 +135,7 @@ def decoder_with_clock(set_clock: SetClock, seconds: int = 60) -> FrameDecoder:
     ids=["one ahead", "ahead from now on", "back", "at random for 3 s"],
 )
 def test_jump_of_the_clock_is_rejected(set_clock: SetClock, min_jumps: int, max_jumps: int) -> None:
-    """After a jump, sample times follow the arrival times, so that no charge is integrated over time that did not pass."""
+    """Sample times then follow the arrival times, so that no charge is integrated over time that did not pass."""
     decoder = decoder_with_clock(set_clock)
     last_sample = decoder.feed(START_S + 60.1, encode_with_clock(600, set_clock))  # follows 600 samples
     assert last_sample["time_s"][0] == pytest.approx(60.0, abs=1e-3)

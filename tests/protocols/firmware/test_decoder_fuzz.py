@@ -123,7 +123,7 @@ def test_all_frames_between_garbage_are_decoded(garbage: list[bytes]) -> None:
 @settings(max_examples=200)
 @given(st.integers(0, 23), st.integers(1, 255))
 def test_sample_with_one_changed_byte_is_rejected(at: int, change: int) -> None:
-    """CRC-16 detects every burst of up to 16 bits, and a byte of a COBS frame affects at most two bytes of the packet."""
+    """CRC-16 detects bursts of up to 16 bits, and a byte of a COBS frame affects at most two bytes of the packet."""
     frame = sample(1)
     changed_frame = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
     block, counters = decode(HELLO + sample(0) + changed_frame + sample(2), [])

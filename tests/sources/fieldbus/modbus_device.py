@@ -43,9 +43,9 @@ class Registers:
     async def answer(
         self, function: int, start: int, address: int, count: int, registers: list[int], _: object
     ) -> ExcCodes | None:
-        """Write the requested values into ``registers``, whose first address is ``start``. pymodbus calls this for a request.
+        """Write the requested values into ``registers``, whose first address is ``start``.
 
-        Return the exception code of the response, or None if the values are to be returned.
+        pymodbus calls this for each request. Return the exception code of the response, or None to return the values.
         """
         self.requests.append((function, address, count))
         async with self._new_request:

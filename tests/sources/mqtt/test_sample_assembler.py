@@ -34,7 +34,7 @@ def json_source(**settings: Any) -> MqttSource:
 def feed(
     assembler: SampleAssembler, messages: Messages, at_s: float = 0.0, *, retained: bool = False
 ) -> list[dict[str, Any]]:
-    """Feed messages that arrive at ``at_s``. Return the samples at once and 0.5 s later, when an open one is complete."""
+    """Feed messages that arrive together. Return the samples, including the one that is complete 0.5 s later."""
     lines = []
     for topic, payload in messages:
         assembler.add_message(topic, payload.encode(), at_s, retained=retained)
@@ -420,7 +420,7 @@ def test_current_published_only_on_change_does_not_count_as_a_second_publisher(
 
 @pytest.mark.parametrize("restarts", [False, True])
 def test_publisher_of_changes_and_of_regular_messages_does_not_count_as_two(*, restarts: bool) -> None:
-    """The load is on for 3 s of every 61 s. The regular interval of 10 s restarts at each change (``restarts``) or not."""
+    """The load is on for 3 s of every 61 s. The regular interval of 10 s restarts at each change, or not."""
     messages: list[tuple[float, float]] = []
     for cycle in range(30):
         on_s = 61.0 * cycle
