@@ -167,11 +167,11 @@ async def test_edges_and_workers_need_tls(serve: tuple[ServeProcess, Path], auth
 async def test_tenant_is_added_without_a_restart(serve: tuple[ServeProcess, Path], authority: Authority) -> None:
     server, folder = serve
     file, context = folder / "fleet.toml", ssl.create_default_context(cafile=str(authority.certificate))
-    before = file.read_text()
-    file.write_text(before + "[tenants.wrong]\nraw_gb = -1\n")
+    valid_settings = file.read_text()
+    file.write_text(valid_settings + "[tenants.wrong]\nraw_gb = -1\n")
     server.process.send_signal(signal.SIGHUP)
     await until(lambda: "tenants.wrong.raw_gb = -1" in server.errors())
-    file.write_text(before + "[tenants.later]\n")
+    file.write_text(valid_settings + "[tenants.later]\n")
     server.process.send_signal(signal.SIGHUP)
     await asyncio.to_thread(server.wait, "tenant later: streams ready")
     await send_block(folder, context, "later")

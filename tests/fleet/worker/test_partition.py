@@ -54,11 +54,11 @@ def assert_state_equals(stream: Stream, pack: str, record) -> None:
 
 def test_duplicates_gaps_resends_and_a_takeover_after_each_message_give_the_state_of_one_run(stream, samples) -> None:
     blocks = blocks_of(samples[:1200])
-    others = blocks_of(pulses(soc=0.7, hours=0.4, seed=2)[0])
+    blocks_of_b = blocks_of(pulses(soc=0.7, hours=0.4, seed=2)[0])
     numbers = [1, 1, 2, 5, 6, 3, 4, 4, 2, 9, 10, 11, 12, 13, 14, 5, 6, 7]
     for index, number in enumerate(numbers):
         stream.send("a", blocks[number - 1])
-        stream.send("b", others[index])
+        stream.send("b", blocks_of_b[index])
         stream.take_over()
     deliver(stream, "a", blocks)
     stream.take_over()
@@ -370,14 +370,14 @@ class TestDeferredPack:
     def test_deferred_blocks_of_packs_are_processed_in_turn_and_in_order_after_a_takeover(
         self, stream, samples
     ) -> None:
-        blocks, others = blocks_of(samples[:400]), blocks_of(pulses(soc=0.7, hours=0.2, seed=2)[0][:400])
-        for pack, data in [("a", data) for data in blocks[:10]] + [("b", data) for data in others[:10]]:
+        blocks, blocks_of_b = blocks_of(samples[:400]), blocks_of(pulses(soc=0.7, hours=0.2, seed=2)[0][:400])
+        for pack, data in [("a", data) for data in blocks[:10]] + [("b", data) for data in blocks_of_b[:10]]:
             stream.send(pack, data, defer=True)
         stream.take_over()
         assert [result.pack for result in stream.take_deferred()] == 10 * ["a", "b"]
         stream.take_over()
         deliver(stream, "a", blocks[10:], first=11)
-        deliver(stream, "b", others[10:], first=11)
+        deliver(stream, "b", blocks_of_b[10:], first=11)
         assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
         assert_state_equals(stream, "b", record_of_one_run(pulses(soc=0.7, hours=0.2, seed=2)[0][:400]))
         assert "gaps" not in stream.partition.counters

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.can_source import PROFILES, CanSource, CellSignals
 from bms_estimator.sources.fieldbus.can_signals import MAX_AGE_S, CanMap, FrameId
 
@@ -82,7 +83,7 @@ def test_no_frames_raise_an_error_with_a_profile(frames: list[tuple[int, bool, b
 def test_no_frames_raise_an_error_with_a_dbc_file(dbc_source: CanSource, frames: list[tuple[int, bytes]]) -> None:
     can_map = CanMap(dbc_source)
     for identifier, data in frames:
-        can_map.feed(0.0, identifier, False, data)
+        can_map.feed(0.0, identifier, extended=False, data=data)
 
 
 def test_only_the_frame_of_the_profile_is_decoded() -> None:
@@ -92,19 +93,19 @@ def test_only_the_frame_of_the_profile_is_decoded() -> None:
     can_map = CanMap(source_settings)
     assert can_map.frame_ids == (FrameId(0x356, False),)
     assert can_map.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
-    assert can_map.feed(0.0, 0x355, False, bytes(4)) is None
-    reading = can_map.feed(0.0, 0x356, False, PYLONTECH_DATA)
+    assert can_map.feed(0.0, 0x355, extended=False, data=bytes(4)) is None
+    reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA)
     assert reading is not None
     assert reading[:4] == (52.34, -12.3, 21.5, ())
 
 
 def test_truncated_frame_gives_the_values_that_it_contains() -> None:
     can_map = CanMap(source(profile="pylontech-can"))
-    reading = can_map.feed(0.0, 0x356, False, PYLONTECH_DATA[:4])
+    reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:4])
     assert reading is not None
     assert reading[:2] == (52.34, -12.3)
     assert math.isnan(reading.temperature_c)
-    assert can_map.feed(0.0, 0x356, False, PYLONTECH_DATA[:2]) is None
+    assert can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:2]) is None
     assert can_map.counters["short_frames"] == 2
 
 
@@ -118,27 +119,31 @@ def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent
             cells=[{"signal": "C{}", "count": 2}, {"signal": "Last"}],
         )
     )
-    # frames 1 to 5: voltage, current, temperature, two cells, last cell, all in units of 0.1
-    assert can_map.feed(0.0, 3, False, b"\xd2") is None
-    assert can_map.feed(0.0, 4, False, b"\x20\x21") is None
-    assert can_map.feed(0.0, 2, False, b"\x05") is None
+    volts, amperes, degrees, two_cells = 1, 2, 3, 4  # identifiers of the frames; each byte is in units of 0.1
+
+    def feed(arrival_s: float, identifier: int, data: bytes) -> Reading | None:
+        return can_map.feed(arrival_s, identifier, extended=False, data=data)
+
+    assert feed(0.0, degrees, b"\xd2") is None
+    assert feed(0.0, two_cells, b"\x20\x21") is None
+    assert feed(0.0, amperes, b"\x05") is None
     assert can_map.missing == "source.voltage (frame 0x001)"
-    reading = can_map.feed(1.0, 1, False, b"\x82")
+    reading = feed(1.0, volts, b"\x82")
     assert reading is not None
     assert reading[:3] == (13.0, 0.5, 21.0)
     assert reading.cells_v[:2] == (3.2, 3.3)
     assert math.isnan(reading.cells_v[2])
-    assert can_map.feed(2.0, 1, False, b"\x83") is None
-    assert can_map.feed(2.0, 2, False, b"\xff") is None  # 25.5 A means that the current is not measured
+    assert feed(2.0, volts, b"\x83") is None
+    assert feed(2.0, amperes, b"\xff") is None  # 25.5 A means that the current is not measured
     assert can_map.counters["not_measured"] == 1
-    assert can_map.feed(3.0, 1, False, b"\x83") is None
-    assert can_map.feed(6.1, 2, False, b"\x05") is None  # voltage and current are more than three periods apart
-    assert can_map.feed(7.0, 1, False, b"\x83") is None
-    assert can_map.feed(10.0, 2, False, b"\x05") is not None
-    assert can_map.feed(11.0, 1, False, b"\x83") is None
-    assert can_map.feed(12.0 + MAX_AGE_S, 2, False, b"\x05") is None
-    assert can_map.feed(13.0 + MAX_AGE_S, 1, False, b"\x83") is None
-    late_reading = can_map.feed(13.5 + MAX_AGE_S, 2, False, b"\x05")
+    assert feed(3.0, volts, b"\x83") is None
+    assert feed(6.1, amperes, b"\x05") is None  # voltage and current are more than three periods apart
+    assert feed(7.0, volts, b"\x83") is None
+    assert feed(10.0, amperes, b"\x05") is not None
+    assert feed(11.0, volts, b"\x83") is None
+    assert feed(12.0 + MAX_AGE_S, amperes, b"\x05") is None
+    assert feed(13.0 + MAX_AGE_S, volts, b"\x83") is None
+    late_reading = feed(13.5 + MAX_AGE_S, amperes, b"\x05")
     assert late_reading is not None
     assert (late_reading.voltage_v, late_reading.cells_v) == (13.1, ())
     assert math.isnan(late_reading.temperature_c)
@@ -147,13 +152,15 @@ def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent
 def test_signals_of_a_dbc_file_are_decoded(dbc_source: CanSource) -> None:
     can_map = CanMap(dbc_source)
     assert set(can_map.frame_ids) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
-    assert can_map.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
-    assert can_map.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
-    assert can_map.feed(0.0, 0x501, False, bytes([1, 0xE6, 0x0C])) is None
+    assert can_map.feed(0.0, 0x18FF0000, extended=True, data=bytes([1, 65])) is None
+    assert can_map.feed(0.0, 0x501, extended=False, data=bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
+    assert can_map.feed(0.0, 0x501, extended=False, data=bytes([1, 0xE6, 0x0C])) is None
     assert can_map.counters["short_frames"] == 0  # a multiplexed frame contains only some of the signals
-    assert can_map.feed(0.0, 0x501, False, bytes([7, 0, 0])) is None  # no signal has the multiplexer value 7
+    assert (
+        can_map.feed(0.0, 0x501, extended=False, data=bytes([7, 0, 0])) is None
+    )  # no signal has the multiplexer value 7
     assert can_map.counters["short_frames"] == 1
-    reading = can_map.feed(0.0, 0x500, False, (4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
+    reading = can_map.feed(0.0, 0x500, extended=False, data=(4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
     assert reading is not None
     assert reading[:4] == (400.1, 12.3, 25.0, (3.3, 3.301, 3.302))
 

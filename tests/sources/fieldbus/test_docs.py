@@ -30,7 +30,7 @@ def test_example_of_a_dbc_file_has_the_signals_of_the_settings_before_it(tmp_pat
     table = tomllib.loads(match[1])["source"] | {"dbc": str(path)}
     frames = CanMap(CanSource.model_validate(table))
     assert frames.frame_ids == (FrameId(0x6B0, False), FrameId(0x18FF0001, True))
-    assert frames.feed(0.0, 0x18FF0001, True, bytes.fromhex("e40ce50c")) is None
-    reading = frames.feed(0.0, 0x6B0, False, bytes.fromhex("ff85020815000000"))
+    assert frames.feed(0.0, 0x18FF0001, extended=True, data=bytes.fromhex("e40ce50c")) is None
+    reading = frames.feed(0.0, 0x6B0, extended=False, data=bytes.fromhex("ff85020815000000"))
     assert reading is not None
     assert reading[:4] == (52.0, -12.3, 21.0, (3.3, 3.301))

@@ -88,7 +88,8 @@ async def test_voltage_and_current_of_an_ads1115_and_temperature_of_another_chip
             shunt_ohm=0.00075,
         ).iter_lines()
     )
-    assert reading == Reading(53.12, -6.666667, 21.5)
+    # 26,560 of 0.125 mV by the divider of 16; -640 of 7.8125 uV across 0.75 mohm
+    assert reading == Reading(voltage_v=53.12, current_a=-6.666667, temperature_c=21.5)
 
 
 @pytest.mark.parametrize(

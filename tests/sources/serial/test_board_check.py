@@ -98,7 +98,8 @@ def symlink(path: Path, target: str):
 @contextlib.asynccontextmanager
 async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
     """Run a board that is plugged in at ``path``."""
-    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial) as board, symlink(path, board.path):
+    reading = Reading(current_a=0.5, voltage_v=voltage_v, temperature_c=25.0)
+    with VirtualBoard(lambda _: reading, serial=serial) as board, symlink(path, board.path):
         task = asyncio.create_task(board.run())
         try:
             yield

@@ -34,7 +34,9 @@ class RunningBoard:
 
     def __init__(self, serial: int, divider: float, sequence: int = 0, age_s: float = 0.0) -> None:
         self._board = VirtualBoard(
-            lambda _: Reading(0.5, PACK_V, 25.0), serial=serial, parts=BoardParts(divider=divider)
+            lambda _: Reading(current_a=0.5, voltage_v=PACK_V, temperature_c=25.0),
+            serial=serial,
+            parts=BoardParts(divider=divider),
         )
         self._board._sequence, self._board._ns = sequence, int(age_s * 1e9)
 

@@ -100,7 +100,9 @@ async def source(
 @contextlib.asynccontextmanager
 async def board(path: Path, serial: int = 1, voltage_v: float = OURS_V, **options: Any) -> AsyncIterator[VirtualBoard]:
     """Run a board that is plugged in at ``path``."""
-    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial, **options) as virtual:
+    with VirtualBoard(
+        lambda _: Reading(current_a=0.5, voltage_v=voltage_v, temperature_c=25.0), serial=serial, **options
+    ) as virtual:
         path.symlink_to(virtual.path)  # noqa: ASYNC240 - at once
         task = asyncio.create_task(virtual.run())
         try:
@@ -179,7 +181,8 @@ async def test_other_board_plugged_into_the_adapter_of_the_open_port_is_rejected
     async with source(port) as reader, board(port) as virtual:
         await until(lambda: reader._board_check.serial)
         virtual._stored[MessageType.COMMAND_SET_SERIAL] = 2
-        virtual._converter = VirtualBoard(lambda _: Reading(0.5, 1.0), parts=BoardParts(divider=9.0))._converter
+        other_board = VirtualBoard(lambda _: Reading(current_a=0.5, voltage_v=1.0), parts=BoardParts(divider=9.0))
+        virtual._converter = other_board._converter
         virtual.reset()
         await until(lambda: reader.message and "board 00000002 is not the pack's, 00000001" in reader.message)
     assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
