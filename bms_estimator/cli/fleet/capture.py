@@ -115,7 +115,7 @@ def _warnings(fetched: "BlockCapture", since_s: float) -> list[str]:
         more = (
             f" and {len(fetched.missing) - MAX_SHOWN_GAPS} more gaps" if len(fetched.missing) > MAX_SHOWN_GAPS else ""
         )
-        lines.append(f"blocks {gaps}{more} are missing: they are lost, or the edge has yet to send them again")
+        lines.append(f"missing blocks: {gaps}{more}; they are lost, or the edge has yet to send them again")
     if fetched.damaged:
-        lines.append(f"{fetched.damaged} messages are damaged and were skipped")
+        lines.append(f"damaged messages, which were skipped: {fetched.damaged}")
     return lines

@@ -1,4 +1,4 @@
-"""Check of the board: nothing is sent to other devices, and ``port = "auto"`` stays with one board.
+"""Check of the board: nothing is sent to other devices, and with ``port = "auto"`` only one board is read.
 
 More tests of the check are in ``test_pinned_board``.
 """
@@ -49,7 +49,7 @@ async def run_source(source: SerialSource, blocks: list[SampleBlock]):
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_nothing_is_sent_to_a_device_with_another_protocol(line: Line) -> None:
+async def test_nothing_is_sent_to_a_device_that_is_silent_or_has_another_protocol(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
     async with run_source(source, []):
@@ -87,6 +87,7 @@ def only_port(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]
 
 @contextlib.contextmanager
 def symlink(path: Path, target: str):
+    """Create a link, and remove it at the end."""
     path.symlink_to(target)
     try:
         yield
@@ -97,7 +98,8 @@ def symlink(path: Path, target: str):
 @contextlib.asynccontextmanager
 async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
     """Run a board that is plugged in at ``path``."""
-    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial) as board, symlink(path, board.path):
+    reading = Reading(current_a=0.5, voltage_v=voltage_v, temperature_c=25.0)
+    with VirtualBoard(lambda _: reading, serial=serial) as board, symlink(path, board.path):
         task = asyncio.create_task(board.run())
         try:
             yield
@@ -124,7 +126,7 @@ async def test_auto_rejects_another_board_and_reopens_its_own(only_port: Path) -
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(22.2, abs=0.1)
 
 
-async def test_auto_reports_what_replaced_its_board(only_port: Path) -> None:
+async def test_auto_reports_a_board_that_prints_text_in_place_of_its_own(only_port: Path) -> None:
     source = SerialSource(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
     async with run_source(source, []):
         async with plugged_in(only_port, serial=1):
