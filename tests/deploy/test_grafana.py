@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.model.payloads import Alarm, Estimate
 from bms_estimator.sinks.exports.line_protocol import ALARM, STATE, lines
 from tests.influxdb import INFLUXD, InfluxDB
-from tests.sinks.snapshots import ONE, SOC_LOW
+from tests.sinks.snapshots import CELL_SNAPSHOT, SOC_LOW_ALARM
 
 DASHBOARD = json.loads((Path(__file__).parents[2] / "deploy/grafana/bms.json").read_text(encoding="utf-8"))
 TARGETS = [(panel["title"], target) for panel in DASHBOARD["panels"] for target in panel["targets"]]
@@ -34,13 +34,18 @@ def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
     if INFLUXD is None:
         pytest.skip("influxd is not installed (apt-get install influxdb)")
     server = InfluxDB(tmp_path_factory.mktemp("influxdb")).start()
-    assert ONE.estimate
+    assert CELL_SNAPSHOT.estimate
     numbers = {
         name: 1.0
         for name, field in Estimate.model_fields.items()
         if "float" in str(field.annotation) and "list" not in str(field.annotation)
     }
-    server.write(lines(None, ONE._replace(estimate=ONE.estimate.model_copy(update=numbers), alarms=(SOC_LOW,))))
+    server.write(
+        lines(
+            None,
+            CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=numbers), alarms=(SOC_LOW_ALARM,)),
+        )
+    )
     yield server
     server.stop()
 

@@ -14,7 +14,7 @@ from bms_estimator.sinks.mqtt.messages import MessageBuilder
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE, SOC_LOW
+from tests.sinks.snapshots import CELL_SNAPSHOT, SOC_LOW_ALARM
 
 ROOT = Path(__file__).parents[2]
 NODE_RED = ROOT / ".node/node_modules/.bin/node-red"
@@ -77,7 +77,7 @@ async def test_remaining_charge_and_alarms_are_reported(broker: Broker, tmp_path
         pytest.skip("node-red is not installed (make integrations)")
 
     async def alarm(client: Listener, *, active: bool) -> None:
-        payload = SOC_LOW.model_copy(update={"active": active, "text": "charge it soon" if active else ""})
+        payload = SOC_LOW_ALARM.model_copy(update={"active": active, "text": "charge it soon" if active else ""})
         await client.publish("bms/attic/alarm/soc_low", payload.model_dump_json(), qos=1, retain=True)
 
     async with Listener(broker) as client:
@@ -88,7 +88,11 @@ async def test_remaining_charge_and_alarms_are_reported(broker: Broker, tmp_path
             await alarm(client, active=True)
             await alarm(client, active=False)
             await program.until(lambda output: "attic: soc_low is over" in output)
-            [state] = [m for m in MessageBuilder("bms", "attic").must_deliver(ONE, ONE) if m.topic == "bms/attic/state"]
+            [state] = [
+                m
+                for m in MessageBuilder("bms", "attic").must_deliver(CELL_SNAPSHOT, CELL_SNAPSHOT)
+                if m.topic == "bms/attic/state"
+            ]
             await client.publish(state.topic, state.payload, qos=1)
             await program.until(lambda output: re.search(r"soc_percent: (49\.9|50)", output) is not None)
     assert program.output.count("charge it soon") == 1

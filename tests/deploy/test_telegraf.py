@@ -15,7 +15,7 @@ import pytest
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.exports.line_protocol import lines
 from bms_estimator.sinks.mqtt.messages import MessageBuilder
-from tests.sinks.snapshots import ONE, SOC_LOW
+from tests.sinks.snapshots import CELL_SNAPSHOT, SOC_LOW_ALARM
 
 CONFIGURATION = tomllib.loads((Path(__file__).parents[2] / "deploy/telegraf/bms.conf").read_text(encoding="utf-8"))
 STATE, ALARM = CONFIGURATION["inputs"]["mqtt_consumer"]
@@ -75,8 +75,10 @@ def sink_metric(line: str) -> tuple[str, dict[str, str], dict[str, Any]]:
 @pytest.fixture
 def snapshot() -> Snapshot:
     """Return a snapshot with cell voltages and an alarm."""
-    assert ONE.estimate
-    return ONE._replace(estimate=ONE.estimate.model_copy(update={"cells_v": [3.25, None, 3.5]}), alarms=(SOC_LOW,))
+    assert CELL_SNAPSHOT.estimate
+    return CELL_SNAPSHOT._replace(
+        estimate=CELL_SNAPSHOT.estimate.model_copy(update={"cells_v": [3.25, None, 3.5]}), alarms=(SOC_LOW_ALARM,)
+    )
 
 
 def test_metrics_of_a_state_and_an_alarm_equal_those_of_the_influxdb_sink(snapshot: Snapshot) -> None:

@@ -24,12 +24,12 @@ from tests.home_assistant.packs import Packs
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.sinks.home_assistant.test_discovery import (
-    CELLS,
+    CELL_COUNT,
     MAX_ROWS_PER_MIN,
-    all_changing,
+    all_values_changing,
     components_of,
     noisy_cell,
-    rows,
+    row_times,
 )
 
 SOC, SET_SOC, SOC_LOW = "sensor.bms_pack_soc_percent", "number.bms_pack_set_soc", "binary_sensor.bms_pack_alarm_soc_low"
@@ -195,16 +195,16 @@ def test_entity_of_a_withdrawn_command_is_removed(home: HomeAssistant, broker: B
     assert entity not in {entry["entity_id"] for entry in home.command("config/entity_registry/list")}
 
 
-@pytest.mark.parametrize(("device", "stream"), [("noisy", noisy_cell), ("restless", all_changing)])
+@pytest.mark.parametrize(("device", "stream"), [("noisy", noisy_cell), ("restless", all_values_changing)])
 def test_recorder_writes_at_most_20_rows_a_minute(
     home: HomeAssistant, broker: Broker, device: str, stream: Callable[[float], Iterator[tuple[float, Snapshot]]]
 ) -> None:
     minutes = 10
     play(broker, device, stream(60.0 * minutes), home)
     info = next(stream(1.0))[1].info
-    inputs = DiscoveryInputs(info, CELLS if stream is all_changing else 0)
+    inputs = DiscoveryInputs(info, CELL_COUNT if stream is all_values_changing else 0)
     expected = len(
-        rows(stream(60.0 * minutes), components_of(discovery(HomeAssistantSettings(), inputs, "bms/pack", 0.0)))
+        row_times(stream(60.0 * minutes), components_of(discovery(HomeAssistantSettings(), inputs, "bms/pack", 0.0)))
     )
     assert 100 < expected <= MAX_ROWS_PER_MIN * minutes
     deadline = time.monotonic() + LONG_S

@@ -22,7 +22,7 @@ from tests.free_port import free_port
 from tests.mosquitto import Broker
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import SERIES, Service, simulated
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 from tests.store.test_history import record
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
@@ -42,7 +42,7 @@ soc_low = {limit = 0.9, delay_s = 1}
 
 def make_day_before() -> list[Snapshot]:
     """Return the snapshots of the last 24 hours, one per minute. The pack is charged by day and discharged at night."""
-    assert ONE.estimate
+    assert CELL_SNAPSHOT.estimate
     times = [time.time() - 60.0 * minute for minute in range(24 * 60, 0, -1)]
     currents = [_current_a(time_s) for time_s in times]
     soc_changes = [-charge_a_min / 60.0 / CAPACITY_AH for charge_a_min in itertools.accumulate(currents)]
@@ -60,7 +60,7 @@ def make_day_before() -> list[Snapshot]:
             "soc_std": 0.012,
             "temperature_c": 24.0 - 0.5 * current_a,
         }
-        snapshots.append(ONE._replace(estimate=ONE.estimate.model_copy(update=values)))
+        snapshots.append(CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=values)))
     return snapshots
 
 

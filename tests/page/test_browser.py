@@ -26,7 +26,7 @@ from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, start_program
-from tests.sinks.snapshots import ONE, STACK
+from tests.sinks.snapshots import CELL_SNAPSHOT, STACK_SNAPSHOT
 from tests.store.test_history import at, record
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -134,8 +134,8 @@ async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
         process = await start_program(folder, "dashboard", *arguments, port=port)
         await publish(live, "availability", b"online")
         await publish(live, "sensor/availability", b"online")
-        await publish(live, "info", ONE.info.model_copy(update={"device": "cellar"}).model_dump_json())
-        await publish(live, "health", ONE.health.model_dump_json())
+        await publish(live, "info", CELL_SNAPSHOT.info.model_copy(update={"device": "cellar"}).model_dump_json())
+        await publish(live, "health", CELL_SNAPSHOT.health.model_dump_json())
         yield House(broker, service, f"http://127.0.0.1:{port}/", live)
         process.terminate()
         assert await process.wait() == 0
@@ -146,8 +146,8 @@ async def publish(live: Listener, topic: str, payload: str | bytes, *, retain: b
 
 
 async def publish_state(live: Listener, **values: Any) -> dict[str, Any]:
-    assert ONE.estimate
-    state = ONE.estimate.model_dump() | {"time": "2026-11-22T16:04:05.000Z"} | values
+    assert CELL_SNAPSHOT.estimate
+    state = CELL_SNAPSHOT.estimate.model_dump() | {"time": "2026-11-22T16:04:05.000Z"} | values
     await publish(live, "state", json.dumps(state), retain=False)
     return state
 
@@ -185,8 +185,8 @@ async def test_unknown_values_are_hidden(browser: Browser, house: House) -> None
         await page_tab.until_text("voltage_v", "3.210 V")
         for name in ("soc_std", "temperature_c", "innovation_v", "time_left", "celllow"):
             assert await page_tab.text(name) == "", name
-        assert STACK.estimate
-        await publish_state(house.live, **STACK.estimate.model_dump(exclude={"time"}))
+        assert STACK_SNAPSHOT.estimate
+        await publish_state(house.live, **STACK_SNAPSHOT.estimate.model_dump(exclude={"time"}))
         await page_tab.until_text("voltage_v", "13.00 V")
         assert not await page_tab.page.locator(".hero").is_visible()  # a fuel cell has no state of charge
         for key in set(state) - {"time", "voltage_v"}:
@@ -301,7 +301,7 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
 
 
 async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(browser: Browser, house: House) -> None:
-    assert ONE.estimate
+    assert CELL_SNAPSHOT.estimate
     states = (
         (50.0, "2026-11-22T17:00:00.000Z"),
         (99.0, "9999-01-01T00:00:00.000Z"),
@@ -309,7 +309,7 @@ async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(bro
     )
 
     async def put(voltage_v: float, time: str) -> None:
-        state = ONE.estimate.model_dump() | {"voltage_v": voltage_v, "time": time}
+        state = CELL_SNAPSHOT.estimate.model_dump() | {"voltage_v": voltage_v, "time": time}
         await house.live.publish("bms/shed/state", json.dumps(state), qos=1)
 
     await put(*states[0])
@@ -390,13 +390,15 @@ async def test_page_is_stale_while_the_sensor_or_the_service_is_offline(browser:
     async with dashboard_of(browser, house, "cellar") as page_tab:
         state = await publish_state(house.live)
         await page_tab.until_status("live")
-        offline = ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "the board is silent"})
+        offline = CELL_SNAPSHOT.health.model_copy(
+            update={"sensor_online": False, "sensor_message": "the board is silent"}
+        )
         await publish(house.live, "health", offline.model_dump_json())
         await publish(house.live, "sensor/availability", b"offline")
         await page_tab.until_status(f"stale since {format_time(state['time'])}")
         assert "the board is silent" in await page_tab.page.inner_text("#why")
         await publish(house.live, "sensor/availability", b"online")
-        await publish(house.live, "health", ONE.health.model_dump_json())
+        await publish(house.live, "health", CELL_SNAPSHOT.health.model_dump_json())
         await page_tab.until_status("live")
         await publish(house.live, "availability", b"offline")
         await page_tab.until_status("stale since")

@@ -20,7 +20,7 @@ from bms_estimator.page.page_sink import Pages, PageSink
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.store.minute import epoch_s
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 from tests.store.test_history import at, record
 
 MAX_BYTES = 100_000
@@ -251,13 +251,13 @@ async def test_packs_that_share_an_address_share_a_page_until_the_last_one_ends(
         async with PageSink(pages, settings, "cellar") as cellar:
             (url,) = opened
             for sink in (attic, cellar):
-                sink.publish(ONE)
+                sink.publish(CELL_SNAPSHOT)
             async with aiohttp.ClientSession(url) as session, session.get("/events") as response:
                 stream = messages(response)
                 content = await anext(stream)
                 for pack in ("attic", "cellar"):
-                    assert content[f"{pack}/state"] == json.loads(ONE.estimate.model_dump_json())
-                    assert content[f"{pack}/health"] == json.loads(ONE.health.model_dump_json())
+                    assert content[f"{pack}/state"] == json.loads(CELL_SNAPSHOT.estimate.model_dump_json())
+                    assert content[f"{pack}/health"] == json.loads(CELL_SNAPSHOT.health.model_dump_json())
                     assert content[f"{pack}/availability"] == "online"
                 await cellar.__aexit__(None, None, None)
                 assert (await anext(stream))["cellar/availability"] == "offline"

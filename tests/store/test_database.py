@@ -21,7 +21,7 @@ from bms_estimator.store.database import FREE_PAGES, Database, StoreError
 from bms_estimator.store.history import History
 from bms_estimator.store.outbox import Outbox
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 
 @pytest.fixture
@@ -192,7 +192,7 @@ async def test_shutdown_with_a_hung_disk_has_one_deadline_for_all_writes(path, m
         async with Database(path, hang_s=10 * LONG_S) as database:
             async with Outbox(database, most=10) as outbox, History(database, days=1) as history:
                 hung = asyncio.create_task(database.call(lambda _: may_return.wait(2 * LONG_S)))
-                history.publish(ONE)
+                history.publish(CELL_SNAPSHOT)
                 outbox.put(Message("t", b"", 1, retain=False))
             with pytest.raises(StoreError, match="has not answered"):
                 await hung

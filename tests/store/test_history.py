@@ -19,7 +19,7 @@ from bms_estimator.store.history import History
 from bms_estimator.store.history_reader import HistoryFile, PastEvent
 from bms_estimator.store.minute import Minute
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 BEGIN_S = 1_700_000_040
 """Start of a minute [s since 1970]."""
@@ -27,7 +27,7 @@ BEGIN_S = 1_700_000_040
 
 def at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, **changes: object) -> Snapshot:
     """Return a snapshot published ``second`` seconds after ``BEGIN_S``."""
-    assert ONE.estimate
+    assert CELL_SNAPSHOT.estimate
     measured = {
         "time": iso_utc(BEGIN_S + second),
         "board_time_s": second,
@@ -35,7 +35,7 @@ def at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, **changes:
         "voltage_v": voltage_v,
         "power_w": current_a * voltage_v,
     }
-    return ONE._replace(estimate=ONE.estimate.model_copy(update=measured | changes))
+    return CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=measured | changes))
 
 
 async def record(path: Path, snapshots: list[Snapshot], days: int = 366) -> None:
@@ -135,7 +135,9 @@ async def test_newest_rows_are_kept_even_if_the_clock_jumps_ahead(path):
 
 
 async def test_events_are_stored_in_order(path):
-    lost = at(1.0)._replace(health=ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "no board"}))
+    lost = at(1.0)._replace(
+        health=CELL_SNAPSHOT.health.model_copy(update={"sensor_online": False, "sensor_message": "no board"})
+    )
     await record(path, [at(0.0), lost])
     names = [event.name for event in past_events(path)]
     assert names == ["start", "sensor_online", "sensor_offline"]
