@@ -23,7 +23,7 @@ from tests.mosquitto import Broker
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import SERIES, Service, simulated
 from tests.sinks.snapshots import CELL_SNAPSHOT
-from tests.store.test_history import record
+from tests.store.test_history import record_history
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
 LEARN_S = 60.0
@@ -115,7 +115,7 @@ async def shoot_all(service: Service, browser: Browser) -> None:
 async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        await record(folder / "attic.sqlite", make_day_before())
+        await record_history(folder / "attic.sqlite", make_day_before())
         broker = Broker(folder).start()
         try:
             async with Service(folder, broker, free_port(), simulated(soc=SOC)) as service, chromium() as browser:

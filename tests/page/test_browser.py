@@ -27,7 +27,7 @@ from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, start_program
 from tests.sinks.snapshots import CELL_SNAPSHOT, STACK_SNAPSHOT
-from tests.store.test_history import at, record
+from tests.store.test_history import record_history, snapshot_at
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
@@ -127,7 +127,7 @@ def board(_time_s: float) -> dict[str, Any]:
 
 @module_fixture
 async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
-    await record(folder / "cellar.sqlite", [])
+    await record_history(folder / "cellar.sqlite", [])
     port = free_port()
     async with Service(folder, broker, free_port(), board, pack=PACK) as service, Listener(broker) as live:
         arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
@@ -368,8 +368,10 @@ async def test_pack_with_an_alarm_is_listed_first_among_too_many_packs(
 
 async def test_history_is_drawn_for_each_span(browser: Browser, house: House, folder: Path) -> None:
     now_s = datetime.now(UTC).timestamp()
-    begin_s = datetime.fromisoformat(at(0.0).estimate.time).timestamp()
-    await record(folder / "cellar.sqlite", [at(now_s - begin_s - 30.0 * s, 3.0, 3.9) for s in range(100, 0, -1)])
+    begin_s = datetime.fromisoformat(snapshot_at(0.0).estimate.time).timestamp()
+    await record_history(
+        folder / "cellar.sqlite", [snapshot_at(now_s - begin_s - 30.0 * s, 3.0, 3.9) for s in range(100, 0, -1)]
+    )
     async with dashboard_of(browser, house, "cellar") as page_tab:
         for span in ("Hour", "Day", "Month"):
             await page_tab.page.get_by_text(span, exact=True).click()

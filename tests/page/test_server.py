@@ -21,7 +21,7 @@ from bms_estimator.settings.page import PageSettings
 from bms_estimator.store.minute import epoch_s
 from tests.patience import LONG_S
 from tests.sinks.snapshots import CELL_SNAPSHOT
-from tests.store.test_history import at, record
+from tests.store.test_history import record_history, snapshot_at
 
 MAX_BYTES = 100_000
 """Maximum total size of the static files [bytes]."""
@@ -197,8 +197,8 @@ async def test_token_is_replaced_by_a_cookie(hub, history, tmp_path):
 
 
 async def test_history_has_a_limited_number_of_points(tmp_path, hub):
-    await record(tmp_path / "attic.sqlite", [at(30.0 * s) for s in range(4000)])  # 33 h
-    now_s = epoch_s(at(30.0 * 3999).estimate.time)
+    await record_history(tmp_path / "attic.sqlite", [snapshot_at(30.0 * s) for s in range(4000)])  # 33 h
+    now_s = epoch_s(snapshot_at(30.0 * 3999).estimate.time)
     history = HistoryQuery(lambda: now_s)
     history.add("attic", tmp_path / "attic.sqlite")
     async with browsing(hub, history) as session:
@@ -211,7 +211,7 @@ async def test_history_has_a_limited_number_of_points(tmp_path, hub):
             assert {len(column) for name, column in content.items() if name not in ("step_s", "events")} == {
                 lengths[span]
             }
-            assert content["voltage_v"][-1] == pytest.approx(at(0.0).estimate.voltage_v)
+            assert content["voltage_v"][-1] == pytest.approx(snapshot_at(0.0).estimate.voltage_v)
         assert 60 <= lengths["hour"] <= 61
         assert 288 <= lengths["day"] <= 289
         assert 17 <= lengths["month"] <= 18

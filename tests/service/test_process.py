@@ -110,7 +110,7 @@ async def stop_service(process: Process) -> list[Any]:
     return [json.loads(line) for line in log.decode().splitlines()]  # a pipe gets JSON
 
 
-async def feed(line: Line) -> None:
+async def print_samples(line: Line) -> None:
     """Print text like a board at 50 Hz, also while the line is not read."""
     with contextlib.suppress(OSError):  # not opened yet
         line.received()  # the board continues while the line is full
@@ -124,7 +124,7 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     pack = pack_file(tmp_path, line, broker)
     async with Listener(broker) as live:
         async with service(pack) as process:
@@ -149,7 +149,7 @@ async def test_a_full_disk_does_not_end_the_service(
 ) -> None:
     """Neither checkpoints nor the log can be written, and the estimates continue."""
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{full_disk}"\ncheckpoint_s = 1\n')
     async with Listener(broker) as live:
         with (full_disk / "log").open("w") as log:
@@ -185,7 +185,7 @@ async def test_a_stopping_service_saves_first_although_its_broker_hangs(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     async with Listener(broker) as live, service(pack_file(tmp_path, line, broker)) as process:
         state = await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 50)
         broker.freeze()
@@ -205,7 +205,7 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
 ) -> None:
     """The log is not read, as if it were on the hanging disk, too."""
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     program, pack = [sys.executable, "-c", HUNG_DISK], pack_file(tmp_path, line, broker)
     with unread_pipe() as log:
         async with Listener(broker) as live, service(pack, program=program, stderr=log) as process:
@@ -265,13 +265,13 @@ async def test_two_packs_in_one_process_have_their_own_board_topics_log_and_chec
     other = Line(tmp_path / "other board")
     packs = [pack_file(tmp_path, line, broker, "house"), pack_file(tmp_path, other, broker, "shed")]
     line.plug()
-    boards = [asyncio.create_task(feed(line))]
+    boards = [asyncio.create_task(print_samples(line))]
     async with Listener(broker) as live, service(*packs) as process:
         house = await live.wait_json("bms/house/health", lambda h: h["sensor_online"])
         shed = await live.wait_json("bms/shed/health", lambda h: "does not exist" in (h["sensor_message"] or ""))
         assert house["samples"]["samples"] > 0 == shed["samples"]["samples"]
         other.plug()
-        boards.append(asyncio.create_task(feed(other)))
+        boards.append(asyncio.create_task(print_samples(other)))
         await live.wait_json("bms/shed/state")
         lines = await stop_service(process)
         for name in ("house", "shed"):
