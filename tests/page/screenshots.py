@@ -1,6 +1,6 @@
-"""Screenshots of the page for the documentation: service of a simulated pack in Chromium (``make screenshots``).
+"""Screenshots of the page for the documentation (``make screenshots``).
 
-The history of the day before is simulated, too.
+The page is that of a service of a simulated pack. Its history of the day before is simulated, too.
 """
 
 import asyncio
@@ -29,10 +29,12 @@ DOCS = Path(__file__).parents[2] / "docs" / "images"
 LEARN_S = 60.0
 """Time before the first screenshot in which the estimator identifies the pack [s]."""
 TOP_PX = 500
-"""Height of the part of the page with alarms or stale values [px]."""
-SOC = 0.66
+"""Height of the upper part of the page, with alarms or the note about stale values [px]."""
+END_SOC = 0.66
 """Approximate SOC at the end of the simulated day."""
 CAPACITY_AH = 30.0
+"""Capacity of the pack in ``tests.page.house``."""
+# limits at which the simulated pack raises both alarms
 ALARMS = """
 [alarms]
 cell_imbalance = {limit_v = 0.02, delay_s = 1, severity = "critical"}
@@ -48,8 +50,8 @@ def make_day_before() -> list[Snapshot]:
     soc_changes = [-charge_a_min / 60.0 / CAPACITY_AH for charge_a_min in itertools.accumulate(currents)]
     snapshots = []
     for time_s, current_a, soc_change in zip(times, currents, soc_changes, strict=True):
-        soc = SOC + soc_change - soc_changes[-1]
-        voltage_v = SERIES * (3.35 + 0.75 * soc - 5e-3 * current_a)
+        soc = END_SOC + soc_change - soc_changes[-1]
+        voltage_v = SERIES * (3.35 + 0.75 * soc - 5e-3 * current_a)  # roughly an NMC cell
         values = {
             "time": iso_utc(time_s),
             "board_time_s": time_s,
@@ -71,6 +73,7 @@ def _current_a(time_s: float) -> float:
 
 
 async def shoot(page_tab: Tab, name: str, part: str = "", *, top: bool = False) -> None:
+    """Write a screenshot of the page, of its upper part (``top``), or of one element (``part``, a CSS selector)."""
     path = DOCS / f"page-{name}.png"
     if part:
         await page_tab.page.locator(part).screenshot(path=path)
@@ -91,6 +94,7 @@ async def open_page(browser: Browser, service: Service, **options: Any) -> Async
 
 
 async def shoot_all(service: Service, browser: Browser) -> None:
+    """Write all screenshots. The service is killed for one of them, and restarted with alarms."""
     async with open_page(browser, service) as page_tab:
         await asyncio.sleep(LEARN_S)
         await shoot(page_tab, "desktop")
@@ -118,7 +122,7 @@ async def main() -> None:
         await record_history(folder / "attic.sqlite", make_day_before())
         broker = Broker(folder).start()
         try:
-            async with Service(folder, broker, free_port(), simulated(soc=SOC)) as service, chromium() as browser:
+            async with Service(folder, broker, free_port(), simulated(soc=END_SOC)) as service, chromium() as browser:
                 await shoot_all(service, browser)
         finally:
             broker.stop()
