@@ -1,4 +1,4 @@
-"""Service as a process: signals, kills, last wills at the broker, full and hanging disks, and errors at the start."""
+"""Service as a process: signals, kills, last wills at the broker, full and hanging disks, and signals at the start."""
 
 import asyncio
 import contextlib
@@ -21,6 +21,7 @@ from tests.serial_line import Line
 
 
 def pack_file(folder: Path, line: Line, broker: Broker, name: str = "pack", state: str = "") -> Path:
+    """Write a pack file. ``state`` is its section ``[state]``. Return its path."""
     path = folder / f"{name}.toml"
     path.write_text(
         f"""
@@ -60,7 +61,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 from bms_estimator.cli.main import main
 main()
 """
-"""Program with the default SIGHUP, which the tests themselves may ignore, as under nohup."""
+"""Program with the default action of SIGHUP. Under nohup it would inherit from the tests that SIGHUP is ignored."""
 
 
 SIGNAL_DURING_START = """
@@ -74,13 +75,14 @@ def load_kernels():
 run.load_kernels = load_kernels
 main()
 """
-"""Program that gets SIGTERM before it serves."""
+"""Program that gets SIGTERM while it loads its kernels."""
 
 
 @contextlib.asynccontextmanager
 async def service(
     *packs: Path, stderr: int | IO[str] = asyncio.subprocess.PIPE, program: Sequence[str] = (str(PROGRAM),)
 ) -> AsyncIterator[Process]:
+    """Run a service as a process, which is killed at the end. ``program`` replaces ``bms-estimator``."""
     process = await asyncio.create_subprocess_exec(
         *program,
         "run",
@@ -98,11 +100,12 @@ async def service(
 
 
 def checkpoints(state_home: Path) -> list[Path]:
+    """Return the checkpoints in the default state folder."""
     return list((state_home / "bms-estimator").glob("*.npz"))
 
 
 async def stop_service(process: Process) -> list[Any]:
-    """Stop the service by SIGTERM. Return its log."""
+    """Stop the service by SIGTERM. Return the decoded lines of its log."""
     process.send_signal(signal.SIGTERM)
     assert process.stderr
     log = await asyncio.wait_for(process.stderr.read(), LONG_S)
@@ -111,9 +114,9 @@ async def stop_service(process: Process) -> list[Any]:
 
 
 async def print_samples(line: Line) -> None:
-    """Print text like a board at 50 Hz, also while the line is not read."""
+    """Print lines like a board at 50 Hz. Lines are lost while the line is full, as with a board."""
     with contextlib.suppress(OSError):  # not opened yet
-        line.received()  # the board continues while the line is full
+        line.received()  # from now on, writing to a full line fails instead of blocking
     while True:
         with contextlib.suppress(BlockingIOError):
             line.write(b"3.80,0.10,25.0\r\n")
@@ -140,6 +143,7 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
         await live.wait("bms/pack/availability", lambda p: p == b"offline", skip=before)
     board.cancel()
     (checkpoint,) = checkpoints(state_home)  # no folder is configured
+    # only the owner may access the folder and its files
     assert {path.stat().st_mode & 0o077 for path in (checkpoint.parent, *checkpoint.parent.iterdir())} == {0}
     assert str(checkpoint) in {line.get("file") for line in lines}
 
@@ -154,8 +158,8 @@ async def test_a_full_disk_does_not_end_the_service(
     async with Listener(broker) as live:
         with (full_disk / "log").open("w") as log:
             async with service(pack, stderr=log) as process:
-                output = "cannot be saved: [Errno 28] No space left on device"
-                await live.wait_json("bms/pack/health", lambda h: h["checkpoint"] == output)
+                checkpoint_status = "cannot be saved: [Errno 28] No space left on device"
+                await live.wait_json("bms/pack/health", lambda h: h["checkpoint"] == checkpoint_status)
                 before = len(live.messages)
                 state = await live.wait_json("bms/pack/state", skip=before)
                 frames = state["frames_received"] + 20
@@ -167,7 +171,7 @@ async def test_a_full_disk_does_not_end_the_service(
 
 @contextlib.contextmanager
 def unread_pipe() -> Iterator[int]:
-    """Yield the write end of a full pipe that is not read."""
+    """Yield the write end of a pipe that is full and is not read."""
     read, write = os.pipe()
     os.set_blocking(write, False)
     with contextlib.suppress(BlockingIOError):
@@ -181,7 +185,7 @@ def unread_pipe() -> Iterator[int]:
         os.close(write)
 
 
-async def test_a_stopping_service_saves_first_although_its_broker_hangs(
+async def test_a_stopping_service_saves_its_checkpoint_although_its_broker_hangs(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     line.plug()
@@ -218,7 +222,7 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
 
 
 @pytest.mark.parametrize(
-    "number",
+    "signal_number",
     [
         signal.SIGHUP,
         pytest.param(signal.SIGTERM, marks=pytest.mark.thorough),  # ends the service of most tests in this file
@@ -226,13 +230,13 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
     ],
     ids=lambda number: number.name,
 )
-async def test_hangup_ends_the_service_cleanly(
-    tmp_path: Path, line: Line, broker: Broker, number: signal.Signals
+async def test_hangup_termination_and_interrupt_end_the_service_cleanly(
+    tmp_path: Path, line: Line, broker: Broker, signal_number: signal.Signals
 ) -> None:
     pack, program = pack_file(tmp_path, line, broker, "house"), [sys.executable, "-c", DEFAULT_HANGUP]
     async with Listener(broker) as live, service(pack, program=program) as process:
         await live.wait("bms/house/health")
-        process.send_signal(number)
+        process.send_signal(signal_number)
         await live.wait("bms/house/availability", lambda payload: payload == b"offline")
         assert await asyncio.wait_for(process.wait(), LONG_S) == 0
 
@@ -248,7 +252,7 @@ async def test_a_service_that_is_still_starting_ends_cleanly_on_a_signal(
     assert json.loads(log)["event"] == "asked to end before samples were taken"
 
 
-async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_restarts(
+async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_restarts_the_service(
     tmp_path: Path, line: Line, broker: Broker, disk_without_files: Path
 ) -> None:
     folder = disk_without_files / "state"
@@ -259,7 +263,7 @@ async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_r
     assert output == f"error: state.folder = {folder}: No space left on device\n"
 
 
-async def test_two_packs_in_one_process_have_their_own_board_topics_log_and_checkpoint(
+async def test_two_packs_in_one_process_have_boards_topics_log_lines_and_checkpoints_of_their_own(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     other = Line(tmp_path / "other board")
