@@ -16,6 +16,7 @@ from tests.sinks.snapshots import CELL_SNAPSHOT, NOW
 
 
 def snapshot_of(device: str, voltage_v: float) -> Snapshot:
+    """Return a snapshot of a pack with this name and voltage."""
     assert CELL_SNAPSHOT.estimate
     info = CELL_SNAPSHOT.info.model_copy(update={"device": device})
     return CELL_SNAPSHOT._replace(
@@ -24,6 +25,7 @@ def snapshot_of(device: str, voltage_v: float) -> Snapshot:
 
 
 async def publish(client: Listener, device: str, voltage_v: float) -> None:
+    """Publish all messages of a pack with this name and voltage."""
     messages, snapshot = MessageBuilder("bms", device), snapshot_of(device, voltage_v)
     for message in (
         *messages.birth_messages(),
