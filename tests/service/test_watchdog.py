@@ -35,23 +35,24 @@ class Systemd:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
         self._socket.setblocking(False)
+        # a watchdog of 30 ms, so that tests do not wait
         self.notifier = SystemdNotifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "30000"})
 
     async def wait_for(self, prefix: str) -> str:
         """Wait for a notification that begins with ``prefix``. Return it."""
         async with asyncio.timeout(LONG_S):
             while True:
-                state = (await asyncio.get_running_loop().sock_recv(self._socket, 4096)).decode()
-                if state.startswith(prefix):
-                    return state
+                notification = (await asyncio.get_running_loop().sock_recv(self._socket, 4096)).decode()
+                if notification.startswith(prefix):
+                    return notification
 
     def received(self) -> list[str]:
         """Return the notifications that have arrived since the last call."""
-        states = []
+        notifications = []
         with contextlib.suppress(BlockingIOError):
             while True:
-                states.append(self._socket.recv(4096).decode())
-        return states
+                notifications.append(self._socket.recv(4096).decode())
+        return notifications
 
     def close(self) -> None:
         self._socket.close()
@@ -98,6 +99,7 @@ async def test_the_idle_time_of_a_source_s_task_grows_while_it_hangs(
         for _ in range(3):
             now_s += 10.0
             async with asyncio.timeout(LONG_S):
+                # the next attempt to open the missing port ends the idle time
                 while board.health().task_idle_s > 0.0:  # noqa: ASYNC110 - the idle time has no event
                     await asyncio.sleep(0.001)
     monkeypatch.setattr(SerialPort, "open", hang)

@@ -260,7 +260,8 @@ def test_chapter_5_runs_on_real_captures(tmp_path, capsys, shared_data):
     assert code == 0
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "4 captures of" in text
-    expected_rows = {  # columns of Table 11 after the name
+    # mean current [A], use in the procedure, printed mean error [%], and mean [%], maximum [%] and RMS [mV] of the error
+    expected_rows = {
         "cell1_discharge_c4": "0.77 step 2 - 0.419 4.99 27.6",
         "cell1_discharge_1c5": "4.62 validation - 5.31 25.8 195",
         "cell5_random_steps": "2.35 validation - 0.284 4.05 13.9",
