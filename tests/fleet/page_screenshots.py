@@ -20,7 +20,7 @@ from tests.fleet.hour_rows import BEGIN, FIRST_STD, estimate_capacities, write_f
 from tests.fleet.nats_cluster import running
 from tests.fleet.published_states import Pack, load, make_packs, publish, publish_heartbeat
 from tests.page.chromium import PHONE, Tab, chromium, tab
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
 PACKS, SILENT, DAYS = 5000, 12, 90
@@ -67,7 +67,7 @@ async def work(nc: Client, packs: list[Pack]) -> None:
             await nc.publish(subjects.hours(packs[index].name), json.dumps({"suspects": int(suspects)}).encode())
         await nc.publish(subjects.unknown("home-900001"), b"not in the table of packs")
         for pack in packs[:100] if rounds % 5 == 1 else ():
-            await nc.publish(f"bms.{pack.name}.parameters", ONE.parameters.model_dump_json().encode())
+            await nc.publish(f"bms.{pack.name}.parameters", CELL_SNAPSHOT.parameters.model_dump_json().encode())
         await asyncio.sleep(1.0)
 
 

@@ -9,7 +9,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 HOME, VAN, PLANT = (
     PackSpec(cell="lfp", capacity_ah=280.0, series=16),
@@ -55,8 +55,8 @@ class Pack(NamedTuple):
 
 def state(**values: Any) -> bytes:
     """Return an encoded state with these values, and otherwise those of an example."""
-    assert ONE.estimate
-    return ONE.estimate.model_copy(update=values).model_dump_json().encode()
+    assert CELL_SNAPSHOT.estimate
+    return CELL_SNAPSHOT.estimate.model_copy(update=values).model_dump_json().encode()
 
 
 def make_packs(count: int, seed: int = 1) -> list[Pack]:

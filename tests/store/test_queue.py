@@ -5,7 +5,7 @@ from bms_estimator.store.outbox_queue import MIN_NUMBER, PAGE, OutboxQueue
 
 
 def queue_with(count: int) -> OutboxQueue:
-    """Return a queue with ``count`` written messages."""
+    """Return a queue with the messages 0 to ``count`` - 1, all of them written."""
     queue = OutboxQueue(max_messages=10 * PAGE)
     for number in range(count):
         queue.put(Message("t", str(number).encode(), 1, retain=False))
@@ -15,6 +15,7 @@ def queue_with(count: int) -> OutboxQueue:
 
 
 def take_numbers(queue: OutboxQueue, max_messages: int) -> list[int]:
+    """Take messages. Return the numbers in their payloads."""
     return [int(waiting.message.payload) for waiting in queue.take_next(max_messages)]
 
 
@@ -25,7 +26,7 @@ def test_messages_in_flight_precede_ready_ones_after_a_rewind():
     assert take_numbers(queue, 5) == [0, 1, 2, 3, 4]
 
 
-def test_memory_holds_one_page_and_newer_messages_wait_for_stored_ones():
+def test_memory_contains_one_page_and_newer_messages_wait_for_those_on_disk():
     queue = queue_with(PAGE + 7)
     assert list(queue.stored) == [range(PAGE, PAGE + 7)]
     queue.put(Message("t", b"9999", 1, retain=False))
@@ -44,4 +45,4 @@ def test_acknowledged_messages_are_deleted_only_if_written():
     assert not queue.has_stale_rows, "it was never written"
     queue.acknowledge(second.number)
     assert queue.has_stale_rows
-    assert queue.gaps() == [(MIN_NUMBER, 0), (1, 3)]
+    assert queue.gaps() == [(MIN_NUMBER, 0), (1, 3)]  # only number 0 is still queued

@@ -1,4 +1,4 @@
-"""Progress line about compiled kernels at a first start."""
+"""Line about the compilation of kernels at a first start."""
 
 import os
 import signal
@@ -41,7 +41,7 @@ def test_first_start_reports_the_compilation_and_can_be_interrupted(command: str
         finally:
             process.kill()
     assert "Traceback" not in rest
-    assert ('"level": "info"' in first) == (command == "run")
+    assert ('"level": "info"' in first) == (command == "run")  # a service logs JSON to a pipe
 
 
 def test_line_is_printed_once_and_only_if_a_kernel_is_compiled() -> None:

@@ -33,7 +33,7 @@ from tests.free_port import free_port
 from tests.page.chromium import Tab, chromium, tab
 from tests.page.house import start_program
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 in_module = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
@@ -125,7 +125,7 @@ async def work(nc: Client) -> None:
                 await publish(nc, pack.name, pack.state)
             await nc.publish(subjects.unknown(MARKUP_NAME), b"no <b>row</b>")
             await nc.publish(subjects.hours("van-1"), json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
-            await nc.publish("bms.home-1.parameters", ONE.parameters.model_dump_json().encode())
+            await nc.publish("bms.home-1.parameters", CELL_SNAPSHOT.parameters.model_dump_json().encode())
         await asyncio.sleep(0.1)
 
 
@@ -212,7 +212,7 @@ async def test_pack_is_found_by_its_prefix_and_opened_with_the_keyboard(browser:
         assert details.startswith("lfp 16s1p 280 Ah · last message")
         await browser_tab.until(
             "rows => document.querySelectorAll('#parameters tr').length === rows",
-            len(ONE.parameters.elements) + len(ONE.parameters.state_of_health),
+            len(CELL_SNAPSHOT.parameters.elements) + len(CELL_SNAPSHOT.parameters.state_of_health),
         )
         await page.keyboard.press("Escape")
         await page.get_by_role("dialog").wait_for(state="hidden")

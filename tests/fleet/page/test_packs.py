@@ -11,7 +11,7 @@ from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.fleet.page.workers import FleetWorkers
 from bms_estimator.model.input_faults import InputFault
 from tests.fleet.published_states import HOME, make_packs, state
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 
 def healthy(**values: object) -> bytes:
@@ -130,13 +130,13 @@ def test_packs_are_found_by_prefix():
 
 def test_details_of_a_pack_have_its_state_parameters_and_suspected_faults():
     packs = receive_states({"a": healthy()}, 5.0)
-    packs.receive_parameters("a", ONE.parameters.model_dump_json().encode())
+    packs.receive_parameters("a", CELL_SNAPSHOT.parameters.model_dump_json().encode())
     packs.receive_hour("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
     details = packs.details("a", 7.0)
     assert details
     assert (details["pack"], details["type"], details["heard_s"]) == ("a", "lfp 16s1p", 2.0)
     assert details["state"] == json.loads(healthy())
-    assert details["parameters"] == json.loads(ONE.parameters.model_dump_json())
+    assert details["parameters"] == json.loads(CELL_SNAPSHOT.parameters.model_dump_json())
     assert "zero of the current sensor" in details["suspects"]
     assert packs.details("b", 7.0) is None
 
