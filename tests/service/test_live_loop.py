@@ -19,7 +19,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Estimate
-from bms_estimator.model.sample import SAMPLE, SampleStatus
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.live_loop import LAG_STEP_S, run_estimation_loop
@@ -27,6 +27,7 @@ from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
+from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.rest_detector import REST_S
 from tests.collector import Collector
 from tests.patience import LONG_S
@@ -379,7 +380,7 @@ async def test_a_source_that_never_waits_does_not_starve_the_sinks() -> None:
             block["voltage_v"] = 3.8
             while True:
                 block["time_s"] = block["time_s"][-1] + 0.01 * np.arange(1, 11)
-                yield block
+                yield ReceivedSamples(block, NO_CELLS)
 
     stop, sink = asyncio.Event(), Collector()
     task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, source=EndlessSource(), sinks=[sink], stop=stop))

@@ -74,9 +74,9 @@ class OutboxMachine(RuleBasedStateMachine):
         self.acknowledged: set[int] = set()
         self.strict = True
 
-    @initialize(most=st.sampled_from([6, 15, 10_000]))
-    def begin(self, most: int) -> None:
-        self.most = most
+    @initialize(max_messages=st.sampled_from([6, 15, 10_000]))
+    def begin(self, max_messages: int) -> None:
+        self.max_messages = max_messages
         self.open()
 
     def open(self) -> None:
@@ -95,7 +95,7 @@ class OutboxMachine(RuleBasedStateMachine):
             self.outbox.put(Message("t", str(self.next_number).encode(), 1, retain=False))
             self.pending.append(self.next_number)
             self.next_number += 1
-            if len(self.pending) > self.most:
+            if len(self.pending) > self.max_messages:
                 self.pending.remove(next(number for number in self.pending if number not in self.in_flight))
                 self.dropped_count += 1
 
@@ -162,7 +162,7 @@ class OutboxMachine(RuleBasedStateMachine):
                 self.rewind()
             self.counts_agree()
 
-    @precondition(lambda self: self.most == 10_000)
+    @precondition(lambda self: self.max_messages == 10_000)
     @rule(failure=st.sampled_from(["before", "after"]))
     def fail_disk(self, failure: str) -> None:
         """Let all transactions fail. Newer messages then overtake those that cannot be read."""
@@ -231,7 +231,7 @@ TestOutbox.settings = settings(max_examples=15, stateful_step_count=40, deadline
 def test_invariants_hold_while_a_full_outbox_drops_messages_of_the_page_that_is_read(seed: int) -> None:
     """Hypothesis rarely generates this case."""
     generator, machine = random.Random(seed), OutboxMachine()
-    machine.begin(most=12)
+    machine.begin(max_messages=12)
 
     def steps() -> list[str]:
         return generator.choices(
