@@ -35,7 +35,7 @@ from tests.benchmarks.wire import hello, sample_frames
 from tests.fleet.nats_cluster import running
 from tests.idle_connections import (
     DESCRIPTORS,
-    IDLE,
+    IDLE_CONNECTIONS,
     Outcome,
     attack_dashboard,
     attack_fleet_page,
@@ -274,7 +274,7 @@ def idle_rows() -> Iterator[Row]:
 
 
 def _idle_row(program: str, attack: Coroutine[None, None, Outcome]) -> Row:
-    quantity = f"{IDLE:,} idle connections each, {DESCRIPTORS:,} descriptors: {program}"
+    quantity = f"{IDLE_CONNECTIONS:,} idle connections each, {DESCRIPTORS:,} descriptors: {program}"
     target = "reconnects, answers, no traceback"
     try:
         outcome = asyncio.run(attack)
