@@ -1,7 +1,11 @@
 """Numbers of docs/theory/fuel-cell.md: ``make fuelcell`` prints them in half a minute.
 
-The data are of the simulated stack of ``tests.mann_stack``, which has effects that the model omits, and two measured curves in
-tests/data/fuel_cell.
+The data come from the simulated stack of ``tests.mann_stack``, which has effects that the model omits, and from two measured
+curves in tests/data/fuel_cell.
+
+Parameters: r is the resistance [ohm], A the Tafel slope [V], a the activation loss at 1 A [V], C the double-layer capacitance
+[F], B the factor of the concentration loss [V], i_L the limiting current and i_n the internal current [A]; e is the error of
+the voltage.
 """
 
 import itertools
@@ -15,20 +19,19 @@ from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, f
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.fuel_cell_settings import MEMORY_S
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop
-from bms_estimator.model.arrays import Record
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.captures.curves import read_polarisation
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from tests import mann_stack
-from tests.mann_stack import CURVE_A
+from tests.mann_stack import CURVE_A, Record
 
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 MIN_A = 0.1
-"""Minimum current of used points of the measured curves, by docs/theory/fuel-cell.md [A/cm2]."""
+"""Minimum current of the measured points that are used; the measured cells have 1 cm2 [A]."""
 WRONG_FACTORS = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])
-"""Initial parameters of the fit, divided by those of ``pem_30w``."""
+"""Initial values of the kernel constants in the fit, divided by those of ``pem_30w``."""
 PRINTED_PARAMETERS = "r_ohm", "tafel_slope_v", "exchange_current_a", "c_dl_farad"
 
 
@@ -37,6 +40,7 @@ def print_line(text: str) -> None:
 
 
 def make_source(name: str, record: Record, *, timed: bool = True) -> Source:
+    """Return data of a fit: samples in time, or points of a polarization curve."""
     return Source(name, record.time_s if timed else None, record.current_a, record.voltage_v, record.temperature_c)
 
 
@@ -69,16 +73,16 @@ def print_identification() -> None:
     )
     start = PEM.identified(PEM.a * WRONG_FACTORS, {})
     measured_curve = mann_stack.curve(CURVE_A)
-    first, second = (mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=s), seed=s) for s in (1, 5))
+    learned, evaluated = (mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=s), seed=s) for s in (1, 5))
     for rate_hz, every in ((500, 2), (100, 10)):
-        held_back = make_source("held back", second.every(every))
+        held_back = make_source("held back", evaluated.every(every))
         for name, sources in (
             (
                 "curve and steps",
-                [make_source("curve", measured_curve, timed=False), make_source("steps", first.every(every))],
+                [make_source("curve", measured_curve, timed=False), make_source("steps", learned.every(every))],
             ),
             ("curve alone", [make_source("curve", measured_curve, timed=False)]),
-            ("steps alone", [make_source("steps", first.every(every))]),
+            ("steps alone", [make_source("steps", learned.every(every))]),
         ):
             fit = fit_fuel_cell(sources, start)
             residuals = ", ".join(f"{k} {1e3 * v:.1f} mV" for k, v in fit.rms_v.items())
@@ -89,23 +93,27 @@ def print_identification() -> None:
         print_line(
             f"    the wrong file {prediction_rms_mv(start, held_back):.1f} mV, pem_30w {prediction_rms_mv(PEM, held_back):.1f} mV"
         )
-    kelvin = first.temperature_c.mean() + 273.15
+    kelvin = learned.temperature_c.mean() + 273.15
     print_line(
-        f"    truth: r_ohm {first.r_ohm.mean():.4f} on the mean at {kelvin - 273.15:.1f} C, c_dl_farad 0.067, B 0.224 V, i_L 9.38 A"
+        f"    truth: r_ohm {learned.r_ohm.mean():.4f} on the mean at {kelvin - 273.15:.1f} C, c_dl_farad 0.067, B 0.224 V, i_L 9.38 A"
     )
 
 
 def print_temperature_effect() -> None:
-    print_line("## Temperature left out: what the held-back minute then has")
-    second = make_source(
+    print_line("## Voltage error of the held-back minute with and without the temperature")
+    held_back = make_source(
         "held back", mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=5), seed=5).every(2)
     )
     fit = fit_fuel_cell([make_source("curve", mann_stack.curve(CURVE_A), timed=False)], PEM)
     without_temperature = Source(
-        second.name, second.time_s, second.current_a, second.voltage_v, np.full(second.voltage_v.size, np.nan)
+        held_back.name,
+        held_back.time_s,
+        held_back.current_a,
+        held_back.voltage_v,
+        np.full(held_back.voltage_v.size, np.nan),
     )
     print_line(
-        f"with {prediction_rms_mv(fit.model, second):.1f} mV, without {prediction_rms_mv(fit.model, without_temperature):.1f} mV"
+        f"with {prediction_rms_mv(fit.model, held_back):.1f} mV, without {prediction_rms_mv(fit.model, without_temperature):.1f} mV"
     )
 
 

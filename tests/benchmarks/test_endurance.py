@@ -17,6 +17,6 @@ async def test_each_lost_quantity_raises_sensor_fault_and_runs_the_hook_of_the_a
     broker: Broker, tmp_path: Path
 ) -> None:
     losses = await lose_quantities(broker, tmp_path, lost_s=0.5)
-    assert [loss.runs_before for loss in losses] == [
+    assert [loss.runs for loss in losses] == [
         (f"{alarm} raised", f"{alarm} cleared") for alarm in ALARM_OF_QUANTITY.values()
     ]
