@@ -122,6 +122,7 @@ def make_procedure(experiment: Experiment) -> Procedure:
 
 
 def _samples(name: str, kind: Kind, experiment: Experiment) -> SampleBlock:
+    """Return the used samples of a capture."""
     rows = load_capture(path_of(name)).rows
     return discharge(rows, MIN_LOAD_C * experiment.capacity_ah) if kind is Kind.CONSTANT else rows
 
@@ -131,6 +132,7 @@ def discharge(rows: SampleBlock, min_a: float) -> SampleBlock:
 
     A current below ``min_a`` is neither charge nor discharge [A].
     """
+    # The rows are split at the begin and at the end of each charge.
     edges = np.r_[0, np.flatnonzero(np.diff((rows["current_a"] < -min_a).astype(np.int8))) + 1, rows.size]
     parts_between_charges = [rows[first:end] for first, end in itertools.pairwise(edges)]
     largest_discharge = max(parts_between_charges, key=lambda part: charge_ah(part)[-1])
@@ -176,7 +178,7 @@ def main() -> None:
 
 
 def errors(procedures: dict[str, Procedure]) -> Table:
-    """Return the errors of Tables 11 and 13."""
+    """Return the table of voltage errors, which the thesis prints in its Tables 11 and 13."""
     printed_means = ", ".join(f"{load} {value}" for load, value in printed_values.TABLE_11.items())
     table = Table(
         title=f"error of the voltage in %; printed means: {printed_means}; largest {printed_values.MAX_CONSTANT} (constant), "
@@ -209,7 +211,7 @@ def parameters(procedures: dict[str, Procedure]) -> Table:
     for column in (*heads, "RC products in s", "of the rests in s"):
         table.add_column(column, overflow="fold")
     for name, p in procedures.items():
-        residual_v, result = p.joint_fit.residual_v, list(products(p))
+        residual_v, rc_products = p.joint_fit.residual_v, list(products(p))
         middle_v = residual_v[np.argmin(np.abs(pooled(p.tests).soc - MIDDLE_SOC))]
         table.add_row(
             name,
@@ -218,8 +220,8 @@ def parameters(procedures: dict[str, Procedure]) -> Table:
             p.smallest.name,
             p.adaptive.outcome,
             ", ".join(f"{value:.4g}" for value in p.r_s_fit.a),
-            ", ".join(f"{estimated_s:.3g}" for _, estimated_s, _ in result),
-            ", ".join(f"{seen_s:.3g}" for _, _, seen_s in result),
+            ", ".join(f"{estimated_s:.3g}" for _, estimated_s, _ in rc_products),
+            ", ".join(f"{rest_s:.3g}" for _, _, rest_s in rc_products),
         )
     return table
 

@@ -96,13 +96,13 @@ def learning_errors(
     for n, factors in enumerate(FILE_FACTORS):
         r_s, r_ts, tau_ts, r_tl, tau_tl = factors
         estimator = learner(file_off_by(ohm_factor * r_s, ohm_factor * r_ts, tau_ts, ohm_factor * r_tl, tau_tl), soc)
-        before = 0
+        begin = 0
         for name, value in (settings or {}).items():
             estimator.settings_record["observer" if name in OBSERVER_SETTINGS else "learning"][name] = value
         for h, hours in enumerate(HOURS):
-            until = int(3600 * hours)
-            run(estimator.record, estimator.settings_record, block[before:until], trace)
-            errors_by_file[n, h], before = relative_errors(estimator, factors), until
+            end = int(3600 * hours)
+            run(estimator.record, estimator.settings_record, block[begin:end], trace)
+            errors_by_file[n, h], begin = relative_errors(estimator, factors), end
     return errors_by_file
 
 

@@ -60,7 +60,8 @@ def rows() -> Iterator[Row]:
 def _block(samples: SampleBlock, minute: int) -> bytes:
     """Return the encoded block of one minute."""
     part = samples[minute * SAMPLES : (minute + 1) * SAMPLES]
-    return encode(Block(STORE_ID, minute + 1, 1, STORE_ID / 1e9 + float(part["time_s"][-1]), part))
+    arrival_s = STORE_ID / 1e9 + float(part["time_s"][-1])
+    return encode(Block(store=STORE_ID, number=minute + 1, oldest=1, arrival_s=arrival_s, samples=part))
 
 
 def _block_us(partition: Partition, blocks: list[bytes]) -> float:
@@ -76,9 +77,8 @@ def _block_us(partition: Partition, blocks: list[bytes]) -> float:
             partition.take(f"pack{pack}", data, sequence)
         minutes_s.append(time.process_time() - begin_s)
     median_s = np.median(minutes_s[1:])
-    hourly_s = (
-        max(minutes_s[60] - median_s, 0.0) / 60
-    )  # the block after the full hour completes the summary of the hour
+    # The first block after the full hour also completes the summary of the hour.
+    hourly_s = max(minutes_s[60] - median_s, 0.0) / 60
     return float(1e6 * (median_s + hourly_s) / PACKS)
 
 

@@ -120,15 +120,15 @@ def table_cells(results: list[Score]) -> Iterator[str]:
 
 
 def scores(source: Source, *, is_declared: bool = True, seeds: Iterable[int] = SEEDS) -> Iterator[Score]:
-    """Return the scores of each run of a kind of source."""
+    """Yield the score of each run of a kind of source."""
     for case in cases_of(source, seeds):
         samples, soc = sample_source(case, source)
-        for wrong in WRONG:
+        for soc_error in WRONG:
             sampling = {"sampling": source.sampling} if is_declared else {}
             estimator = Estimator(
                 cell_file(case),
                 voltage_resolution_v=source.volt_step,
-                initial_soc=float(np.clip(soc[0] + wrong, 0.0, 1.0)),
+                initial_soc=float(np.clip(soc[0] + soc_error, 0.0, 1.0)),
                 **sampling,
             )
             trace = estimator.run(samples)
@@ -163,7 +163,7 @@ def current_of(case: Case, source: Source, rate_hz: int) -> Floats:
 
 
 def sample_source(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
-    """Return the samples of the source, and the SOC at each."""
+    """Return the samples of the source until the cell is empty, and the true SOC at each."""
     rng = np.random.default_rng(1000 + case.seed)
     rate_hz = max(TRUTH_HZ, round(source.rate_hz))
     current_a = current_of(case, source, rate_hz)
@@ -181,15 +181,13 @@ def sample_source(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
         0,
         current_a.size - 1,
     )
-    empty = (soc[sample_indices] < 0.02) | (
-        voltage_v[sample_indices] < (2.5 if case.truth.ocv_v is OXIDE.ocv_v else 2.0)
-    )
+    cutoff_v = 2.5 if case.truth.ocv_v is OXIDE.ocv_v else 2.0
+    empty = (soc[sample_indices] < 0.02) | (voltage_v[sample_indices] < cutoff_v)  # the load would be disconnected
     sample_indices = sample_indices[: int(np.argmax(empty))] if empty.any() else sample_indices
     samples = np.zeros(sample_indices.size, dtype=SAMPLE)
     samples["time_s"] = sample_indices / rate_hz
-    reported_a = current_a[np.clip(sample_indices - delay_steps, 0, current_a.size - 1)] + rng.normal(
-        0.0, 2e-3 * source.capacity_ah / 3.0, sample_indices.size
-    )
+    noise_a = rng.normal(0.0, 2e-3 * source.capacity_ah / 3.0, sample_indices.size)  # 2 mA on a cell of 3 Ah
+    reported_a = current_a[np.clip(sample_indices - delay_steps, 0, current_a.size - 1)] + noise_a
     reported_a[np.abs(reported_a) < source.dead_band_a] = 0.0
     samples["current_a"] = np.round(reported_a / source.ampere_step) * source.ampere_step
     samples["voltage_v"] = (

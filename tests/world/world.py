@@ -338,12 +338,11 @@ class World:
             clean: True if the service ended by itself.
             silently: True if the power was cut.
         """
-        loss_s = POWER_LOSS_S if silently else KILL_LOSS_S
-        if clean:
-            loss_s = 0.0
         if self.disk.is_faulty or self.timeline.now_s < self.disk_usable_s + (POWER_LOSS_S if silently else 0.0):
-            loss_s = math.inf
-        return loss_s
+            return math.inf
+        if silently:
+            return POWER_LOSS_S
+        return 0.0 if clean else KILL_LOSS_S
 
     def _on_end_in_thread(self, how: type[BaseException]) -> None:
         """Handle a kill or a power cut during a write."""
